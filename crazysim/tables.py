@@ -102,6 +102,16 @@ def read_numbers(
     return array
 
 
+def read_floats(name: str, value: Any) -> NDArray[np.float64]:
+    """Return a number or an array of numbers of any shape in float64, read-only; NaN and infinity are allowed.
+
+    Args:
+        name: Name for messages.
+        value: The number or array.
+    """
+    return _as_array(name, value)
+
+
 def read_number(name: str, value: Any, allowed: Range = ANY_NUMBER, remedy: str = "") -> float:
     """Return one number, checked as ``read_numbers`` does."""
     return float(read_numbers(name, value, allowed, ((),), remedy=remedy))

@@ -20,7 +20,7 @@ from crazysim.core.stage import stage
 from crazysim.core.stages import is_tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 MIN_SLOT_DEGREE = 7
 """Smallest degree of slots if later trajectories are expected: the degree of minimum snap and of drone shows."""
@@ -98,7 +98,7 @@ class Follow(Plugin):
                 f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
                 f"Use Sim(control='state')."
             )
-        trajectories = self._trajectory_list()
+        trajectories = trajectory_list(self.trajectories)
         n_slots = (
             len(trajectories) if self.n_slots is None else _check_count("n_slots", self.n_slots, len(trajectories))
         )
@@ -221,15 +221,6 @@ class Follow(Plugin):
         for path in paths:
             if np.any(path != path[0]):
                 overlays.line(path, PATH_COLOR, 2.0, 2.0)
-
-    def _trajectory_list(self) -> list[Trajectory]:
-        """Return the setting ``trajectories`` as a list of single trajectories."""
-        trajectories = self.trajectories
-        trajectories = trajectories.unstacked() if isinstance(trajectories, Trajectory) else trajectories
-        is_list = isinstance(trajectories, (list, tuple)) and len(trajectories) > 0
-        if not is_list or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in trajectories):
-            raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
-        return list(trajectories)
 
 
 def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:

@@ -13,7 +13,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError
+from crazysim.tables import read_floats
 from crazysim.trajectories.trajectory import Trajectory
 
 FIT_TOLERANCE = 5e-6
@@ -47,6 +49,7 @@ def figure_eight(
         speed: Largest speed, m/s, instead of the period; it is reached in the middle.
         height: Height, m.
     """
+    width, depth = (float(require_vector(name, x, ())) for name, x in (("width", width), ("depth", depth)))
     return lissajous((width / 2, depth / 2, 0.0), (1, 2, 1), period=period, speed=speed, center=(0.0, 0.0, height))
 
 
@@ -121,6 +124,7 @@ def helix(
         along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
     require_positive("turns", turns)
+    check_flag("along", along)
     lengths = {"radius": radius, "climb": climb, "height": height}
     radius, climb, height = (float(require_vector(name, x, ())) for name, x in lengths.items())
     w = 2 * np.pi / _resolve_period(period, speed, math.hypot(2 * np.pi * radius, climb))
@@ -230,8 +234,8 @@ def require_positive(name: str, value: float) -> float:
 
 def require_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
     """Return the value of a setting as an array after a check of its shape, and of its numbers against ``MAX_SIZE``."""
-    array = np.asarray(value)
-    if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
+    array = read_floats(name, value)
+    if array.shape != shape or not np.all(np.abs(array) <= MAX_SIZE):
         kind = "3 finite numbers" if shape else "a finite number"
         raise ConfigError(f"expected {name} as {kind} of a size up to {MAX_SIZE:g}, got {value!r}")
-    return array.astype(float)
+    return array

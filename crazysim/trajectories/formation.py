@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import grid_2d
 from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
+from crazysim.tables import read_floats
 from crazysim.trajectories.curves import require_positive, require_vector
 
 CENTER = (0.0, 0.0, 1.0)
@@ -79,7 +80,7 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
         starts: Positions from which the drones start, m. (n, 3)
         targets: Positions to fly to, in any order, m. (n, 3)
     """
-    a, b = np.asarray(starts, float), np.asarray(targets, float)
+    a, b = read_floats("starts", starts), read_floats("targets", targets)
     if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or not np.all(np.isfinite(a) & np.isfinite(b)):
         raise ConfigError(f"expected as many finite starts as targets, (n, 3) each, got shapes {a.shape} and {b.shape}")
     from scipy.optimize import linear_sum_assignment  # a fifth of a second to import

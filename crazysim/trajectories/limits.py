@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.trajectories.approaches import Approach, closest_approaches
 from crazysim.trajectories.peaks import QUANTITIES, Peak, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 LIMIT_TOLERANCE = 1e-4
 """Fraction of a limit by which a value may exceed it, for the errors of float32. For a height limit below 1 m it is a
@@ -154,6 +154,14 @@ class Report:
         return "\n".join([*lines, *map(str, self.violations)])
 
 
+def require_limits(limits: Limits) -> None:
+    """Check that an argument is a record of limits."""
+    if not isinstance(limits, Limits):
+        raise ConfigError(
+            f"expected limits as Limits, got {short_repr(limits)}. Use Limits(speed=...), or Limits() for none."
+        )
+
+
 def limit_size(name: str, limit: float) -> float:
     """Return the size of a limit for relative tolerances; for a height it is at least 1 m."""
     return max(abs(limit), 1.0) if QUANTITIES[name].orders == (0,) else abs(limit)
@@ -184,7 +192,8 @@ def check(
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
     """
-    flights = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
+    require_limits(limits)
+    flights = trajectory_list(trajectories)
     if len(flights) == 1 and np.ndim(starts) == 1:
         flights *= np.size(starts)
     table = PieceTable.create(flights, starts, duration)
@@ -193,7 +202,8 @@ def check(
         raise ConfigError(
             f"expected {len(flights)} names, one for each drone, got {len(labels)}. Pass one name per trajectory."
         )
-    if not 0 < tolerance < np.inf:
+    is_number = isinstance(tolerance, (int, float, np.number))
+    if not is_number or not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
     limit_values = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
     peaks, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.tables import read_floats
 from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
 
@@ -47,7 +48,7 @@ class PieceTable:
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
-        start_times = np.asarray(starts, float)
+        start_times = read_floats("starts", starts)
         n_drones = len(trajectories)
         if start_times.shape not in ((), (n_drones,)) or not np.all(np.isfinite(start_times)):
             raise ConfigError(f"expected one finite start, s, or one for each of {n_drones} drones, got {starts!r}")

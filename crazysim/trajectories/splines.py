@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
+from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.bezier import power_coefficients
 from crazysim.trajectories.trajectory import Trajectory
@@ -32,9 +33,9 @@ def spline(
             (n_points,)
         at_rest: True to start and end at rest; False for a natural spline, with free derivatives at both ends.
     """
-    if degree not in SPLINE_ORDERS:
+    if not isinstance(degree, (int, np.integer)) or degree not in SPLINE_ORDERS:
         raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
-    knots, x = np.asarray(times, float), np.asarray(points, float)
+    knots, x = read_floats("times", times), read_floats("points", points)
     if knots.ndim != 1 or x.shape != (len(knots), 3):
         raise ConfigError(
             f"expected times (n_points,) and points (n_points, 3), got shapes {knots.shape} and {x.shape}. Pass one "
@@ -70,8 +71,12 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
             all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
         repeats: True to start again after the end.
     """
-    end_times = np.asarray(ends, float)
-    curves = [np.asarray(points, float) for points in control_points]
+    end_times = read_floats("ends", ends)
+    if not isinstance(control_points, (list, tuple, np.ndarray)):
+        raise ConfigError(
+            f"expected control points as a list with an array per curve, got {short_repr(control_points)}"
+        )
+    curves = [read_floats("control points", points) for points in control_points]
     shapes = [curve.shape for curve in curves]
     if end_times.shape != (len(curves),) or not curves:
         raise ConfigError(
@@ -116,7 +121,7 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
         yaw: One yaw for all points, or one per point, rad. () or (n_points,)
         n_points: Number of points.
     """
-    angles = require_finite(np.asarray(yaw, float), "yaw")
+    angles = require_finite(read_floats("yaw", yaw), "yaw")
     if angles.shape not in ((), (n_points,)):
         raise ConfigError(
             f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}. Pass a number, or an "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -14,9 +14,11 @@ from jax import Array, lax
 from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
+from crazysim.core.settings import check_flag
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, leaf
+from crazysim.tables import read_floats
 from crazysim.trajectories.interpolation import unit_coefficients
 
 MAX_COUNTED_PIECES = 16
@@ -52,7 +54,7 @@ class Trajectory(PyTree):
                 degree + 1)
             repeats: True to start again after the end.
         """
-        lengths, c = np.asarray(durations, float), np.asarray(coefficients, float)
+        lengths, c = read_floats("durations", durations), read_floats("coefficients", coefficients)
         if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
             raise ConfigError(
                 f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
@@ -75,7 +77,7 @@ class Trajectory(PyTree):
         if c.shape[1] == 3:
             c = np.concatenate([c, np.zeros_like(c[:, :1])], axis=1)
         c = c * lengths[:, None, None] ** np.arange(c.shape[2])
-        return Trajectory(ends, c.astype(float_dtype()), np.bool_(repeats))  # type: ignore[arg-type]
+        return Trajectory(ends, c.astype(float_dtype()), np.bool_(check_flag("repeats", repeats)))  # type: ignore[arg-type]
 
     @property
     def n_pieces(self) -> int:
@@ -128,6 +130,11 @@ class Trajectory(PyTree):
                 higher degrees are ignored. None to use ``degree`` for all axes. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
+        if ends.ndim != 2:
+            raise ConfigError(
+                f"expected trajectories along one leading axis, got ends of shape {ends.shape}. Use evaluate(t) for a "
+                f"single trajectory, and Trajectory.stack for several."
+            )
         end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
         local_time, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _find_piece(ends, index, local_time)
@@ -153,6 +160,13 @@ class Trajectory(PyTree):
         Returns:
             Values, their first derivatives, and so on. (4,) each
         """
+        self._require_single("evaluate_one(index, t)")
+        if np.shape(t) != ():
+            raise ConfigError(
+                f"expected one time, got shape {np.shape(t)}. Use jax.vmap(trajectory.evaluate)(times) for several."
+            )
+        if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 0 <= order <= N_DERIVATIVES:
+            raise ConfigError(f"expected an order from 0 to {N_DERIVATIVES}, got {short_repr(order)}")
         xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
         # A table with one row for each piece needs a single lookup. The parts of a row begin at multiples of four.
@@ -182,8 +196,7 @@ class Trajectory(PyTree):
         Args:
             trajectories: Single trajectories.
         """
-        if not trajectories:
-            raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
+        trajectories = trajectory_list(trajectories)
         n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
         padded_trajectories = [t.padded(n_pieces, degree) for t in trajectories]
         xp = _array_module(padded_trajectories)
@@ -200,6 +213,7 @@ class Trajectory(PyTree):
 
         Added pieces have no length and stay at the last point.
         """
+        self._require_single("unstacked()")
         xp = _array_module(self)
         n_added_pieces, n_added_degrees = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
         ends = xp.concatenate([self.ends, xp.broadcast_to(self.ends[-1:], (n_added_pieces,))])
@@ -222,6 +236,7 @@ class Trajectory(PyTree):
             return self.replace(repeats=np.bool_(True))
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
             raise ConfigError(f"expected a number of rounds of at least 1, got {n!r}. Use None for no end.")
+        self._require_single("unstacked()")
         xp = _array_module(self)
         rounds = xp.arange(n, dtype=self.ends.dtype)[:, None] * self.ends[-1]
         return Trajectory(
@@ -241,6 +256,10 @@ class Trajectory(PyTree):
             transition: Duration of an additional piece of degree 7 that connects the two trajectories, s; 0 for none.
                 Velocity, acceleration and jerk are continuous, and the yaw turns the shorter way.
         """
+        if not isinstance(other, Trajectory):
+            raise ConfigError(f"expected a trajectory to follow, got {short_repr(other)}. Use a.then(b).")
+        self._require_single("unstacked()")
+        other._require_single("unstacked()")
         if self.repeats or other.repeats:
             position = "first" if self.repeats else "second"
             raise ConfigError(
@@ -269,6 +288,18 @@ class Trajectory(PyTree):
             ends=xp.concatenate([first.ends, first.ends[-1] + second.ends]),
             coefficients=xp.concatenate([first.coefficients, second.coefficients]),
         )
+
+    def _require_single(self, remedy: str) -> None:
+        """Check that this is a trajectory of one vehicle.
+
+        Args:
+            remedy: Method to use for several trajectories.
+        """
+        if np.ndim(self.ends) != 1:
+            raise ConfigError(
+                f"expected a trajectory of one vehicle, got several, with ends of shape {np.shape(self.ends)}. Use "
+                f"{remedy} of them."
+            )
 
     def _end_derivatives(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
@@ -299,6 +330,22 @@ class Trajectory(PyTree):
         rotated_coefficients = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
         constant = rotated_coefficients[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
         return self.replace(coefficients=xp.concatenate([constant, rotated_coefficients[..., 1:]], axis=-1))
+
+
+def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Trajectory]:
+    """Return trajectories as a list of single ones.
+
+    Args:
+        trajectories: One trajectory, a sequence of single trajectories, or a record with one leading axis.
+    """
+    is_stack = isinstance(trajectories, Trajectory)
+    items = trajectories.unstacked() if is_stack else list(trajectories) if isinstance(trajectories, Iterable) else []
+    if not items or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in items):
+        raise ConfigError(
+            f"expected at least one trajectory, each of one vehicle, got {short_repr(trajectories)}. Pass a list with "
+            f"one per drone."
+        )
+    return items
 
 
 def _array_module(tree: object) -> Any:

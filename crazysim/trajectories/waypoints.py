@@ -10,10 +10,11 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
+from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation, timing
 from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits
+from crazysim.trajectories.limits import Limits, require_limits
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces, unwrap_yaw
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -149,6 +150,8 @@ def _plan_trajectory(
     corridors: ArrayLike | None,
 ) -> Trajectory:
     nodes = _waypoint_nodes(waypoints, fixed_derivatives)
+    if limits is not None:
+        require_limits(limits)
     n_pieces = len(nodes) - 1
     yaw_nodes = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
     yaw_nodes[:, 0, 0], yaw_nodes[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
@@ -200,7 +203,7 @@ def _plan_trajectory(
 
 def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
-    positions = np.asarray(waypoints, float)
+    positions = read_floats("waypoints", waypoints)
     if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
         raise ConfigError(
             f"expected waypoints (n, 3), at least two, got shape {positions.shape}. Pass an array with a row for each "
@@ -214,7 +217,7 @@ def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike 
         if values is None:
             nodes[[0, -1], k] = 0.0
             continue
-        array = np.asarray(values, float)
+        array = read_floats(name, values)
         if array.shape != positions.shape or np.any(np.isinf(array)):
             raise ConfigError(
                 f"expected finite {name} {positions.shape}, NaN where free, got shape {array.shape}. Pass one row per "
@@ -226,7 +229,7 @@ def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike 
 
 def _corridor_radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
     """Return the radius of the corridor of each piece, m. (n_pieces,)"""
-    radii = np.asarray(np.inf if corridors is None else corridors, float)
+    radii = read_floats("corridors", np.inf if corridors is None else corridors)
     if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
         raise ConfigError(f"expected positive corridors, one or {n_pieces}, got {corridors!r}. Use inf for no bound.")
     return np.broadcast_to(radii, (n_pieces,))
@@ -248,7 +251,7 @@ def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float
 
 def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s, after a check. (n_pieces,)"""
-    lengths = np.asarray(durations, float)
+    lengths = read_floats("durations", durations)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
         raise ConfigError(
             f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}. Pass "

@@ -233,11 +233,11 @@ def test_wrong_settings_are_errors(settings, message):
 def test_wrong_levels_trajectories_and_uploads_are_errors():
     with pytest.raises(ConfigError, match="control='state'"):
         Sim(control="attitude").add(Follow(EIGHT))
-    with pytest.raises(ConfigError, match="one or more"):
+    with pytest.raises(ConfigError, match="at least one"):
         build().add(Follow([]))
-    with pytest.raises(ConfigError, match="one or more trajectories of one vehicle each, got 3"):
+    with pytest.raises(ConfigError, match="at least one trajectory, each of one vehicle, got 3"):
         build().add(Follow(3))
-    with pytest.raises(ConfigError, match="one or more"):
+    with pytest.raises(ConfigError, match="at least one"):
         build().add(Follow([Trajectory.stack([EIGHT, UP])]))
     sim = build()
     plugin = sim.add(Follow([UP, UP]))

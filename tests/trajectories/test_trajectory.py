@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PPoly
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories import Trajectory
+from crazysim.trajectories import Trajectory, figure_eight, line
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -236,3 +236,36 @@ def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
     for k in range(order + 1):
         np.testing.assert_allclose(found[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)
+
+
+EIGHT, UP = figure_eight(), line([0, 0, 0], [0, 0, 1], 2.0)
+PAIR = Trajectory.stack([EIGHT, UP])
+
+
+@pytest.mark.parametrize(
+    ("call", "remedy"),
+    [
+        (lambda: EIGHT.evaluate(np.linspace(0, 1, 5)), r"one time, got shape \(5,\).*jax.vmap"),
+        (lambda: PAIR.evaluate(0.5), r"one vehicle.*evaluate_one"),
+        (lambda: EIGHT.evaluate_one(0, 0.5), r"one leading axis.*evaluate\(t\)"),
+        (lambda: EIGHT.derivatives(0.5, 5), "order from 0 to 4"),
+        (lambda: PAIR.repeat(2), r"one vehicle.*unstacked\(\)"),
+        (lambda: PAIR.padded(9, 7), r"one vehicle.*unstacked\(\)"),
+        (lambda: PAIR.then(UP), r"one vehicle.*unstacked\(\)"),
+        (lambda: UP.then(PAIR), r"one vehicle.*unstacked\(\)"),
+        (lambda: UP.then("up"), "trajectory to follow, got 'up'"),
+        (lambda: Trajectory.stack([PAIR, UP]), "each of one vehicle"),
+        (lambda: Trajectory.stack([UP, None]), "each of one vehicle"),
+        (lambda: Trajectory.of_pieces(["a"], [[[1.0]]]), "durations as a number or array"),
+        (lambda: Trajectory.of_pieces([1.0], [[[1.0], [1.0, 2.0], [1.0]]]), "coefficients as a number or array"),
+        (lambda: Trajectory.of_pieces([1.0], np.zeros((1, 3, 2)), "no"), "repeats as True or False"),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_errors_with_a_remedy(call, remedy):
+    with pytest.raises(ConfigError, match=f"(?s){remedy}"):
+        call()
+
+
+def test_a_stack_of_a_stack_is_the_same_stack():
+    for x, y in zip(jax.tree.leaves(Trajectory.stack(PAIR)), jax.tree.leaves(PAIR), strict=True):
+        np.testing.assert_array_equal(x, y)

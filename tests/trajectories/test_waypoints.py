@@ -10,7 +10,19 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize
 
 from crazysim import ConfigError
-from crazysim.trajectories import Limits, check, minimum_jerk, minimum_snap
+from crazysim.trajectories import (
+    Limits,
+    check,
+    circle,
+    figure_eight,
+    formation,
+    minimum_jerk,
+    minimum_snap,
+    of_bezier,
+    save_csv,
+    save_samples,
+    spline,
+)
 from crazysim.trajectories.peaks import QUANTITIES
 from crazysim.trajectories.piece_table import PieceTable
 
@@ -327,3 +339,38 @@ def test_durations_times_the_factor_of_the_error_meet_the_limits():
     report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
     assert max(report.peaks[name].value[0] / LIMITS.as_dict()[name] for name in ("speed", "acceleration")) > 0.99
     assert "separation" not in QUANTITIES
+
+
+CORNER = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: minimum_snap("abc", [1.0]), "waypoints"),
+        (lambda: minimum_snap([[0, 0], [1, 1, 1]], [1.0]), "waypoints"),
+        (lambda: minimum_snap(CORNER, "ab"), "durations"),
+        (lambda: minimum_snap(CORNER, [1.0, 1.0], corridors="x"), "corridors"),
+        (lambda: minimum_snap(CORNER, [1.0, 1.0], yaw="x"), "yaw"),
+        (lambda: minimum_snap(CORNER, [1.0, 1.0], velocities="x"), "velocities"),
+        (lambda: minimum_snap(CORNER, limits=5), "limits as Limits"),
+        (lambda: spline("a", CORNER), "times"),
+        (lambda: spline([0, 1, 2], CORNER, degree=[3]), "degree 3, 5 or 7"),
+        (lambda: of_bezier([1.0], None), "control points as a list"),
+        (lambda: of_bezier([1.0], [[[0, 0, 1], [0, 1]]]), "control points"),
+        (lambda: check(5, Limits()), "each of one vehicle"),
+        (lambda: check(spline([0, 1, 2], CORNER), None), "limits as Limits"),
+        (lambda: check(spline([0, 1, 2], CORNER), Limits(), starts="x"), "starts"),
+        (lambda: check(spline([0, 1, 2], CORNER), Limits(), tolerance="x"), "tolerance"),
+        (lambda: figure_eight(width="a"), "width"),
+        (lambda: circle(along="no"), "along as True or False"),
+        (lambda: formation.matched("a", "b"), "starts"),
+        (lambda: save_csv(None, "x.csv"), "a trajectory, got None"),
+        (lambda: save_samples("x.csv", 0.0, [0, 0, 0]), r"times \(n,\)"),
+        (lambda: save_samples("x.csv", [0, 1], CORNER[:2], yaw=[[0], [0]]), r"times \(n,\)"),
+        (lambda: save_samples("x.csv", [0, 1], [[0, 0, 1], [0, 0, np.nan]]), "finite pos"),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_named(call, name):
+    with pytest.raises(ConfigError, match=f"expected .*{name}"):
+        call()

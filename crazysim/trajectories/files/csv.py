@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import read_text, write_file
+from crazysim.tables import read_floats
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.polynomials import trajectory_from_rows, trajectory_rows
-from crazysim.trajectories.splines import trajectory_from_unit_pieces
+from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
@@ -88,7 +89,7 @@ def _fit_samples(rows: NDArray, location: str) -> Trajectory:
 
 
 def save_csv(trajectory: Trajectory, path: str | Path) -> None:
-    """Write a trajectory as Crazyswarm's polynomials.
+    """Write a trajectory as Crazyswarm's polynomials. One round of a repeating trajectory is written.
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
@@ -113,15 +114,19 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
     Raises:
         ConfigError: If the folder does not exist.
     """
-    columns = [np.asarray(times, float)[:, None], np.asarray(pos, float)]
+    columns = [read_floats("times", times), read_floats("pos", pos)]
     header = "t,x,y,z"
     if yaw is not None:
-        columns.append(np.asarray(yaw, float)[:, None])
+        columns.append(read_floats("yaw", yaw))
         header += ",yaw"
-    if len({len(column) for column in columns}) != 1 or columns[1].shape[1:] != (3,):
+    n = columns[0].size
+    shapes = [column.shape for column in columns]
+    if shapes != [(n,), (n, 3), (n,)][: len(shapes)]:
         raise ConfigError(
-            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {[column.shape for column in columns]}. "
-            "Pass one row per time."
+            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {shapes}. Pass one row per time."
         )
+    for name, column in zip(("times", "pos", "yaw"), columns, strict=False):
+        require_finite(column, name)
+    columns = [column.reshape(n, -1) for column in columns]
     lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in np.concatenate(columns, axis=1))]
     write_file(path, "".join(f"{line}\n" for line in lines).encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -29,6 +29,8 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
         Ends, s (n_pieces,), and coefficients of x, y, z, m, and yaw, rad, constant term first, in each piece's time
         scaled to [0, 1] (n_pieces, 4, degree + 1).
     """
+    if not isinstance(trajectory, Trajectory):
+        raise ConfigError(f"expected a trajectory, got {short_repr(trajectory)}. Use figure_eight(), for example.")
     ends = np.asarray(trajectory.ends)
     if ends.ndim != 1:
         raise ConfigError(

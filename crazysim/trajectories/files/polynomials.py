@@ -193,7 +193,7 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:
-    """Write a trajectory in the format of the Crazyflie's trajectory memory.
+    """Write a trajectory in the format of the Crazyflie's trajectory memory; one round if it repeats.
 
     Args:
         trajectory: Trajectory of one vehicle.
