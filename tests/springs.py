@@ -1,4 +1,4 @@
-"""A small population for tests: point masses on springs, alone or tied to the drones of their world."""
+"""A small population for tests: point masses on springs, some of them tied to the drones of their world."""
 
 from collections.abc import Sequence
 from typing import ClassVar

@@ -27,13 +27,13 @@ NOT_ON_LANES = ("kalman", "eskf", "terrain")
 
 @pytest.mark.long("compiles every stage of the package for every engine")
 @pytest.mark.parametrize("name", sweep.CASES)
-def test_every_engine_gives_what_plain_gives(name):
+def test_every_engine_agrees_with_plain(name):
     compare(name, [engine for engine in ENGINES if engine != "lanes" or name not in LONG_ON_LANES + NOT_ON_LANES])
 
 
 @pytest.mark.slow("XLA compiles a minute in all; lanes of the other simulations have the same operations")
 @pytest.mark.parametrize("name", LONG_ON_LANES)
-def test_long_programs_on_lanes_give_what_plain_gives(name):
+def test_long_programs_on_lanes_agree_with_plain(name):
     compare(name, ["lanes"])
 
 

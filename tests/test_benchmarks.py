@@ -60,7 +60,7 @@ def test_loop_prints_the_time_of_an_iteration(run):
     assert 0 < box["shortest_s"] <= box["iteration_s"]
 
 
-def test_devices_prints_rates_and_what_devices_exchange(run):
+def test_devices_prints_rates_and_the_exchange_between_devices(run):
     """Two of the four host devices: physics exchanges nothing, and a gradient with respect to commands neither."""
     lines = run("devices.py", "--small", "--cases", "physics", "gradient", "--devices", 1, 2, "--repeats", 1)
     assert [(line["case"], line["n_devices"]) for line in lines] == [
@@ -406,7 +406,7 @@ def test_the_flight_stack_is_timed_against_its_references(run):
     assert all(line["ratio"] > 0 and line["operations"]["mul"] > 0 for line in lines)
 
 
-def test_cars_are_timed_alone_and_beside_drones(run):
+def test_cars_are_timed_without_and_beside_drones(run):
     lines = run("vehicles.py", "--worlds", "4", "--cases", "drive", "path", "beside_drone", "--repeats", "1")
     assert [(line["case"], line["alone"]) for line in lines] == [
         ("drive", True),

@@ -166,7 +166,7 @@ print(jax.config.jax_compilation_cache_dir)
 
 
 @pytest.mark.long("two processes import JAX and compile")
-def test_a_second_process_finds_what_the_first_one_compiled_without_being_asked(tmp_path):
+def test_a_second_process_finds_programs_of_the_first_one_by_default(tmp_path):
     def run(folder):
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "CRAZYSIM"))}
         environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu", "CXX": f"{folder / 'g++'}"}
@@ -182,7 +182,7 @@ def test_a_second_process_finds_what_the_first_one_compiled_without_being_asked(
     programs = sorted((tmp_path / "crazysim").rglob("*-cache"))
     second, n_second = run(script.parent)
     assert first == second
-    assert first.splitlines()[-1] == "None", "JAX's own configuration is left alone"
+    assert first.splitlines()[-1] == "None", "JAX's own configuration is not changed"
     assert n_first == n_second >= 2, "nothing is compiled again"
     assert {"jit_sync_sim2mjx", "jit__observations"} <= {path.name.split("-")[0] for path in programs}
     assert sorted((tmp_path / "crazysim").rglob("*-cache")) == programs

@@ -348,7 +348,7 @@ def test_only_one_module_goes_beyond_the_public_interface():
 
 
 @pytest.mark.long("runs tests in another process")
-def test_the_engine_runs_without_what_jax_may_take_away():
+def test_the_engine_runs_without_functions_that_jax_may_remove():
     """Every fallback, and steps on them: in a kernel, split by a stage, of all engines, and with commands."""
     tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/engine/test_stepper.py"]
     some = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
@@ -368,7 +368,7 @@ def test_digamma_at_zero_is_that_of_this_version():
     np.testing.assert_array_equal(jax.lax.digamma(np.float32(0)), np.float32(jaxcompat.DIGAMMA_AT_ZERO))
 
 
-def test_a_process_alone_is_its_only_host():
+def test_a_single_process_is_its_only_host():
     """``tests/train/test_hosts.py`` tests several hosts."""
     assert jaxcompat.connected_hosts() is None
     assert not jaxcompat.is_stop_requested(1)

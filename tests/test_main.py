@@ -20,7 +20,7 @@ from crazysim.scene.software import film_size
 COMMANDS = ("demo", "replay", "show", "live", "train", "evaluate", "export", "render", "airframe", "identify", "info")
 
 
-def test_without_a_command_it_lists_what_there_is(capsys):
+def test_without_a_command_the_program_lists_its_commands(capsys):
     assert main([]) == 0
     out = capsys.readouterr().out
     assert all(f"\n    {name} " in out for name in COMMANDS)

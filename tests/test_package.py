@@ -201,7 +201,7 @@ def test_a_target_installs_its_extra_once(target, extra, tmp_path):
     assert not [line for line in lines if " install " in line]
 
 
-def test_the_rest_is_what_make_test_leaves_out():
+def test_the_target_rest_runs_the_tests_that_make_test_leaves_out():
     chosen = commands_of_make("test")[-1].split('"not slow" ')[1].split()
     rest = commands_of_make("test-rest")[-1].split('"not slow" ')[1].split()
     assert rest == [f"--ignore={path}" for path in chosen]

@@ -40,7 +40,7 @@ def test_records_are_frozen():
         fleet().rate = 100
 
 
-def test_replace_leaves_the_original_alone():
+def test_replace_does_not_change_the_original():
     old = fleet()
     new = old.replace(rate=100)
     assert (old.rate, new.rate) == (50, 100)

@@ -66,7 +66,7 @@ def test_law_07_gradients_are_finite_at_zero_and_at_saturation():
     assert not np.any(jacobians[2])  # at full thrust on every rotor nothing more comes out
 
 
-def test_every_level_has_a_size_and_says_what_its_numbers_are():
+def test_every_level_has_a_size_and_descriptions_of_its_numbers():
     sizes = {level.value: command_size(level, 6) for level in Control}
     assert sizes == {"state": 16, "attitude": 4, "body_rate": 4, "force_torque": 4, "rotor_vel": 6}
     assert set(COMMAND_FIELDS) == set(Control)

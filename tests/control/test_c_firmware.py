@@ -142,7 +142,7 @@ def fly_to_heights(controller, n_steps=1000):
     return sim
 
 
-def test_a_law_in_c_flies_as_the_same_law_in_jax(library):
+def test_a_law_in_c_flies_like_the_same_law_in_jax(library):
     found = fly_to_heights(CFirmware(library("hover", HOVER)))
     expected = fly_to_heights(Height())
     assert np.ptp(expected.data.states.pos[..., 2]) > 1.0

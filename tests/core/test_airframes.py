@@ -63,11 +63,11 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
             Sim(drone=airframe, control=control, controller=controller, engine="interpret"), pos[:, k : k + 1]
         )
         own.step(25)
-        n, alone = own.airframe.n_rotors, jax.device_get(own.data.states)
+        n, own_states = own.airframe.n_rotors, jax.device_get(own.data.states)
         for name in STATES:
-            expected, got = getattr(alone, name)[0, 0], getattr(flown, name)[0, k]
+            expected, got = getattr(own_states, name)[0, 0], getattr(flown, name)[0, k]
             np.testing.assert_allclose(got, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
-        expected, got = alone.rotor_vel[0, 0], flown.rotor_vel[0, k]
+        expected, got = own_states.rotor_vel[0, 0], flown.rotor_vel[0, k]
         np.testing.assert_allclose(got[:n], expected, rtol=1e-3)
         np.testing.assert_array_equal(got[n:], 0)
 
@@ -84,9 +84,9 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
     mixed = set_flying(Sim(drone=list(fleet.values()), control="body_rate", engine="interpret"), pos)
     mixed.step(25)
     for k, airframe in enumerate(fleet.values()):
-        alone = set_flying(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
-        alone.step(25)
-        found, expected = mixed.data.states.ang_vel[0, k], alone.data.states.ang_vel[0, 0]
+        single_sim = set_flying(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
+        single_sim.step(25)
+        found, expected = mixed.data.states.ang_vel[0, k], single_sim.data.states.ang_vel[0, 0]
         np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5)
 
 

@@ -150,7 +150,7 @@ def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(d
     np.testing.assert_array_equal(old.vel, new.vel)
 
 
-def test_integrators_leave_everything_but_the_states_alone(data, x64):
+def test_integrators_change_only_the_states(data, x64):
     def check(data):
         for integrate in INTEGRATORS.values():
             after = integrate(data, first_principles_derivative)

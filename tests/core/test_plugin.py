@@ -171,7 +171,7 @@ def test_law_09_plugins_of_a_simulation_are_a_list(plugins):
         Sim(plugins=plugins)
 
 
-def test_remove_restores_what_was_there_before():
+def test_remove_restores_the_simulation_before_the_plugin():
     """Plugins are removed in any order. Stages, records and every bit of a flight are as before."""
     sim = make_hovering_sim(engine="interpret")
     before, data, default = dict(sim.step_pipeline), sim.data, sim.default_data
@@ -215,7 +215,7 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     np.testing.assert_allclose(sim.data.plugins["wake"].vel, np.asarray(sim.data.states.vel) / 60, rtol=0.15, atol=2e-4)
 
 
-def test_replace_changes_the_step_where_it_must():
+def test_replace_adds_stages_that_the_new_settings_need():
     """Gusts need a stage, and ``strength`` is a constant of the compiled step."""
     sim = make_hovering_sim(engine="interpret")
     sim.add(Wind((2.0, 0, 0)))
@@ -514,7 +514,7 @@ class Undeclared(Plugin):
     (lambda sim: replace_fn(sim.step_pipeline, lambda d: d, "attitude_controller") or sim.remove("latency"),
      ConfigError, "'attitude_controller' of plugin 'latency' has been replaced since"),
 ])  # fmt: skip
-def test_law_09_what_cannot_be_added_replaced_or_removed(act, error, words):
+def test_law_09_impossible_additions_replacements_and_removals_are_refused(act, error, words):
     sim = Sim()
     sim.add(Wind((1.0, 0, 0)))
     sim.add(Latency(2))

@@ -36,12 +36,12 @@ def states_by_name(data):
 
 
 @pytest.mark.parametrize(("n_worlds", "n_drones", "n_members"), COUNTS)
-def test_law_02_axes_are_the_declared_ones_for_any_counts(n_worlds, n_drones, n_members):
-    """For equal and unequal numbers of worlds, drones and members, the first world flies as it does alone."""
-    sim, alone = (build_springs(KINDS, n, n_drones, n_members, engine="interpret") for n in (n_worlds, 1))
-    for one in (sim, alone):
-        one.step(7)
-    expected = states_by_name(alone.data)
+def test_law_02_axes_are_as_declared_for_any_counts(n_worlds, n_drones, n_members):
+    """For equal and unequal numbers of worlds, drones and members, the first world flies like a single world."""
+    sim, single_sim = (build_springs(KINDS, n, n_drones, n_members, engine="interpret") for n in (n_worlds, 1))
+    for each_sim in (sim, single_sim):
+        each_sim.step(7)
+    expected = states_by_name(single_sim.data)
     for name, values in states_by_name(sim.data).items():
         assert np.all(np.isfinite(values)), name
         np.testing.assert_allclose(values[:1], expected[name], rtol=2e-5, atol=2e-6, err_msg=name)
@@ -50,7 +50,7 @@ def test_law_02_axes_are_the_declared_ones_for_any_counts(n_worlds, n_drones, n_
         np.testing.assert_array_equal(states_by_name(sim.data)[f"ticks of {kind}"], 2)  # 100 Hz: steps 0 and 5
 
 
-def test_a_member_moves_as_it_does_alone():
+def test_a_member_moves_like_a_single_member():
     """Law 1: the motion of a member does not depend on the others."""
     sim = keep_mass_stages(build_springs(Springs, 3, 2, 4, engine="interpret"))
     sim.step(9)
@@ -63,8 +63,8 @@ def test_a_member_moves_as_it_does_alone():
         own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
         one.data = one.plugins["springs"].write(one.default_data, own)
         one.step(9)
-        alone = np.asarray(one.data.plugins["springs"].pos)[0, 0]
-        np.testing.assert_allclose(alone, record.pos[world, member], rtol=1e-6)
+        pos = np.asarray(one.data.plugins["springs"].pos)[0, 0]
+        np.testing.assert_allclose(pos, record.pos[world, member], rtol=1e-6)
 
 
 @pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
@@ -147,13 +147,13 @@ def test_worlds_are_reset_with_their_members():
 
 def test_worlds_are_spread_over_devices():
     kinds = (Springs, Tying)
-    alone = build_springs(kinds, 4, 2, 3)
+    unsharded_sim = build_springs(kinds, 4, 2, 3)
     sharded_sim = build_springs(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
-    for sim in (alone, sharded_sim):
+    for sim in (unsharded_sim, sharded_sim):
         sim.step(8)
     for record in sharded_sim.data.plugins.values():
         assert len(record.pos.sharding.device_set) == 2
-    for name, value in states_by_name(alone.data).items():
+    for name, value in states_by_name(unsharded_sim.data).items():
         np.testing.assert_allclose(states_by_name(sharded_sim.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
 
 

@@ -46,7 +46,7 @@ def test_the_function_is_applied_to_every_world(n_worlds, n_drones):
     assert after.opaque is record.opaque
 
 
-def test_a_leaf_that_is_not_written_is_returned_as_it_came():
+def test_a_leaf_that_is_not_written_is_returned_unchanged():
     record = numbers(2, 3)
     after = vmap_worlds(lambda world: world.replace(own=world.own + 1))(record)
     assert all(getattr(after, name) is getattr(record, name) for name in ("ours", "row", "all", "opaque"))

@@ -188,7 +188,7 @@ def test_names_files_and_dicts_give_the_same_airframe(tmp_path):
     assert load_airframe(by_name) is by_name
 
 
-def test_a_users_dict_is_left_alone_and_an_airframe_cannot_be_changed():
+def test_a_users_dict_is_not_changed_and_an_airframe_cannot_be_changed():
     tables = plain_tables("cf21B_500") | {"name": "mine"}
     before = copy.deepcopy(tables)
     airframe = load_airframe(tables)

@@ -120,7 +120,7 @@ def test_external_wrench_acts_in_the_world_frame():
 
 
 def test_every_rotor_can_have_constants_of_its_own():
-    """Four equal rows change nothing; half a thrust curve on one rotor halves that rotor's thrust alone."""
+    """Four equal rows change nothing; half a thrust curve on one rotor halves only that rotor's thrust."""
     params = first_principles.Params.create(load_airframe("cf21B_500"))
     rows = {
         name: jnp.broadcast_to(getattr(params, name), shape)

@@ -67,7 +67,7 @@ def test_without_nvrtc_the_kernel_is_unsupported(source, monkeypatch):
         cuda.compile_source(source.text, cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
-def test_what_nvrtc_refuses_is_unsupported(source):
+def test_a_source_that_nvrtc_refuses_is_unsupported(source):
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here")
     with pytest.raises(KernelError, match="NVRTC refused the kernel"):

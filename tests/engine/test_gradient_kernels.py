@@ -176,7 +176,7 @@ def long_loop(data):
 
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
-def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
+def test_programs_without_a_kernel_are_differentiated_on_lanes(x64):
     ((fast, step, data), (plain, *_)), point = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
         found = jit_gradient(fast)(point)

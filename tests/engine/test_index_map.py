@@ -61,7 +61,7 @@ def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_lanes_that_loop_together_compute_what_each_computes_alone(tables, platform):
+def test_lanes_that_loop_together_agree_with_single_lanes(tables, platform):
     """A row is skipped if no lane needs it, and an initial number that all lanes share differs between lanes later."""
 
     def fn(index, numbers):

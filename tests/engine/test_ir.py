@@ -16,7 +16,7 @@ def test_a_common_subexpression_is_computed_once():
     assert len(b.finish([first, again, other]).operations) == 2
 
 
-def test_an_inner_block_uses_what_is_computed_around_it():
+def test_an_inner_block_uses_results_of_the_block_around_it():
     b = Builder()
     x = b.input(F)
     outside = b.add("sin", (x,), F)

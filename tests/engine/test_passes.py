@@ -33,7 +33,7 @@ def numbers_by_slot(program, leaves):
 
 
 def run_program(program, numbers, n_steps):
-    """Return all numbers after some steps, by the interpreter alone."""
+    """Return all numbers after some steps by the interpreter."""
     numbers = dict(numbers)
     shape = (N_WORLDS,)
     hoisted = {

@@ -33,7 +33,7 @@ def test_steps_at_once_are_steps_one_by_one(data, step):
     assert trees_equal(step(data, jnp.int32(7)), one_by_one)
 
 
-def test_a_static_number_of_steps_gives_what_a_dynamic_one_gives(data, step):
+def test_a_static_number_of_steps_gives_the_results_of_a_dynamic_number(data, step):
     """The results differ by float32 rounding, since XLA fuses a scan and a loop differently."""
     static, dynamic = step(data, 7), step(data, jnp.int32(7))
     for name in ("pos", "quat", "vel", "ang_vel"):

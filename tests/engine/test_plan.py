@@ -80,7 +80,7 @@ def test_a_parameter_that_jax_renamed_is_unsupported_and_a_wrong_rule_is_a_bug(s
     assert_steps_like_plain(sim, step, (sway,))
 
 
-def test_strict_raises_what_is_not_supported(sim, monkeypatch):
+def test_strict_raises_an_error_for_unsupported_stages(sim, monkeypatch):
     monkeypatch.delitem(RULES, "sin")
     with pytest.raises(ConfigError, match=r"stage 'sway' is not fused: .*'sin'"):
         Step(make_pipeline(sim, sway), strict=True).plan(sim.data)

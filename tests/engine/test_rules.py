@@ -37,7 +37,7 @@ def lane_numbers(g):
 
 
 @pytest.mark.parametrize("name", [*CASES, *RANDOM_CASES])
-def test_a_case_gives_what_jax_gives(name):
+def test_a_case_gives_the_results_of_jax(name):
     """Integers, bools and random bits are equal, floats equal up to rounding."""
     g = make_inputs()
     block = lower_function(case_function(name), drone_shapes(g))
@@ -104,7 +104,7 @@ def data():
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_refused_is_named_with_its_stage(data, name):
+def test_a_refused_operation_is_named_with_its_stage(data, name):
     fn, words = REFUSED[name]
     (unfused,) = lower_stages(as_stages({"mine": stage("drone")(fn)}), data).unfused_stages
     assert words in str(unfused.error)
@@ -137,7 +137,7 @@ def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsup
     lambda x: 0.0 * x, lambda x: x * jnp.zeros(3)[0], lambda x: 0.0 / x, lambda x: x - x, lambda x: x * 1 + 0.0,
     lambda x: jnp.dot(jnp.zeros(2), jnp.stack([x, x])), lambda x: jnp.maximum(x, 0.0), lambda x: jnp.clip(x, -1, 1),
 ])  # fmt: skip
-def test_constants_do_not_hide_what_is_not_finite(fn):
+def test_constants_do_not_hide_numbers_that_are_not_finite(fn):
     """A product with zero is NaN where the other number is infinite, even if the zero is a constant."""
     x = np.float32([np.nan, np.inf, -np.inf, 0.0, -2.5])
     (found,) = interpret.run_block(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)

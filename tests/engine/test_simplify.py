@@ -128,7 +128,7 @@ def test_conversions_fold_as_xla_computes_them(x, dtype, expected):
     assert simplify("convert_element_type", (F(x),), np.dtype(dtype), ()) == expected
 
 
-def test_what_numpy_rounds_otherwise_is_not_folded():
+def test_operations_that_numpy_rounds_differently_are_not_folded():
     inexact = {row.name for row in ops.TABLE.values() if not row.exact and not row.structured}
     assert {"exp", "sin", "pow", "erf_inv", "integer_pow"} <= inexact
     assert simplify("exp", (F(1),), np.dtype(F), ()) is None

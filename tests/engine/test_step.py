@@ -437,7 +437,7 @@ def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
 
 
 @pytest.mark.parametrize("control", ["state", "rotor_vel"])
-def test_a_rollout_stages_what_the_setter_stages(control):
+def test_a_rollout_stages_commands_like_the_setter(control):
     """In particular, no jerk, snap and yaw rate of an earlier command remains."""
     sim = shared_sim(n_worlds=2, n_drones=1, control=control)
     before = send(sim.data, repeat_command(sim.data, hover_command(sim.data)))
@@ -478,7 +478,7 @@ def test_a_rollout_has_a_gradient():
     ({"n_control_steps": 2.0}, "n_control_steps is 2.0; it must be a positive whole number"),
     ({"n_control_steps": 10, "every": 3}, "every=3 does not divide n_control_steps=10"),
 ])  # fmt: skip
-def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
+def test_law_09_rollouts_refuse_wrong_input(settings, words):
     sim = shared_sim(n_worlds=1, n_drones=1, control="attitude")
     with pytest.raises(ConfigError, match=words):
         sim.rollout(climb_policy, jnp.float32(0.3), **settings)

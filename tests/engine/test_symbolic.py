@@ -45,7 +45,7 @@ def call(function, *args):
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in {*REFUSED_CASES, *UNCOMPARED_CASES}])
-def test_a_case_gives_what_jax_gives(g, name):
+def test_a_case_gives_the_results_of_jax(g, name):
     function, compiled = casadi_function(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
     for world, drone in ((0, 0), (3, 1), (6, 2)):
         one = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=np.tile(g.table, (7, 3, 1))))

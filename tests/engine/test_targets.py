@@ -115,13 +115,13 @@ def assert_agree(found, expected, engine):
     assert not wrong, f"{engine}: " + "; ".join(map(str, wrong))
 
 
-def test_xla_computes_what_the_interpreter_does(all_operations, expected):
+def test_xla_agrees_with_the_interpreter(all_operations, expected):
     program, arrays = all_operations
     written, _ = jax.jit(lambda leaves: lanes.run_steps(program, leaves, 1))(arrays)
     assert_agree(written, expected, "lanes")
 
 
-def test_a_kernel_computes_what_the_interpreter_does(all_operations, expected):
+def test_a_kernel_agrees_with_the_interpreter(all_operations, expected):
     if native.compiler() is None:
         pytest.skip("no C++ compiler here")
     program, arrays = all_operations
@@ -146,7 +146,7 @@ def _number(rng, dtype, low, high):
 
 
 @pytest.mark.usefixtures("casadi")
-def test_casadi_computes_what_the_interpreter_does_or_refuses():
+def test_casadi_agrees_with_the_interpreter_or_refuses():
     """They are compared in float64, on finite numbers, since CasADi has neither NaN nor infinity."""
     import casadi
 

@@ -82,7 +82,7 @@ def normalised_hover(engine):
     [(noisy_hover, "fused"), (lopsided_hover, "fused"), (swarm, "fused"), (normalised_hover, "fused"),
      (noisy_hover, "lanes"), (normalised_hover, "lanes"), (swarm, "interpret")],
 )  # fmt: skip
-def test_an_engine_steps_an_environment_as_the_reference_does(make, engine):
+def test_an_engine_steps_an_environment_like_the_reference(make, engine):
     env, reference = make(engine), make("plain")
     state = jax.jit(reference.reset)(jax.random.key(0))
     assert env.explain().startswith(f"engine: {engine}")

@@ -119,7 +119,7 @@ def test_float64_agrees_with_the_peer(stem, variant, x64):
 
 
 @pytest.mark.parametrize(("stem", "variant"), [case for case in CASES if case[1] == "euler"])
-def test_float32_is_as_near_to_float64_as_the_peers_own(stem, variant):
+def test_float32_is_as_near_to_float64_as_that_of_crazyflow(stem, variant):
     """Errors from rounding are at most three times those of Crazyflow, whose operations have another order.
 
     The recorded error is the largest of all airframes and starts in one second. One unit in the last place of a

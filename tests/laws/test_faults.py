@@ -180,7 +180,7 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
     np.testing.assert_array_equal(commanded, 0.0)
     z, v, r = simulate_fall(data, 250)
     assert_falls(data.states, z, v, r)
-    assert v < -3.5, "gravity alone gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
+    assert v < -3.5, "gravity gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
 
 
 @pytest.mark.parametrize("dynamics", ["first_principles", *FITTED_DYNAMICS])

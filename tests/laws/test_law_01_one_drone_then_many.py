@@ -120,15 +120,15 @@ def draw_arguments(module, function, model, rng, per_drone):
 def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model, per_drone, x64, rng):
     """Law 1 for every function of dynamics and control, with shared parameters and parameters per drone."""
     batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone)
-    if not batched:  # a function of parameters alone: without batch axes there is nothing to compare
+    if not batched:  # a function of parameters only: without batch axes there is nothing to compare
         assert not per_drone
         batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone=True)
     compiled = jax.jit(lambda batched: function(**batched, **shared_arguments))
     whole = jax.tree.leaves(jax.device_get(compiled(batched)))
     assert whole
     for i in np.ndindex(BATCH):
-        alone = jax.tree.leaves(jax.device_get(compiled(jax.tree.map(lambda x, i=i: x[i], batched))))
-        for many, one in zip(whole, alone, strict=True):
+        single = jax.tree.leaves(jax.device_get(compiled(jax.tree.map(lambda x, i=i: x[i], batched))))
+        for many, one in zip(whole, single, strict=True):
             assert many.shape == (*BATCH, *one.shape)
             assert np.all(np.isfinite(one))
             # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
@@ -137,8 +137,8 @@ def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model,
 
 
 @pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in ("load_lqr", "tracking_lqr")])
-def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
-    """Law 1: drones with random states and setpoints fly in a batch as each drone flies alone.
+def test_drones_in_a_batch_fly_like_single_drones(name, rng):
+    """Law 1: drones with random states and setpoints fly in a batch like single drones.
 
     Controllers that need a load or a trajectory of their own are compared in tests/control.
     """
@@ -162,10 +162,10 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
         "rotor_vel": rng.uniform(1.2e4, 1.6e4, (*BATCH, 4)),
     }
     many, one = (Sim(*counts, control="state", controller=name, engine="interpret") for counts in (BATCH, (1, 1)))
-    together, start = fly(many, many.data, drawn), one.data
+    batch, start = fly(many, many.data, drawn), one.data
     for i in [(0, 0), (2, 1)]:
-        alone = fly(one, start, {key: x[i][None, None] for key, x in drawn.items()})
-        for x, y in zip(together, alone, strict=True):
+        single = fly(one, start, {key: x[i][None, None] for key, x in drawn.items()})
+        for x, y in zip(batch, single, strict=True):
             # float32 rounding, which 25 steps of feedback with gains of PWM amplify
             np.testing.assert_allclose(x[i], y[0, 0], rtol=1e-3, atol=1e-4 * max(1.0, float(np.abs(y).max())))
 

@@ -96,7 +96,7 @@ def test_scopes_determine_the_axes(dynamics, control):
     assert all(counts.values())
 
 
-def test_the_resized_data_are_what_sim_builds():
+def test_the_resized_data_equal_those_of_a_new_simulation():
     """The shapes above are those of a real simulation, with as many worlds as drones and with more drones."""
     for n_worlds, n_drones in ((3, 3), (2, 4)):
         sim = Sim(n_worlds, n_drones, control="state", attitude_freq=100, force_torque_freq=100)
@@ -125,7 +125,7 @@ def test_a_mass_belongs_to_its_world_and_drone(three_by_three):
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 1), (3, 1, 1), (1, 3, 1), (3, 3), (3, 3, 3), (3, 3, 1, 1), (2, 3, 1), ()])
-def test_a_mass_of_a_world_alone_is_refused(three_by_three, shape):
+def test_a_mass_of_a_world_without_an_axis_of_drones_is_refused(three_by_three, shape):
     """Law 2: a parameter is shared or per drone; the user must broadcast a parameter of a world to its drones."""
     wrong = with_params(three_by_three.data, mass=np.full(shape, 0.03, np.float32))
     with pytest.raises(ConfigError) as error:

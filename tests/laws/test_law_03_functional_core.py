@@ -79,13 +79,13 @@ def test_the_shell_only_calls_the_core(start, shell_rollout):
     assert shell_rollout.core.episode[:, 0].tolist() == [0, 1, 0]
 
 
-def test_jit_does_what_the_shell_does(start, shell_rollout):
+def test_jit_agrees_with_the_shell(start, shell_rollout):
     """Law 3: commands, steps and a masked reset as one compiled function."""
     _, data, step, _, commands = start
     assert_close(jax.jit(make_rollout(start, step))(data, jnp.asarray(commands)), shell_rollout)
 
 
-def test_scan_does_what_the_shell_does(start):
+def test_scan_agrees_with_the_shell(start):
     """Law 3: a rollout in ``lax.scan``, a command before every step."""
     sim, data, step, _, commands = start
     commands = np.concatenate([commands, commands[::-1]])

@@ -171,7 +171,7 @@ def test_the_next_query_after_a_change_syncs_once(two_world_sim, syncs, change):
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
     change(two_world_sim)
-    assert not syncs, "a change alone syncs nothing"
+    assert not syncs, "a change syncs nothing"
     two_world_sim.contacts()
     assert len(syncs) == 1
     two_world_sim.contacts()
@@ -248,7 +248,7 @@ def test_a_cleared_flag_is_an_array_of_its_own(two_world_sim):
     assert len(set(map(id, flags))) == len(flags)
 
 
-def test_what_sync_returns_may_be_assigned(two_world_sim, syncs):
+def test_results_of_a_sync_may_be_assigned(two_world_sim, syncs):
     """After the results of sync_sim2mjx are assigned, one redundant sync is allowed, but no stale answer."""
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     syncs.clear()
@@ -278,7 +278,7 @@ def test_queries_share_a_sync_until_the_next_step(one_world_sim, syncs):
     assert len(syncs) == 2
 
 
-def test_pictures_show_the_world_as_it_is_and_leave_mjx_alone(one_world_sim, syncs, opengl):
+def test_pictures_show_the_world_as_it_is_and_do_not_use_mjx(one_world_sim, syncs, opengl):
     """An image after a step shows that step, whether the contacts were up to date or not."""
     one_world_sim.reset()
     one_world_sim.contacts()
@@ -355,7 +355,7 @@ def test_no_scene_state_of_worlds_is_allocated_before_it_is_needed():
     assert scene_bytes() > 1000 * n_worlds
 
 
-def test_data_has_what_was_added_before_the_scene_is_compiled(monkeypatch, syncs):
+def test_data_have_added_objects_before_the_scene_is_compiled(monkeypatch, syncs):
     """Reading data, stepping, commands and resets compile no MuJoCo model; a question does, once for all edits.
 
     The data has the objects and mocap ids that the model will have, between hand-made bodies too.

@@ -51,13 +51,13 @@ def test_a_world_draws_the_same_with_other_numbers_of_worlds(four_world_sim):
 
 
 def test_a_world_draws_the_same_whichever_other_worlds_are_reset(four_world_sim):
-    alone = masses_after_resets(four_world_sim, [False, False, True, False])
-    together = masses_after_resets(four_world_sim, [True, False, True, True])
+    third_reset = masses_after_resets(four_world_sim, [False, False, True, False])
+    others_reset = masses_after_resets(four_world_sim, [True, False, True, True])
     all_worlds = masses_after_resets(four_world_sim, None)
-    np.testing.assert_array_equal(alone[2], all_worlds[2])
-    np.testing.assert_array_equal(together[[0, 2, 3]], all_worlds[[0, 2, 3]])
+    np.testing.assert_array_equal(third_reset[2], all_worlds[2])
+    np.testing.assert_array_equal(others_reset[[0, 2, 3]], all_worlds[[0, 2, 3]])
     # Worlds that the mask leaves out keep their masses.
-    np.testing.assert_array_equal(alone[[0, 1, 3]], np.float32(0.0434))
+    np.testing.assert_array_equal(third_reset[[0, 1, 3]], np.float32(0.0434))
     # World 2 in its second episode draws as it does when all worlds are in theirs.
     twice = masses_after_resets(four_world_sim, [False, False, True, False], [False, True, True, False])
     np.testing.assert_array_equal(twice[2], masses_after_resets(four_world_sim, None, None)[2])

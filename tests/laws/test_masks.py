@@ -63,7 +63,7 @@ def test_traced_masks_are_checked_by_shape_and_type(wrong):
                 jax.eval_shape(fn, WRONG_MASKS[wrong])
 
 
-def test_masks_of_host_and_device_do_what_they_say():
+def test_masks_of_host_and_device_change_only_the_selected_worlds():
     x = np.asarray(gates.set_pose(sim.data, [1, 0, 1], mask=MASK).objects.pos)[:, 0, 0, 0]
     np.testing.assert_array_equal(x, [1, 0, 1])
     for mask in (MASK, np.array(MASK), jnp.array(MASK)):

@@ -376,7 +376,7 @@ def test_invalid_views_are_refused(sim, wrong, message):
 # Many worlds at once ----------------------------------------------------------------------------------------------
 
 
-def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
+def test_warp_draws_the_image_of_the_plain_renderer(opengl, plain_scene):
     """The same places, colours and shapes; edges and shadows are drawn in other ways."""
     pytest.importorskip("warp")
     sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)

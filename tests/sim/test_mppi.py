@@ -77,7 +77,7 @@ def test_equal_seeds_give_equal_commands(sim, mppi):
 
 
 def test_the_command_follows_from_the_cost(sim):
-    """A cost of the thrust alone drops the drone; the command is within the limits."""
+    """A cost of only the thrust drops the drone; the command is within the limits."""
     place_drones(sim, [0, 0, 1.0])
     mppi = MPPI(sim, samples=256, freq=125, horizon=20, cost=lambda states, setpoint, command: command[3] ** 2)
     for _ in range(20):

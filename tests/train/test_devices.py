@@ -109,11 +109,11 @@ def test_two_devices_train_the_student_of_one():
 
 @pytest.mark.long("compiles a training of two seeds and of three for two devices")
 def test_seeds_are_divided_among_devices_or_trained_on_all():
-    """If devices divide the seeds, each trains its own seeds, without exchange. Seeds are trained as they are alone."""
-    alone = Training(ppo, PPO, 1, 16, 1)
+    """Devices that divide the seeds train them without exchange. Seeds are trained as in runs of one seed."""
+    single_training = Training(ppo, PPO, 1, 16, 1)
     two, three = (Training(ppo, PPO, n, 16, 2) for n in (2, 3))
     for training in (two, three):
-        assert_same(agent_of(training, 0), agent_of(alone, 0), atol=1e-5)
+        assert_same(agent_of(training, 0), agent_of(single_training, 0), atol=1e-5)
         assert np.any(agent_of(training, 1).log_std != agent_of(training, 0).log_std)
     assert [x.learner.agents.log_std.addressable_shards[0].data.shape[0] for x in (two, three)] == [1, 3]
     metrics = sum(x.nbytes for x in jax.tree.leaves(two.metrics))

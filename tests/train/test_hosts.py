@@ -90,14 +90,14 @@ def assert_same_files(actual_folder, expected_folder):
 def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_path):
     """One training: complete; continued, and interrupted by Ctrl-C on one host; continued, until a host is killed;
     continued by one process with all devices."""
-    out, alone = tmp_path / "two", tmp_path / "one"
+    out, one_process_folder = tmp_path / "two", tmp_path / "one"
     ended = [process.end() for process in start(tmp_path, training_arguments(out, "--iterations", "3"))]
     assert [status for status, _ in ended] == [0, 0], ended
     assert "16 on each of 4 devices" in ended[0][1]
     assert "host 1 of 2: 2 cpu" in ended[1][1]
     assert "success" not in ended[1][1], "only host 0 reports"
-    assert main(training_arguments(alone, "--iterations", "3", "--devices", "4")) == 0
-    assert_same_files(out, alone)
+    assert main(training_arguments(one_process_folder, "--iterations", "3", "--devices", "4")) == 0
+    assert_same_files(out, one_process_folder)
     assert len(json.loads((out / CURVE_FILE).read_text())) == 2
 
     endless = training_arguments(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")

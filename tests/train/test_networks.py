@@ -281,7 +281,7 @@ def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
 
 
 def plain_network():
-    """Return a network in JAX alone, without memory."""
+    """Return a network in plain JAX, without memory."""
 
     def init(key, n_obs):
         return {"weight": jax.random.normal(key, (n_obs, 8)) / np.sqrt(n_obs)}

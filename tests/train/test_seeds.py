@@ -1,4 +1,4 @@
-"""Several seeds in one program: each is trained as it is alone."""
+"""Several seeds in one program: each is trained as in a program of its own."""
 
 import csv
 import functools
@@ -39,36 +39,36 @@ def block_observations(state, i):
 
 @pytest.mark.long("compiles a training of one seed, and of two")
 @pytest.mark.parametrize(("algorithm", "hyperparameters"), [(ppo, PPO), (apg, APG)], ids=["ppo", "apg"])
-def test_a_seed_trains_with_others_as_it_does_alone(algorithm, hyperparameters):
+def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters):
     """Initial states are equal; agents, metrics and worlds agree to rounding after three iterations, with episodes that
     end in between. Hyperparameters of the seeds differ."""
     wrap = AutoReset if algorithm is ppo else lambda env: env
     env_of_one, env_of_both = (wrap(make("hover", n, randomize="crazyflie", **SECONDS)) for n in (4, 8))
     keys = jax.random.split(jax.random.key(3), 2)
     init = jax.jit(algorithm.init, static_argnums=(0, 1))
-    together, alone = (
+    joint, separate = (
         init(env_of_both, tuple(hyperparameters), keys),
         [init(env_of_one, (hyperparameters[i],), keys[i : i + 1]) for i in range(2)],
     )
     for i in range(2):
-        for name, x in block_observations(alone[i].env, 0).items():
-            np.testing.assert_array_equal(block_observations(together.env, i)[name], x, err_msg=name)
-    assert np.any(block_observations(together.env, 0)["pos"] != block_observations(together.env, 1)["pos"])
+        for name, x in block_observations(separate[i].env, 0).items():
+            np.testing.assert_array_equal(block_observations(joint.env, i)[name], x, err_msg=name)
+    assert np.any(block_observations(joint.env, 0)["pos"] != block_observations(joint.env, 1)["pos"])
     for _ in range(3):
-        together, metrics = algorithm.iterate(together, env_of_both, tuple(hyperparameters))
+        joint, metrics = algorithm.iterate(joint, env_of_both, tuple(hyperparameters))
         for i in range(2):
-            alone[i], reference = algorithm.iterate(alone[i], env_of_one, (hyperparameters[i],))
+            separate[i], reference = algorithm.iterate(separate[i], env_of_one, (hyperparameters[i],))
             for name in metrics:
                 np.testing.assert_allclose(metrics[name][i], reference[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
     for i in range(2):
-        actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((together, i), (alone[i], 0)))
+        actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((joint, i), (separate[i], 0)))
         for x, y in zip(actual, reference, strict=True):
             if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
                 x, y = map(jax.random.key_data, (x, y))
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
-        for name, x in block_observations(alone[i].env, 0).items():
-            np.testing.assert_allclose(block_observations(together.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
-    policies = together.as_policy()
+        for name, x in block_observations(separate[i].env, 0).items():
+            np.testing.assert_allclose(block_observations(joint.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
+    policies = joint.as_policy()
     found = evaluate_blocks(make("hover", 16, **SECONDS), Policies(policies), n_blocks=2)
     for i in range(2):
         expected = evaluate(make("hover", 8, **SECONDS), take_seed(policies, i))
@@ -76,17 +76,19 @@ def test_a_seed_trains_with_others_as_it_does_alone(algorithm, hyperparameters):
             np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-def test_the_random_numbers_of_a_block_are_those_of_its_key_alone():
-    """Resets, ``world_keys`` and ``drone_keys`` give a block the same numbers beside another block as alone. All drones
-    of a world draw from its key."""
+def test_the_random_numbers_of_a_block_depend_only_on_its_key():
+    """Resets, ``world_keys`` and ``drone_keys`` give a block the same numbers with and without another block.
+
+    All drones of a world draw from its key.
+    """
     keys = jax.random.split(jax.random.key(5), 2)
     reset_two, reset_four = (jax.jit(make("swarm", n, engine="plain").reset) for n in (2, 4))
-    together, alone = reset_four(keys), [reset_two(key) for key in keys]
-    for i, state_alone in enumerate(alone):
-        for name, x in state_alone.obs.items():
-            np.testing.assert_array_equal(together.obs[name][2 * i : 2 * i + 2], x, err_msg=name)
+    joint, separate = reset_four(keys), [reset_two(key) for key in keys]
+    for i, separate_state in enumerate(separate):
+        for name, x in separate_state.obs.items():
+            np.testing.assert_array_equal(joint.obs[name][2 * i : 2 * i + 2], x, err_msg=name)
         for draw in (world_keys, drone_keys):
-            x, y = (jax.random.key_data(draw(state.full_data, "gusts")) for state in (together, state_alone))
+            x, y = (jax.random.key_data(draw(state.full_data, "gusts")) for state in (joint, separate_state))
             np.testing.assert_array_equal(x[2 * i : 2 * i + 2], y)
 
 
@@ -145,7 +147,7 @@ def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_no_othe
 
 
 @pytest.mark.long("compiles a training of two seeds, and two of one")
-def test_a_seed_trains_in_a_run_of_several_as_alone_and_an_interrupted_run_resumes(tmp_path, monkeypatch):
+def test_a_seed_trains_in_a_run_of_several_like_in_its_own_run_and_an_interrupted_run_resumes(tmp_path, monkeypatch):
     """An interrupted run resumes bit for bit; its learning curves are those of runs of one seed, to rounding."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     seen = []
@@ -169,9 +171,9 @@ def test_a_seed_trains_in_a_run_of_several_as_alone_and_an_interrupted_run_resum
     assert actual.keys() == reference.keys()
     for name, x in actual.items():
         np.testing.assert_array_equal(x, reference[name], err_msg=name)
-    alone = tmp_path / "alone"
-    train_quietly(alone, seeds=[1])
-    for actual, other in zip(read_curve(whole / "seed-1"), read_curve(alone / "seed-1"), strict=True):
+    separate = tmp_path / "alone"
+    train_quietly(separate, seeds=[1])
+    for actual, other in zip(read_curve(whole / "seed-1"), read_curve(separate / "seed-1"), strict=True):
         for name in ("success", "error", "reward", "check"):
             np.testing.assert_allclose(actual[name], other[name], rtol=1e-3, err_msg=name)
 

@@ -495,7 +495,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
     assert checkpoint.read(path)[1] == {"iteration": 1}
 
 
-def test_a_policy_comes_back_as_it_was(uninterrupted_run):
+def test_a_policy_is_restored_unchanged(uninterrupted_run):
     policy, config, meta = load_policy(uninterrupted_run.folder)
     assert config == small_config()
     assert sum(meta["observations"].values()) == policy.layers[0][0].shape[0]

@@ -254,7 +254,7 @@ def test_law_07_no_nan_in_gradients():
             assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
 
 
-def test_law_01_a_world_flies_as_it_does_alone():
+def test_law_01_a_world_flies_like_a_single_world():
     """Loads have different masses."""
     masses = np.array([[0.0, 0.1], [0.2, 0.3]])
     sim = build(2, 2, height=2.0)

@@ -113,7 +113,7 @@ def test_references_by_arc_length_stop_at_the_end():
     assert abs(np.asarray(record.body_vel)[0, 0, 0]) < 0.02
 
 
-def test_a_car_drives_as_it_does_alone():
+def test_a_car_drives_like_a_single_car():
     sim, _ = build(2, 1, members=3, path=[EIGHT, circle(2.0, speed=1.0)], in_scene=False)
     sim.step(60)
     single_sim, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
