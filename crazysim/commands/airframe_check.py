@@ -1,4 +1,4 @@
-"""Abilities and gaps of an airframe as text, and a picture of its body, for ``crazysim airframe``."""
+"""Capabilities and missing parameters of an airframe as text, and a picture of its body, for ``crazysim airframe``."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ QUARTER_TURN = np.pi / 2
 MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given (dimensionless)."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
-"""Angular acceleration under controller ``auto`` below which a warning is given, rad/s^2: the least of the airframes in
-the tests."""
+"""Angular acceleration under controller ``auto`` below which a warning is given, rad/s^2: the smallest values among the
+airframes in the tests."""
 MAX_PRECESSION_RATIO = 2.5
 """Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable
 (dimensionless). Of 1,960 random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one
 with 4.3 does not."""
 MAX_PRECESSION_FRACTION = 0.25
-"""Fraction of the roll or pitch authority that the gyroscopic torque of the rotors takes up at 1 rad/s, above which a
-warning is given (dimensionless)."""
+"""Ratio of the gyroscopic torque of the rotors at 1 rad/s to the largest roll or pitch torque, above which a warning is
+given (dimensionless)."""
 MAX_TIME_CONSTANT = 0.2
-"""Time constant of rotors above which a warning is given, s: the longest of the airframes in the tests."""
+"""Time constant of rotors above which a warning is given, s: the longest among the airframes in the tests."""
 DEFAULT_FREQ = 500
 """Default rate of the physics, Hz."""
 
@@ -184,7 +184,7 @@ def _missing_parameters(create: Callable[[], Any]) -> str:
 
 
 def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
-    """Yield warnings about allowed settings that are probably mistakes."""
+    """Yield warnings about numbers that are allowed but probably mistakes."""
     positions, ratio = airframe.value("rotors.position"), _thrust_to_weight(airframe)
     if ratio < MIN_THRUST_TO_WEIGHT:
         yield f"thrust over weight is {ratio:.2f}; below {MIN_THRUST_TO_WEIGHT:g} little is left for manoeuvres"

@@ -18,7 +18,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run)
     add = parser.add_argument
     add("--worlds", type=int, dest="n_worlds", metavar="N", help="number of worlds; by default 1024")
-    add("--drones", type=int, dest="n_drones", metavar="N", help="drones in each; by default 4")
+    add("--drones", type=int, dest="n_drones", metavar="N", help="drones in each world; by default 4")
     add("--seconds", type=float, help="simulated time, s; by default 10")
     add("--device", help="device: cpu, gpu; by default cpu")
     add("--out", type=Path, help="folder of the files; by default out")

@@ -157,7 +157,7 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
 
 @jit_eager_calls("n_drones")
 def jerk_feedforward(time: Array, n_drones: int) -> Array:
-    """Return the jerk of every drone's setpoint; its snap and yaw rates are sent as zero.
+    """Return the feedforward of every drone's setpoint: its jerk, and zeros for snap and yaw rates.
 
     Without the jerk, drones lag behind their setpoints in curves.
 
@@ -175,9 +175,10 @@ def jerk_feedforward(time: Array, n_drones: int) -> Array:
 
 
 def build_frame_step(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
-    """Return a jitted function that flies for 1 / FPS seconds, with one setpoint per tick of the state controller.
+    """Return a jitted function of data that flies for 1 / FPS seconds, with one setpoint per tick of the controller.
 
-    It returns the data, and the distance from the setpoint at every tick, m. (n_ticks, n_worlds, n_drones)
+    The function returns the new data, and the distance from the setpoint at every tick, m, of shape
+    (n_ticks, n_worlds, n_drones).
     """
     step = sim.build_step_fn()
     steps_per_tick = sim.freq // sim.control_freq
@@ -208,10 +209,8 @@ def print_report(errors: np.ndarray, pole_contacts: np.ndarray, n_steps: int, st
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
     mean, percentile = settled_errors.mean(), np.percentile(settled_errors, 95)
     print(f"tracking error    {mean:.1f} cm mean, {percentile:.1f} cm 95th percentile")
-    n_contacts_begun, n_worlds = (
-        int(contact_starts.sum() + pole_contacts[0].sum()),
-        int(pole_contacts.any((0, 2, 3)).sum()),
-    )
+    n_contacts_begun = int(contact_starts.sum() + pole_contacts[0].sum())
+    n_worlds = int(pole_contacts.any((0, 2, 3)).sum())
     print(
         f"contacts          {n_contacts_begun:,} begun, in {n_worlds:,} of "
         f"{count_text(pole_contacts.shape[1], 'world')}; {1e3 * contact_s:.1f} ms a query"

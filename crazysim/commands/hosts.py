@@ -1,6 +1,6 @@
-"""Commands that run on several hosts: a process for each host, and the process that starts it and explains its end.
+"""Commands that run on several hosts: a process on each host, and its parent process, which explains its end.
 
-JAX's runtime aborts a process when another host is lost, so only the process that started it can say what happened.
+JAX's runtime aborts a process when another host is lost, so only the parent process can say what happened.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from crazysim.errors import ConfigError, DivergedError
 HOST_VARIABLE = "CRAZYSIM_HOST"
 """Environment variable of the process of a host: its ``Host`` as JSON."""
 STOP_KEY = "crazysim/stop"
-"""Folder of the coordinator's store in which a host writes why it stops."""
+"""Prefix of the keys in the coordinator's store under which hosts write why they stop."""
 STOP_SECONDS = 10
-"""Time for which a host that stops waits for the others, s."""
+"""Time for which a host that stops waits for the other hosts, s."""
 POLL_SECONDS = 0.5
 """Time between two checks whether another host stops, s."""
 END_SECONDS = 24 * 3600
-"""Time that hosts wait for the last one to end, s: host 0 draws and films when the others have finished."""
+"""Time for which hosts wait until the last host ends, s: host 0 draws and films when the others have finished."""
 EXPLAINED_LINE = "crazysim: the end of this host is explained"
 """Line that the process of a host writes when it has printed why it ends, so that its parent prints nothing more."""
 
@@ -42,7 +42,7 @@ class Host:
     """One of the hosts of a command."""
 
     coordinator: str
-    """Address at which host 0 coordinates them, HOST:PORT."""
+    """Address at which host 0 coordinates the hosts, HOST:PORT."""
     host_id: int
     """Number of this host, from 0."""
     n_hosts: int
@@ -50,7 +50,7 @@ class Host:
     devices: list[int] | None
     """Indices of its devices; None for all."""
     heartbeat_timeout: int
-    """Time without a heartbeat after which a host counts as lost, s."""
+    """Time without a heartbeat after which a host is treated as lost, s."""
     connect_timeout: int
     """Time within which all hosts must have connected, s."""
 
@@ -85,8 +85,8 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     """Run a command on this host together with others, and return the exit status.
 
     Args:
-        command: The command. It runs in a process of its own, which is connected with the other hosts.
-        options: Its options, including the options of ``add_options``, and ``arguments``, from which they were parsed.
+        command: The command. It runs in a separate process, which is connected with the other hosts.
+        options: Options of the command, including those of ``add_options``, and ``arguments``, the command line.
 
     Raises:
         ConfigError: If the options are invalid, or no hosts are found.
@@ -161,9 +161,9 @@ def _explain_end(log: str, status: int, host: Host, arguments: Sequence[str]) ->
 
     Args:
         log: Messages of JAX's runtime and other libraries.
-        status: Its exit status; -n for signal n.
+        status: Exit status of the process; -n for signal n.
         host: The host.
-        arguments: Arguments of its command.
+        arguments: Arguments of the command.
     """
     if "RegisterTask" in log:
         others = "the other hosts" if host.host_id == 0 else f"host 0 at {host.coordinator}"
@@ -255,7 +255,7 @@ _end_lock = threading.Lock()
 
 
 def _end_process(host: Host, line: str, reason: str | None) -> None:
-    """Print a line, write the reason for the other hosts if there is one, wait until they end, and end the process."""
+    """Print a line, send a reason to the other hosts unless it is None, wait until they end, and end the process."""
     from crazysim.jaxcompat import connected_hosts
 
     if not _end_lock.acquire(blocking=False):
@@ -276,7 +276,7 @@ def _end_process(host: Host, line: str, reason: str | None) -> None:
 
 
 def _stop_with_others(host: Host, parent: int) -> None:
-    """End this process as soon as another host stops with an error, or the process that started this one has ended."""
+    """End this process as soon as another host stops with an error, or the parent process has ended."""
     from crazysim.jaxcompat import connected_hosts
 
     while True:
@@ -293,5 +293,5 @@ def _stop_with_others(host: Host, parent: int) -> None:
 
 
 def _notify_parent() -> None:
-    """Write the line for the process that started this one: the reason of the end has been printed."""
+    """Write ``EXPLAINED_LINE`` to the log that the parent process reads."""
     os.write(2, f"{EXPLAINED_LINE}\n".encode())

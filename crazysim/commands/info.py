@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield the name of each line and a function that returns the rest of it."""
+    """Yield the name of each line and a function that returns the text after the name."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
     yield "system", lambda: f"{platform.platform()}, {_n_cores()} CPU cores"

@@ -53,7 +53,7 @@ def specified_options(options: argparse.Namespace, *names: str) -> dict[str, Any
 
 
 def has_screen() -> bool:
-    """Return True if there may be a screen for a window; on Linux, if a variable of the environment names one."""
+    """Return True if there may be a screen for a window; on Linux, if an environment variable names one."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
@@ -77,7 +77,7 @@ def load_policy_and_env(
 
     Args:
         folder: Folder of the run.
-        device: Device of the environment; None for the training's.
+        device: Device of the environment; None for the device of the training.
         n_worlds: Number of worlds of the environment.
         task: Reference of the task, if it has moved since training; None for the reference in the run.
 

@@ -43,7 +43,7 @@ class Airframe:
     """Constants of a drone type, as plain numbers in SI units (rotor speeds in rpm)."""
 
     name: str
-    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
+    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without that key."""
     values: Mapping[str, NDArray[np.float64]]
     """All numbers by dotted path, such as ``rigid_body.mass``, as float64 arrays, without units and sources."""
     not_inherited_reason: str = ""
@@ -93,7 +93,7 @@ class Airframe:
         return (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - np.asarray(thrust)))) / (2 * k2)
 
     def missing_reason(self, path: str) -> str:
-        """Return the reason why a table or value of the base was not inherited, followed by a space; empty for none."""
+        """Return why a table or value of the base was not inherited, with a space at the end; empty if it was."""
         return (
             f"{self.not_inherited_reason} "
             if self.not_inherited_reason and path.partition(".")[0] in TUNED_TABLES
@@ -129,7 +129,7 @@ class Airframe:
 
     @property
     def mixing_matrix(self) -> NDArray[np.float64]:
-        """Rotor thrusts to torque over the arm, 1. (3, n_rotors)
+        """Matrix from rotor thrusts to torque divided by the arm, 1. (3, n_rotors)
 
         A rotor at (x, y) with thrust f exerts the torque (y f, -x f), so the rows are y / arm, -x / arm and
         the sign of the torque that its drag exerts on the body about z.
@@ -140,12 +140,12 @@ class Airframe:
 
     @property
     def rotor_vel_limits(self) -> NDArray[np.float64]:
-        """Speeds of the least and the largest thrust of a rotor that is on, rpm. (2, 1 or n_rotors)"""
+        """Speeds of a rotor at ``rotors.thrust_min`` and ``rotors.thrust_max``, rpm. (2, 1 or n_rotors)"""
         return self.rotor_vel([[self.value("rotors.thrust_min", ())], [self.value("rotors.thrust_max", ())]])
 
     @property
     def full_thrust_voltage(self) -> float | None:
-        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None without a curve that reaches it."""
+        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None if the airframe has no such curve."""
         if "battery.thrust_over_voltage" not in self.values:
             return None
         excess = self.value("battery.thrust_over_voltage") - [self.value("rotors.thrust_max"), 0, 0, 0]

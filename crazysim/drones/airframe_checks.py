@@ -1,4 +1,4 @@
-"""Check that a drone with the numbers of an airframe can fly."""
+"""Checks that a drone with the numbers of an airframe can fly."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ MAX_ROTOR_VEL = 1e6
 MIN_SINGULAR_VALUE = 1e-3
 """Smallest singular value of the mixing matrix; a quadrotor in X has 2."""
 MAX_INERTIA_EXCESS, INERTIA_ROUNDING = 0.05, 1e-5
-"""Relative excess of the largest moment of inertia over the sum of the others: up to ``INERTIA_ROUNDING`` it is
-ignored, and up to ``MAX_INERTIA_EXCESS`` it is only a warning, since moments that were measured one by one can have
-such an excess. RotorPy's Crazyflie has 1%."""
+"""Limits of the relative excess of the largest moment of inertia over the sum of the others. An excess up to
+``INERTIA_ROUNDING`` is ignored, and an excess up to ``MAX_INERTIA_EXCESS`` is only a warning, since moments that were
+measured separately can have it. RotorPy's Crazyflie has 1%."""
 
 
 def check_airframe(airframe: Airframe) -> None:

@@ -22,25 +22,25 @@ from crazysim.tables import POSITIVE, read_number
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
 PITCH_RATIO = 0.5
-"""Pitch over diameter of a propeller whose pitch is not given, 1."""
+"""Default ratio of the pitch to the diameter of a propeller, 1."""
 OUTER_MASS_SHARE = 0.4
 """Fraction of the mass that is located at the rotors, 1; the inertias about z of the built-in airframes correspond to
 0.31 to 0.53."""
 MERIT_DIAMETERS, FIGURES_OF_MERIT = (0.127, 0.254), (0.44, 0.68)
 """Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover, 1."""
 DRAG_RATE = 0.45
-"""Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.29 to 0.58."""
+"""Ratio of linear drag to mass, 1/s; the built-in airframes that were identified from flights have 0.29 to 0.58."""
 ROTOR_TIME_CONSTANT = 0.05
 """Time constant of rotors up to 10 inches, s."""
 MAX_TABLE_ERROR = 0.05
 """Fraction of the largest value of a motor table by which thrust or torque may fall where the speed rises, or by which
 two columns of one quantity may differ: an assumption about the errors of data sheets."""
 IDLE_THRUST_RATIO = 0.05
-"""Smallest over largest thrust of a rotor that is on, 1."""
+"""Ratio of the smallest to the largest thrust of a rotor that is on, 1."""
 MOTOR_EFFICIENCY = 0.75
-"""Mechanical power over electric power of a motor with its speed controller, 1."""
+"""Ratio of mechanical to electric power of a motor with its speed controller, 1."""
 BATTERY_SHARE = 0.22
-"""Mass of the battery over the drone's mass, 1; a Crazyflie 2.1 Brushless has 0.21."""
+"""Ratio of the battery's mass to the drone's mass, 1; a Crazyflie 2.1 Brushless has 0.21."""
 BATTERY_ENERGY = 153.0
 """Energy per mass of lithium-polymer batteries, W h/kg."""
 CELL_VOLTAGE = 3.7
@@ -48,7 +48,7 @@ CELL_VOLTAGE = 3.7
 CELL_RESISTANCE = 0.015
 """Resistance of a cell times its capacity, ohm A h."""
 MAX_DISC_LOADING = 1e4
-"""Thrust over disc area above which units must be wrong, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
+"""Thrust per disc area above which units must be wrong, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
 MotorTable = str | Path | Mapping[str, ArrayLike]
 """Path of a CSV file, or its columns."""
 COLUMNS = {
@@ -66,7 +66,7 @@ SOURCES = {
     "of the nose; rotors 1, 3, ... turn counter-clockwise seen from above",
     "spins": "Rotors that turn counter-clockwise seen from above have -1: their drag turns the body clockwise",
     "inertia": f"estimate: {OUTER_MASS_SHARE:g} of the mass as points at the rotors, the rest at the centre; inertias "
-    "of the built-in airframes correspond to 0.31 to 0.52",
+    "of the built-in airframes correspond to 0.31 to 0.53",
     "thrust_to_weight": "Thrust over weight of {ratio:g}: ratio mass g / number of rotors",
     "thrust_min": f"estimate: {IDLE_THRUST_RATIO:g} thrust_max, rotors that idle",
     "thrust_curve": "estimate: T = C_T rho n^2 D^4 with n in 1/s, rho = 1.225 kg/m^3, C_T = 0.0427 + 0.144 pitch / D = "
@@ -79,7 +79,7 @@ SOURCES = {
     "lag": f"estimate: first order with {ROTOR_TIME_CONSTANT:g} s, longer in proportion to the diameter beyond 0.254 "
     "m; thrust of cf21B_500 has 0.06 s around hover, of hb_x500 (10 inch) 0.045 to 0.071 s",
     "drag": f"estimate: {DRAG_RATE:g} 1/s times the mass; airframes identified from flights (cf21B_500, cf2x_L250, "
-    "hb_x500) have 0.35 to 0.58 1/s",
+    "hb_x500) have 0.35 to 0.57 1/s",
     "cells": "estimate: 1 cell below 0.1 kg, 3 below 0.5 kg, 4 below 3 kg, else 6",
     "battery_mass": f"estimate: capacity times {CELL_VOLTAGE:g} V per cell over {BATTERY_ENERGY:g} W h/kg, as in a "
     "pack of 3.4 A h, 4 cells and 0.329 kg (MK-quadro)",
@@ -88,7 +88,7 @@ SOURCES = {
     "1 to 4 mohm when new (rchelicopterfun.com, LiPo Internal Resistance)",
     "propeller": "Radius of the propeller that was given",
 }
-"""Descriptions of the sources of a file, filled in where they are used."""
+"""Templates of the descriptions of a file's sources, by the name of the source."""
 
 
 def estimate_airframe(
@@ -199,7 +199,7 @@ class _AirframeFile:
         self.sources[source] = text
 
     def text(self) -> str:
-        """Return the file."""
+        """Return the text of the file."""
         lines = [
             f"# {self.name}, written by crazysim airframe new. Every number is {{ value, unit, source }}; [sources]",
             "# has the formula and the origin of each. Replace estimates by what you measure.",
@@ -237,7 +237,7 @@ def _rotor_layout(
     spins: Sequence[int] | None,
     propeller: float,
 ) -> tuple[NDArray, NDArray]:
-    """Return positions and signs of the yaw torques of the rotors."""
+    """Return positions (n, 3), m, and signs of the yaw torques (n,) of the rotors; describe a layout in the file."""
     if (arm is None) == (positions is None):
         raise ConfigError("expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.")
     if positions is None:
@@ -303,7 +303,7 @@ def _add_thrust(
     table: MotorTable | None,
     pitch: float | None,
 ) -> float:
-    """Add the thrust and its curves; return the largest thrust of one rotor, N."""
+    """Add the largest thrust and the curves of thrust and torque; return the largest thrust of one rotor, N."""
     if (ratio is None) == (table is None):
         raise ConfigError(
             "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
@@ -414,7 +414,7 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
 
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
-    """Return the columns of a CSV file whose first line has their names."""
+    """Return the columns of a CSV file by their names in its first line."""
     if not is_file(path):
         raise ConfigError(f"expected a motor table as an existing CSV file, got {str(path)!r}")
     lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line[0] != "#"]

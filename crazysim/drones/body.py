@@ -23,7 +23,7 @@ MATERIALS = {
 """Colours that all drones share, rgba."""
 
 BATTERY_VOLUME = 1.2e-4
-"""Volume of a derived battery over the mass of the drone, m^3/kg; the built-in airframes have 0.8e-4 to 1.7e-4."""
+"""Default ratio of the battery's volume to the drone's mass, m^3/kg; the built-in airframes have 0.8e-4 to 1.7e-4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows it from behind."""
     shape = body_shape(airframe)
     camera_pos = shape["track_camera"]
-    # Looking ahead from behind: right is body -y, and up is tilted forward by as much as the camera looks down.
+    # The camera looks ahead from behind: its right is body -y, and its up is tilted forward as far as it looks down.
     camera_up = np.array([-camera_pos[2] * np.sign(camera_pos[0]), 0, abs(camera_pos[0])]) / np.hypot(
         camera_pos[0], camera_pos[2]
     )

@@ -24,19 +24,20 @@ BODY_KEYS = (
     "rotors.thrust_max",
     "rotors.thrust_curve",
 )
-"""Numbers for which the gains and fits of an airframe hold."""
+"""Numbers on which the gains and fits of an airframe depend."""
 
 
 def load_airframe(source: AirframeSource) -> Airframe:
     """Return the airframe from a name, a TOML file anywhere on disk, or a dict of the same tables.
 
-    A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
-    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. If one of
-    ``BODY_KEYS`` differs, gains and fits (``TUNED_TABLES``) are not inherited, except for ``controller.thrust2torque``
-    where neither the thrust curve nor the torque curve is given.
+    A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. The
+    key ``base`` is the name or path of another airframe, from which missing numbers are inherited. If one of
+    ``BODY_KEYS`` differs from the base, gains and fits (``TUNED_TABLES``) are not inherited, except for
+    ``controller.thrust2torque`` if neither the thrust curve nor the torque curve is given.
 
     Args:
-        source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
+        source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe, which is returned
+            unchanged.
 
     Raises:
         UnknownNameError: If the source is neither the name of an airframe nor a file.
@@ -67,7 +68,7 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
 
 
 def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
-    """Return the numbers that an airframe inherits, and the reason why it does not inherit all, empty if it does.
+    """Return the numbers that an airframe inherits, and the reason why some are not inherited (empty if all are).
 
     Args:
         base: The base.

@@ -1,4 +1,4 @@
-"""Airframe parameters of the dynamics, importable under the same module path as in Crazyflow."""
+"""Airframe parameters of the dynamics, under Crazyflow's import path."""
 
 from crazysim.dynamics.parameter_tables import load_fn_params, load_params, rotor_vel_limits
 

@@ -29,7 +29,7 @@ from crazysim.geometry.vector import Vector, axis_vector, normalize, rounding_ma
 BestDirection = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""
 SupportPoint = tuple[Vector, list[Array]]
-"""Support point of the Minkowski difference, m, and its point of the segment or box, in the frame of the latter, m."""
+"""Support point of the Minkowski difference, m, and the support point of the segment or box in its own frame, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,10 +47,10 @@ class ShapePair:
 
     def gap(self, n: Vector) -> Array:
         """Return the gap between the shapes along a unit direction from the other shape to this one, m. (...)"""
-        out = self.centre.dot(n) - support.support_function(self.other, n)
+        gap = self.centre.dot(n) - support.support_function(self.other, n)
         for edge, half in zip(self.edges, self.half, strict=True):
-            out = out - half * jnp.abs(edge.dot(n))
-        return out
+            gap = gap - half * jnp.abs(edge.dot(n))
+        return gap
 
     def support_coordinates(self, n: Vector) -> list[Array]:
         """Return the support point of the segment or box opposite to a direction, in its own frame, m. (...) each"""
@@ -69,12 +69,12 @@ class ShapePair:
         return self.point_at(coordinates) - support.support_point(self.other, n), coordinates
 
     def with_candidate(self, n: Vector, best: BestDirection) -> BestDirection:
-        """Return the direction with the larger gap: the given one or the best so far."""
+        """Return the direction with the larger gap: ``n`` or the best direction so far."""
         return larger_gap((self.gap(n), n), best)
 
 
 def larger_gap(candidate: BestDirection, best: BestDirection) -> BestDirection:
-    """Return the direction with the larger gap; on a tie, the old one."""
+    """Return the direction with the larger gap; on a tie, ``best``."""
     is_larger = candidate[0] > best[0] + rounding_margin(best[0].dtype) * jnp.abs(best[0])
     return jnp.where(is_larger, candidate[0], best[0]), select_vector(is_larger, candidate[1], best[1])
 
@@ -83,7 +83,8 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
     """Return the direction between the nearest points of separated shapes, and the nearest point of the first shape.
 
     A triangle of support points of the Minkowski difference moves towards the origin. Each step adds the support point
-    along the direction to the triangle's nearest point, and keeps the nearest of the three triangles that contain it.
+    opposite to the direction of the triangle's nearest point. The new triangle is the nearest of the three that join it
+    with two of the corners.
 
     Args:
         pair: The two shapes.

@@ -1,7 +1,7 @@
 """Signed distances, negative inside: from a point to a shape, and from the shape of a drone to another shape.
 
 The shape of a drone has a core, which is a point, a segment or a box, and a radius around it. This module has the
-closed forms; ``convex`` computes the rest.
+closed forms; ``overlap.convex_distance`` computes the distances of all other pairs.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, normalize, select_vector, to_vector
 
 MIN_COMPONENT = 1e-12
-"""Component of a unit direction below which a ray counts as parallel; its inverse and square fit into float32."""
+"""Component of a unit direction below which a ray is treated as parallel; float32 can hold its inverse and square."""
 
 Hit = tuple[Array, Vector]
 """Distance along a ray, m (...), infinite where it misses, and the outward normal of the plane that it hits."""
@@ -67,7 +67,7 @@ def _face_hits(
 
 
 def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the hits of the box below z = 0."""
+    """Return the nearest hit of the box below z = 0."""
     x_half, y_half, _, base = shape.size
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
@@ -88,7 +88,7 @@ def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
 
 
 def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the hits of the walls between z = 0 and the surface."""
+    """Return the nearest hit of the walls between z = 0 and the surface."""
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
     for t, n, x, y in _face_hits(shape.size[:2], origin, direction):  # type: ignore[arg-type]
@@ -99,7 +99,7 @@ def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
 
 
 def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the hits of the triangles, by traversing the cells below each ray in order."""
+    """Return the nearest hit of the triangles, by traversing the cells below each ray in order."""
     ground = shape.array("heights")
     n_rows, n_columns = ground.shape
     heights = jnp.asarray(ground, origin.x.dtype)

@@ -32,7 +32,7 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     """Return the signed distance from a point to the ground, m. (...)
 
     The cell below the point and all cells within ``radius`` are examined. Distances of a magnitude up to ``radius`` are
-    exact; larger ones are upper bounds, the distance to the nearest examined cell. The sign is always correct.
+    exact; larger results are the distance to the nearest examined cell, an upper bound. The sign is always correct.
 
     Args:
         shape: Height field.
@@ -60,9 +60,9 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     """Return the signed distance from a box or a segment to the ground, m. (...)
 
     For separated shapes the nearest points are a corner of the box and a point of the ground, or a point of the box
-    and one on an edge of the ground. The result is exact up to half the diagonal of the box, and an upper bound beyond.
-    For overlapping shapes, the depth is the larger of the depths of the deepest corner and edge. The shortest
-    translation out of all triangles at once can be longer.
+    and a point on an edge of the ground. Distances up to half the diagonal of the box are exact; larger results are
+    upper bounds. For overlapping shapes, the depth is the larger of the depths of the deepest corner and edge. The
+    shortest translation that separates the box from all triangles can be longer.
 
     Args:
         half: Half lengths of the box, m; zeros for a segment. (3,)
@@ -70,12 +70,12 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
         pos: Position of the centre of the box in the frame of the field, m. (..., 3)
         rot: Rotation matrix from the frame of the box to the frame of the field. (..., 3, 3)
     """
-    size = math.sqrt(sum(h * h for h in half))
+    half_diagonal = math.sqrt(sum(h * h for h in half))
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0] if h else [0.0] for h in half], indexing="ij"), axis=-1).reshape(-1, 3)
     local_corners = jnp.asarray(signs * np.asarray(half), pos.dtype)
     corners = pos[..., None, :] + sum(rot[..., None, :, k] * local_corners[:, k, None] for k in range(3))
-    corner_distance = jnp.min(field_distance(shape, corners, size), axis=-1)
-    grid = nearby_corners(shape, to_vector(lax.stop_gradient(pos)), 2 * size)
+    corner_distance = jnp.min(field_distance(shape, corners, half_diagonal), axis=-1)
+    grid = nearby_corners(shape, to_vector(lax.stop_gradient(pos)), 2 * half_diagonal)
     axes = [to_vector(rot[..., k]) for k in range(3)]
     position = to_vector(pos)
     a, b = edges(grid)
@@ -157,7 +157,7 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
     Args:
         heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)
         half: Half extents along x and y, m. (2,)
-        point: Point in the frame of the field; its z does not count, m. (..., 3)
+        point: Point in the frame of the field, m; its z is ignored. (..., 3)
 
     Returns:
         Height, m (...), unit normal, upwards (..., 3), and True on the field (...).
@@ -193,7 +193,7 @@ def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
 def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Return the triangle below a point: the position in its cell, its rises, and the height of the cell's origin.
 
-    A point outside the grid belongs to the plane of the nearest cell.
+    For a point outside of the grid, it is the triangle of the nearest cell.
 
     Args:
         heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)

@@ -1,7 +1,7 @@
 """Contact manifolds: the points at which two balls or boxes touch, with normals and gaps.
 
-The functions take one pair, as small arrays; use ``jax.vmap`` for many. The number of points depends only on the kinds
-of the two bodies, and points that do not exist have a large gap.
+The functions take one pair of bodies, as small arrays; use ``jax.vmap`` for many. The number of points depends only on
+the kinds of the two bodies, and points that do not exist have a large gap.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from crazysim.geometry.small_matrices import matmul, matvec
 N_BOX_POINTS = 13
 """Number of contact points between two boxes."""
 MIN_EDGE_SINE = 1e-3
-"""Sine of the angle between two edges below which they span no separating axis."""
+"""Sine of the angle between two edges below which their cross product is not used as a separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
 """An axis of two edges is chosen if its overlap is less than ``EDGE_SHARE`` times the overlap of the best face minus
 ``EDGE_BIAS`` times the smallest half length. Faces are preferred because their several points rest more steadily."""
 FACE_BIAS = 1e-3
-"""A face of the first box is chosen unless one of the second has less overlap by this fraction of the smallest half
-length. Otherwise rounding would choose between aligned boxes, and impulses of the last step would not match the
-points."""
+"""Preference for faces of the first box, as a fraction of the smallest half length: a face of the second box is chosen
+only if its overlap is smaller by this length. Otherwise rounding would choose between the faces of aligned boxes, and
+impulses of the last step would not match the points."""
 FACE_SHARE = 1 - 1e-4
 """Fraction of a face within which the corners of the other face are separate points. Closer to the border, the clipped
 edges give the points; they are clipped at ``2 - FACE_SHARE`` times the half lengths of the face."""
@@ -112,12 +112,12 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     edge_gaps = jnp.where(
         is_defined, jnp.abs(jnp.sum(axes * offset, axis=-1)) - half_extent, -OUTSIDE_DISTANCE
     ).reshape(-1)
-    pair = jnp.argmax(lax.stop_gradient(edge_gaps))
-    is_edge_contact = edge_gaps[pair] > EDGE_SHARE * face_gaps[best_face] + EDGE_BIAS * min_half
-    # If the boxes are apart, the axis with the largest distance counts, face or edge. Without the bias, rounding would
-    # choose between level faces that touch.
+    edge_pair = jnp.argmax(lax.stop_gradient(edge_gaps))
+    is_edge_contact = edge_gaps[edge_pair] > EDGE_SHARE * face_gaps[best_face] + EDGE_BIAS * min_half
+    # If the boxes are apart, the axis with the largest distance is chosen, of a face or of two edges. Without the bias,
+    # rounding would choose between level faces that touch.
     is_edge_contact = jnp.where(
-        face_gaps[best_face] > 0, edge_gaps[pair] > face_gaps[best_face] + FACE_BIAS * min_half, is_edge_contact
+        face_gaps[best_face] > 0, edge_gaps[edge_pair] > face_gaps[best_face] + FACE_BIAS * min_half, is_edge_contact
     )
 
     is_a = best_face < 3
@@ -125,7 +125,7 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     face = tuple(jnp.where(is_a, x, y) for x, y in zip(*boxes, strict=True))
     other = tuple(jnp.where(is_a, y, x) for x, y in zip(*boxes, strict=True))
     gap, normal, point = _clip_face(face, best_face % 3, other)
-    gap_edge, normal_edge, point_edge = _edge_contact(boxes, pair, axes.reshape(-1, 3)[pair], offset)
+    gap_edge, normal_edge, point_edge = _edge_contact(boxes, edge_pair, axes.reshape(-1, 3)[edge_pair], offset)
     gap = jnp.concatenate(
         [
             jnp.where(is_edge_contact, OUTSIDE_DISTANCE, gap),
@@ -138,7 +138,9 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
 
 
 def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Return gaps, normal of the face towards the other box, and points of the other's nearest face clipped to it.
+    """Return gaps, normal and points of the contact between a face of a box and the nearest face of another box.
+
+    The normal points towards the other box, whose face is clipped to the face of the first.
 
     Args:
         face: Half lengths, position and attitude of the box with the face.
@@ -151,12 +153,12 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     normal = side * rot[:, 0]
     other_normal = matvec(other[2].T, normal)
     other_axis = jnp.argmax(lax.stop_gradient(jnp.abs(other_normal)))
-    half_o, _, rot_o = _renumber_axes(other, other_axis)
-    # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
+    half_other, _, rot_other = _renumber_axes(other, other_axis)
+    # Middle and half edges of the other box's nearest face, in the frame of the face: two axes in it and its normal.
     sign = jnp.where(other_normal[other_axis] > 0, -1.0, 1.0)
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
-    middle = matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
-    edge_1, edge_2 = half_o[1] * matvec(frame, rot_o[:, 1]), half_o[2] * matvec(frame, rot_o[:, 2])
+    middle = matvec(frame, offset + sign * half_other[0] * rot_other[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
+    edge_1, edge_2 = half_other[1] * matvec(frame, rot_other[:, 1]), half_other[2] * matvec(frame, rot_other[:, 2])
     other_corners = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     edges = jnp.roll(other_corners, -1, axis=0) - other_corners
     limit = half[1:] * (2 - FACE_SHARE)
@@ -173,7 +175,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     valid = [is_clipped, is_clipped & (end < 1)]  # the end of an edge is the beginning of the next
     # Clip to the edge: for an edge parallel to the border up to rounding, the computed ends can be kilometres away.
     candidates = [other_corners + jnp.clip(x, 0.0, 1.0)[:, None] * edges for x in (start, end)]
-    # Corners of the face, projected along its normal onto the other's nearest face.
+    # Corners of the face, projected along its normal onto the other box's nearest face.
     face_corners = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
     det = jnp.where(jnp.abs(det) > 1e-12, det, 1e-12)
@@ -185,22 +187,22 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     candidates.append(jnp.concatenate([face_corners, height[:, None]], axis=-1))
     points = jnp.concatenate(candidates)
     gap = jnp.where(jnp.concatenate(valid), points[:, 2], OUTSIDE_DISTANCE)
-    local = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
-    return gap, normal, pos + jnp.sum(local[:, :, None] * frame[None], axis=-2)
+    local_points = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
+    return gap, normal, pos + jnp.sum(local_points[:, :, None] * frame[None], axis=-2)
 
 
 def _edge_contact(
-    boxes: tuple[tuple[Array, ...], ...], pair: Array, axis: Array, offset: Array
+    boxes: tuple[tuple[Array, ...], ...], edge_pair: Array, axis: Array, offset: Array
 ) -> tuple[Array, Array, Array]:
-    """Return gap, normal and point of the contact of two edges, number ``pair // 3`` of b and ``pair % 3`` of a."""
+    """Return gap, normal and point of the contact of edge ``edge_pair // 3`` of b with edge ``edge_pair % 3`` of a."""
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     ends = []
-    for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):
+    for (half, pos, rot), number, side in zip(boxes, (edge_pair % 3, edge_pair // 3), (-1.0, 1.0), strict=True):
         local_normal = matvec(rot.T, normal)
         is_edge = jnp.arange(3) == number
-        local = jnp.where(is_edge, 0.0, side * jnp.where(local_normal < 0, -1.0, 1.0) * half)
+        local_middle = jnp.where(is_edge, 0.0, side * jnp.where(local_normal < 0, -1.0, 1.0) * half)
         direction = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
-        ends.append((pos + matvec(rot, local), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
+        ends.append((pos + matvec(rot, local_middle), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
     (p, u, half_p), (q, v, half_q) = ends
     offset_pq = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, offset_pq), (v, offset_pq)))

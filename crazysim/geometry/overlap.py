@@ -21,12 +21,12 @@ from crazysim.geometry.triangle import MIN_SQUARED_SINE
 from crazysim.geometry.vector import Vector, axis_vector, normalize, select_vector, stack_vectors, to_vector
 
 SEPARATION_STEPS = 16
-"""Steps towards the nearest points of separated shapes; polytopes need few, curved shapes more."""
+"""Number of steps towards the nearest points of separated shapes; curved shapes need more than polytopes."""
 TOUCH_STEPS = 24
-"""Further steps from the best direction towards the nearest or touching points."""
+"""Number of further steps from the best direction towards the nearest or touching points."""
 SEPARATION_SHARE = 0.02
-"""Distance to which overlapping shapes are separated for these steps, as a fraction of the largest half length of the
-moving shape."""
+"""Distance to which overlapping shapes are separated for the further steps, as a fraction of the largest half length of
+the moving shape."""
 N_ARCS = 16
 """Number of arcs of a circle of directions, each searched for the smallest depth."""
 N_ARC_STEPS = 6
@@ -56,7 +56,7 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     fallback = axis_vector(2, centre.x)
     best, _ = find_separation(fixed_pair, normalize(fixed_pair.centre, fallback), SEPARATION_STEPS)
     gap, n = find_overlap(fixed_pair, a.kind == "box", best)
-    # Once moved apart along the direction found, the shapes have nearest points, at which they would touch first.
+    # Overlapping shapes have no nearest points. They are moved apart along the best direction to find these points.
     clearance = SEPARATION_SHARE * max(half)
     separated_pair = dataclasses.replace(
         fixed_pair, centre=fixed_pair.centre + n * jnp.where(gap < clearance, clearance - gap, 0.0)
@@ -70,7 +70,7 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
 
 def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDirection:
-    """Return the best of a direction and all candidate normals of the Minkowski difference."""
+    """Return the direction with the largest gap: ``best``, or a candidate normal of the Minkowski difference."""
     b, edges = pair.other, pair.edges
     box_axes = [axis_vector(k, pair.centre.x) for k in range(3)]
     sides = {"box": box_axes, "cylinder": box_axes[2:]}.get(b.kind, [])
@@ -89,14 +89,14 @@ def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDire
 
 
 def _select_best(candidates: BestDirection, best: BestDirection) -> BestDirection:
-    """Return the best of the directions along the first axis and the best so far."""
+    """Return the direction with the largest gap: ``best``, or one of the candidates along the first axis."""
     for k in range(candidates[0].shape[0]):
         best = larger_gap((candidates[0][k], candidates[1][k]), best)
     return best
 
 
 def _best_face_normal(pair: ShapePair) -> BestDirection:
-    """Return the best of the face normals of a mesh."""
+    """Return the face normal of a mesh with the largest gap."""
     normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
     x, y, z = (jnp.asarray(column, pair.centre.x.dtype) for column in normals.T)
 
@@ -112,7 +112,7 @@ def _best_face_normal(pair: ShapePair) -> BestDirection:
 
 
 def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
-    """Return the best of a direction and of an ellipsoid's normals nearest to corners of the box or segment."""
+    """Return the direction with the largest gap: ``best``, or an ellipsoid's normal at a point nearest to a corner."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
     def try_corner(k: Array, best: BestDirection) -> BestDirection:
@@ -175,6 +175,7 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         )
         return m, q, jnp.where(is_larger, peak_gap, gap), best_arc
 
+    # An arc is (n, p, m, q, peak): directions n and m with support points p and q, and the estimate between them.
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first = support_point(start)
     _, _, gap, widest_arc = lax.fori_loop(

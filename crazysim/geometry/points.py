@@ -1,8 +1,8 @@
-"""Signed distances from a point to shapes of each kind but height fields, negative inside.
+"""Signed distances from a point to shapes of all kinds except for height fields, negative inside.
 
-Formulas are in components, with selections instead of branches. Most take a few dozen scalar operations for a point, an
-ellipsoid a few hundred; those of a mesh grow with its planes and triangles. At a switch the gradient is taken from one
-side.
+Formulas are in components, with selections instead of branches. Most take a few dozen scalar operations for a point,
+and an ellipsoid takes a few hundred; for a mesh, their number grows with its planes and triangles. Where the gradient
+jumps, the gradient of one side is returned.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class SizedShapes:
     """Primitives of one kind with arrays as sizes, as in a loop over many objects."""
 
     kind: str
-    """Kind of the shapes; one that ``Shape`` describes by its size alone."""
+    """Kind of the shapes; a kind that ``Shape`` describes by its size only."""
     size: Sequence[Array]
     """Size in the convention of the kind, m. (...) each"""
 
@@ -53,7 +53,7 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
 def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Array:
     """Return the distance along rays to the surface of a shape, m, infinite where they miss. (...)
 
-    For the conventions see ``ray_distance``. Rays in components make a loop over many objects element-wise
+    For the conventions see ``ray_distance``. With rays in components, a loop over many objects is element-wise
     arithmetic, which compilers fuse and vectorise.
 
     Args:
@@ -180,7 +180,7 @@ def _mesh_interval(shape: Shape, origin: Components, direction: Components) -> I
 def first_distance(interval: Interval) -> Array:
     """Return the distance at which a ray first meets the surface of a shape, from the interval of its line. (...)
 
-    It is infinite where the ray misses. A ray from inside meets the surface where it leaves.
+    The distance is infinite where the ray misses. A ray from inside meets the surface where it leaves the shape.
     """
     near, far, is_crossing = interval
     is_hit = is_crossing & (far >= 0)

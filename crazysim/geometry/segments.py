@@ -9,7 +9,7 @@ from crazysim.geometry.points import Components, magnitude, maximum
 from crazysim.rotation import clip, safe_sqrt
 
 MIN_SQUARED_SINE = 1e-12
-"""Square of a sine below which two directions count as parallel."""
+"""Square of a sine below which two directions are treated as parallel."""
 
 
 def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:

@@ -15,7 +15,7 @@ N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "elli
 MAX_HULL_VERTICES = 64
 """Largest number of vertices whose convex hull is computed, by trying every triangle."""
 UNBOUNDED_LENGTH = 1e18
-"""Half length that represents an unbounded one, m; its square fits into float32."""
+"""Half length of unbounded shapes in ``bounding_box``, m; float32 can hold its square."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

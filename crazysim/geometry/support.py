@@ -17,12 +17,12 @@ from crazysim.geometry.vector import Vector
 
 
 def sharpness(dtype: jnp.dtype) -> float:
-    """Return the inverse of the angle, 1/rad, within which two corners count as tied."""
+    """Return the inverse of the angle, 1/rad, within which support points are interpolated between two corners."""
     return 1e3 if dtype == jnp.float32 else 1e7
 
 
 def segment_support_point(half: float, direction: Array) -> Array:
-    """Return the support point of a segment, m along it, from the component of the direction along it. (...)"""
+    """Return the support point as a coordinate along a segment, m, for the direction's component along it. (...)"""
     return half * jnp.clip(direction * sharpness(direction.dtype), -1.0, 1.0)
 
 

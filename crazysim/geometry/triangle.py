@@ -47,7 +47,7 @@ def _nearest_on_segment(a: Vector, side: Vector) -> Array:
 
 
 def _nearer_point(candidate: Barycentric, current: Barycentric, a: Vector, b: Vector, c: Vector) -> Barycentric:
-    """Return the point nearer to the origin; on a tie, the old one."""
+    """Return the point nearer to the origin; on a tie, ``current``."""
     p, q = from_barycentric(candidate, a, b, c), from_barycentric(current, a, b, c)
     square = q.dot(q)
     return _choose(p.dot(p) < square * (1 - rounding_margin(square.dtype)), candidate, current)

@@ -79,7 +79,7 @@ def normalize(v: Vector, fallback: Vector, min_square: float = 0.0) -> Vector:
 
 
 def rounding_margin(dtype: jnp.dtype) -> float:
-    """Return the relative margin by which a number must exceed another to count as larger despite rounding.
+    """Return the relative margin by which a number must exceed another to be treated as larger despite rounding.
 
     A compiler may recompute a comparison for each component of a selected vector with different rounding, and so mix
     the components of two vectors that tie.

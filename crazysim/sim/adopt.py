@@ -22,7 +22,7 @@ VehicleKind = AirframeSource | type[Population]
 
 
 def known_kinds() -> dict[str, VehicleKind]:
-    """Return the airframes and populations that need no entry in ``kinds``, by the prefix of their vehicles' names."""
+    """Return the airframes and populations that need no entry in ``kinds``, by the prefix in the names of vehicles."""
     from crazysim.plugins.vehicles import Bicycles, Cars  # imported only when an MJCF file is read
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
@@ -77,7 +77,7 @@ def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Arra
 
     Args:
         vehicles: The vehicles.
-        template: An array that gives the number of worlds, its first axis, and the type of the results.
+        template: An array with the type of the results and a first axis over worlds.
     """
     poses = [v.pos for v in vehicles], [v.quat for v in vehicles]
     pos, quat = (jnp.asarray(np.broadcast_to(x, (template.shape[0], *np.shape(x))), template.dtype) for x in poses)
@@ -87,8 +87,8 @@ def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Arra
 def remove_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list[Vehicle]:
     """Return the vehicles of a spec, and remove their bodies from it.
 
-    A vehicle is a child of the world body that can move (a mocap body, or a body with joints) and whose name is a
-    prefix, an underscore and a number.
+    A vehicle is a child of the world body that can move (a mocap body, or a body with joints). Its name is a prefix, an
+    underscore and a number.
 
     Args:
         spec: The spec, which is changed in place.

@@ -1,4 +1,4 @@
-"""The settings of a simulation, checked."""
+"""The checked settings of a simulation."""
 
 from __future__ import annotations
 
@@ -68,17 +68,17 @@ class Configuration:
     device: jax.Device
     """Device of the data."""
     mesh: Mesh | None
-    """Devices that the worlds are spread over at construction; None for the one device."""
+    """Devices over which the worlds are distributed at construction; None for ``device`` only."""
     engine: str
     """Engine that executes steps, one of ``crazysim.engine.ENGINES``."""
     strict: bool
     """True to raise an error where a slower engine would be used with a warning."""
 
     def check(self, data: Any, reference: SimData) -> None:
-        """Check that data belong to a simulation with these settings; it takes some tens of microseconds.
+        """Check that data belong to a simulation with these settings; takes some tens of microseconds.
 
-        Of states and commands, last axes and types are checked too; the batch axes of all leaves are checked by the
-        step.
+        The last axes and the types of states and commands are checked too. The step checks the batch axes of all
+        leaves.
 
         Args:
             data: Data to check.
@@ -124,11 +124,8 @@ class Configuration:
         switch: Callable[..., Array] | ArrayLike | None = None,
     ) -> Configuration:
         """Return the configuration for the arguments of ``Sim``, as users pass them."""
-        n_worlds, n_drones, freq = (
-            positive_integer("n_worlds", n_worlds),
-            positive_integer("n_drones", n_drones),
-            physics_freq(freq),
-        )
+        n_worlds, n_drones = positive_integer("n_worlds", n_worlds), positive_integer("n_drones", n_drones)
+        freq = physics_freq(freq)
         n_drones = len(drone) if n_drones == 1 and is_airframe_list(drone) and len(drone) else n_drones
         dynamics, control = enum_member(Dynamics, "dynamics", dynamics), enum_member(Control, "control", control)
         integrator = enum_member(Integrator, "integrator", integrator)
@@ -153,7 +150,7 @@ class Configuration:
 
 
 def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
-    """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones."""
+    """Return the plugins of a new simulation: those for ``estimator`` and ``aero``, then the listed plugins."""
     shorthand_plugins: list[Plugin] = []
     if estimator is not None:
         from crazysim.plugins.estimators import find_estimator
@@ -173,7 +170,7 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
 
 
 def _check_fields(name: str, record: Any, reference: Any, fields: Sequence[str]) -> None:
-    """Check that fields of a record are arrays with the last axis and the kind of numbers of those of a reference."""
+    """Check that fields of a record are arrays with the same last axis and kind of numbers as in a reference."""
     for field in fields:
         value, expected = getattr(record, field, None), getattr(reference, field, None)
         if value is expected:

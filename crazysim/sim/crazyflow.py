@@ -1,4 +1,4 @@
-"""Functions of Crazyflow's API that only its users call; modules with Crazyflow's import paths export them."""
+"""Functions of Crazyflow's API that crazysim itself does not use; modules with Crazyflow's import paths export them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) ->
     """Return a copy of a record with fields replaced in the worlds of a mask.
 
     Args:
-        record: Record whose named fields begin with an axis over worlds, or broadcast to one.
+        record: Record; the replaced fields have a first axis over worlds, or broadcast to such a shape.
         mask: True in the worlds to change; None for all. (n_worlds,)
         **changes: New values. (n_worlds, ...)
     """
@@ -41,7 +41,7 @@ def world_mask(tree: Tree) -> Tree:
 
 
 def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None = None) -> Tree:
-    """Return a tree with the batched leaves of another tree in the worlds of a mask.
+    """Return a tree in which batched leaves have the values of another tree in the worlds of a mask.
 
     Args:
         tree: Tree to change.
@@ -60,7 +60,7 @@ def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None 
 def render_depth(
     sim: Sim, camera: int | str = 0, resolution: tuple[int, int] = (100, 100), include_drone: bool = False
 ) -> Array:
-    """Return the depth image of one camera in every world, m: along the ray, -1 where it meets nothing.
+    """Return the depth image of one camera in every world, m: along the ray, -1 where a ray hits nothing.
 
     ``sim.depth`` returns the images of all drones' cameras at once, and hides each drone from its own camera only.
 
@@ -83,7 +83,7 @@ def render_depth(
 
 
 def _select_in_worlds(mask: Any, new: Any, old: Any) -> Array:
-    """Return new values in the worlds of a mask, and old ones elsewhere; the mask is checked."""
+    """Check the mask, and return new values in its worlds and old values elsewhere."""
     new = jnp.asarray(new)
     n_worlds = np.broadcast_shapes(new.shape, np.shape(old))[:1]
     return select_worlds(as_mask(mask, n_worlds), new, old)

@@ -21,9 +21,9 @@ Color = tuple[float, float, float]
 
 
 def attach_splats(sim: Sim, scene: str | Path | None = None, drone: str | Path | None = None) -> None:
-    """Read a scene of splats that is in the world frame, for the functions below.
+    """Read a scene of splats for the functions below; its coordinates are in the world frame, m.
 
-    ``SplatScene`` and ``sim.scene.splat_fn`` are the same for any pose and scale.
+    For other poses and scales, use ``SplatScene`` and ``sim.scene.splat_fn``.
 
     Args:
         sim: Simulation.

@@ -1,4 +1,4 @@
-"""Records of a simulation, where Crazyflow has them."""
+"""Records of a simulation, under Crazyflow's import path."""
 
 from crazysim.control import Control
 from crazysim.core.controls import (

@@ -1,4 +1,4 @@
-"""Derivatives of all drones by model, where Crazyflow has them."""
+"""Derivatives of all drones by model, under Crazyflow's import path."""
 
 from crazysim.core.stages import first_principles_derivative as first_principles_dynamics
 from crazysim.core.stages import fitted_derivative as so_rpy_dynamics

@@ -131,7 +131,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         leaf: casadi.vertcat(*(written_values.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
         for leaf, symbol in symbols.items()
     }
-    # Leaves that the next state depends on belong to the state, and so do leaves that these depend on.
+    # A leaf is part of the state if the next value of any leaf of the state depends on it.
     while memory_leaves := [
         leaf
         for leaf, symbol in symbols.items()
@@ -141,7 +141,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         state += memory_leaves
     state = state[: len(STATES)] + sorted(state[len(STATES) :])
     parts = {"x": state, "u": inputs[:1], "p": inputs[1:]}
-    used_parts = [part for part, members in parts.items() if members]
+    used_parts = [part for part, part_leaves in parts.items() if part_leaves]
     arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[part])) for part in used_parts]
     x_next = casadi.vertcat(*(next_values[leaf] for leaf in state))
     return CasadiStep(
@@ -152,10 +152,10 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
 
 
 def _step_expressions(program: Program, initial_value: Callable[[Slot], Any]) -> dict[Slot, Any]:
-    """Return the expressions that a step writes.
+    """Return the expressions of the values that a step writes.
 
     Raises:
-        ConfigError: If it cannot be exported; the message names the stage.
+        ConfigError: If the step cannot be exported; the message names the stage.
     """
     for segment in program.segments:
         if isinstance(segment, UnfusedStage):

@@ -1,4 +1,4 @@
-"""Commands as pure functions, where Crazyflow has them."""
+"""Commands as pure functions, under Crazyflow's import path."""
 
 from crazysim.core.functional import (
     attitude_control,

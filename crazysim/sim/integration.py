@@ -1,4 +1,4 @@
-"""Integrators, where Crazyflow has them."""
+"""Integrators, under Crazyflow's import path."""
 
 from crazysim.core.integration import Integrator, euler, rk4, symplectic_euler
 

@@ -52,8 +52,8 @@ class Member:
     population: str
     """Name of its population; ``"drone"`` for a drone."""
 
-    def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage: StageCommand):
-        self._sim, self.name, self.index, self._plugin, self._stage = sim, name, index, plugin, stage
+    def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage_command: StageCommand):
+        self._sim, self.name, self.index, self._plugin, self._stage_command = sim, name, index, plugin, stage_command
         self.population, self.lock = DRONE_POPULATION if plugin is None else plugin.name, sim.lock
 
     def __getattr__(self, field: str) -> Array:
@@ -64,7 +64,7 @@ class Member:
 
     @locked
     def set(self, **values: ArrayLike) -> None:
-        """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each."""
+        """Write fields of the record, such as ``pos``: (...) for all worlds, or (n_worlds, ...) for each world."""
         record, new_values = self._record(), {}
         for field, value in values.items():
             if field not in self._fields():
@@ -78,31 +78,31 @@ class Member:
 
     @locked
     def command(self, command: ArrayLike) -> None:
-        """Stage a command for this drone or member alone: (k,), or (n_worlds, k) for each world.
+        """Stage a command for this drone or member only: (k,) for all worlds, or (n_worlds, k) for each world.
 
-        A drone takes a command of the simulation's level, a member a command of its population's level.
+        A drone takes a command of the simulation's command level, and a member takes a command of its population.
         """
         data, plugin = self._sim.data, self._plugin
         if plugin is not None:
             if plugin.command_field is None:
                 raise ConfigError(f"expected a population that takes commands, got {self.population!r}, which does not")
             record = plugin.read(data)
-            staged = self._replace_checked_row(
+            staged_command = self._replace_checked_row(
                 f"command of {self.name}", getattr(record, plugin.command_field), command
             )
-            self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
+            self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged_command}))
             return
         level = data.controls.mode
-        staged, *feedforward_leaves = F.staged_leaves(data)
+        staged_command, *feedforward_leaves = F.staged_leaves(data)
         if level == Control.rotor_vel:
             command = self._pad_rotors(command, command_shape(data, level)[-1])
-        staged = self._replace_checked_row(f"{level.value} command of {self.name}", staged, command)
-        # the feedforward of the other drones stays
+        staged_command = self._replace_checked_row(f"{level.value} command of {self.name}", staged_command, command)
+        # The feedforward of other drones does not change.
         feedforward = [
-            _replace_row(x, self.index, _read_row(F.default_feedforward(staged), self.index))
+            _replace_row(x, self.index, _read_row(F.default_feedforward(staged_command), self.index))
             for x in feedforward_leaves
         ]
-        self._stage(staged, *feedforward)
+        self._stage_command(staged_command, *feedforward)
 
     def _pad_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
         """Return rotor speeds padded with zeros for the rotors that this drone lacks."""
@@ -146,9 +146,9 @@ def _read_row(x: Array | NDArray, index: int) -> Any:
 
 
 def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
-    """Return rows with the row of one drone or member replaced. (n_worlds, n, ...)
+    """Return an array with the row of one drone or member replaced. (n_worlds, n, ...)
 
-    They are a NumPy array if ``x`` is on the host and ``value`` is not a JAX array.
+    The result is a NumPy array if ``x`` is on the host and ``value`` is not a JAX array.
     """
     if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
@@ -167,13 +167,13 @@ def _replace_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Ar
     return x.at[:, index].set(value)
 
 
-def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: StageCommand) -> Member:
+def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage_command: StageCommand) -> Member:
     """Return the view of a drone or member of a population among the plugins."""
     if name in (drones := sim.names[: sim.n_drones]):
-        return Member(sim, name, drones.index(name), None, stage)
+        return Member(sim, name, drones.index(name), None, stage_command)
     for plugin in plugins.values():
         if isinstance(plugin, Population) and name in plugin.names:
-            return Member(sim, name, plugin.names.index(name), plugin, stage)
+            return Member(sim, name, plugin.names.index(name), plugin, stage_command)
     raise UnknownNameError(
         f"expected the name of a drone or member, got {name!r}. {_suggest_names(str(name), sim.names)}"
     )

@@ -36,12 +36,12 @@ COMMAND_LEVELS = (Control.attitude, Control.body_rate, Control.force_torque, Con
 
 
 class MPPIMemory(PyTree):
-    """The plan of every drone, from one command to the next."""
+    """The planned commands of every drone, which one call of ``MPPI`` passes to the next."""
 
     plan: Array = leaf("drone", 2)
     """Commands at the knots of the horizon. (n_worlds, n_drones, n_knots, k)"""
     count: Array = leaf("shared", 0)
-    """Number of commands so far; enters the random numbers. ()"""
+    """Number of commands so far. The random numbers depend on it. ()"""
 
 
 class RolloutRecord(PyTree):
@@ -56,17 +56,18 @@ class RolloutRecord(PyTree):
 
 
 def tracking_cost(states: SimState, setpoint: Setpoint, command: Array) -> Array:
-    """Return the cost of tracking errors: squares of position and velocity errors, yaw error, body rates. ()
+    """Return the cost of a control step: squares of position and velocity errors, yaw error, body rates. ()
 
-    An error of 1 m costs as much as 2 m/s, 90 degrees of yaw, or a body rate of 10 rad/s; a height below 5 cm costs 10
+    An error of 1 m costs as much as 2 m/s, 90 degrees of yaw, or a body rate of 10 rad/s. A height below 5 cm costs 10
     more.
     """
     del command
-    pos, vel = states.pos - setpoint.pos, states.vel - setpoint.vel
-    yaw = rotation.yaw(states.quat) - setpoint.yaw[0]
-    rates = jnp.sum(states.ang_vel * states.ang_vel)
-    crash = jnp.where(states.pos[2] < 0.05, 10.0, 0.0)
-    return jnp.sum(pos * pos) + 0.25 * jnp.sum(vel * vel) + (1 - jnp.cos(yaw)) + 0.01 * rates + crash
+    pos_error, vel_error = states.pos - setpoint.pos, states.vel - setpoint.vel
+    yaw_error = rotation.yaw(states.quat) - setpoint.yaw[0]
+    rate_cost = 0.01 * jnp.sum(states.ang_vel * states.ang_vel)
+    crash_cost = jnp.where(states.pos[2] < 0.05, 10.0, 0.0)
+    error_cost = jnp.sum(pos_error * pos_error) + 0.25 * jnp.sum(vel_error * vel_error) + (1 - jnp.cos(yaw_error))
+    return error_cost + rate_cost + crash_cost
 
 
 def setpoint_after(setpoint: Setpoint, t: Array) -> Setpoint:
@@ -98,7 +99,7 @@ class MPPI:
     the plan is shifted by one control step. A plan is a polyline through ``knots`` commands over the horizon. With the
     same seed, equal calls return equal commands.
 
-    Drones of a world are sampled together but weighted separately, which suits drones that do not interact.
+    Drones of a world are sampled together but weighted separately, which assumes that drones do not interact.
     Rollouts begin at step 0, also for effects that depend on the time since the reset.
     """
 
@@ -123,11 +124,11 @@ class MPPI:
             horizon: Number of control steps of a rollout.
             samples: Number of rollouts for each world.
             substeps: Physics steps of a control step.
-            knots: Number of commands that make a plan, 2 to ``MAX_KNOTS``.
-            freq: Rate of the rollouts' physics, Hz; None for the simulation's. A control step lasts
+            knots: Number of commands in a plan, 2 to ``MAX_KNOTS``.
+            freq: Rate of physics steps in rollouts, Hz; None for the rate of the simulation. A control step lasts
                 ``substeps / freq`` s, and ``command`` must be called once in that time.
             noise: Standard deviation of the samples around the plan, in the units of the command, (k,); None for a
-                default of the level.
+                default of the command level.
             temperature: Temperature as a fraction of the mean excess of the costs over the lowest cost.
             cost: Cost of a control step; the cost of a rollout is the sum over its control steps.
             seed: Seed of the samples.
@@ -187,7 +188,7 @@ class MPPI:
 
         Args:
             data: The data of the simulation, from which rollouts start.
-            setpoint: Setpoint now: of every drone, or one for all. (n_worlds, n_drones, ...) or (...)
+            setpoint: Present setpoint of every drone, (n_worlds, n_drones, ...), or of all drones, (...).
 
         Returns:
             Command of the simulation's level. (n_worlds, n_drones, k)
@@ -199,12 +200,12 @@ class MPPI:
         """Return the command of every drone and the memory for the next call; pure, and one compiled call.
 
         Args:
-            memory: From ``init``, or from the last call.
+            memory: Result of ``init``, or of the last call.
             data: The data of the simulation.
             setpoint: As for ``command``.
 
         Returns:
-            Command of the simulation's level (n_worlds, n_drones, k); the memory.
+            Command of the simulation's level (n_worlds, n_drones, k), and the memory for the next call.
         """
         arguments = (memory, data, setpoint)
         return (self._plan if is_traced(arguments) else self._compiled_plan)(*arguments)
@@ -277,7 +278,7 @@ class MPPI:
         return stage_command(data, self._command_at(data, data.core.steps))
 
     def _cost_stage(self, data: SimData) -> SimData:
-        """Add the cost of the control step that has just ended; the clock has advanced already."""
+        """Add the cost of the control step that has just ended; the step counter has been incremented already."""
         record = data.plugins[RECORD_NAME]
         t = data.core.steps.astype(record.cost.dtype) / data.core.freq
         command = self._command_at(data, data.core.steps - self.substeps)

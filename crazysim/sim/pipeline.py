@@ -1,4 +1,4 @@
-"""Functions that edit pipelines, where Crazyflow has them."""
+"""Functions that edit pipelines, under Crazyflow's import path."""
 
 from crazysim.core.pipeline import (
     Pipeline,

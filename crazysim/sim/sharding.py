@@ -1,4 +1,4 @@
-"""Functions that distribute worlds over devices, importable under the same module path as in Crazyflow."""
+"""Functions that distribute worlds over devices, under Crazyflow's import path."""
 
 from crazysim.core.sharding import shard, shardings_of, world_mesh
 

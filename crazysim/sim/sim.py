@@ -68,8 +68,9 @@ __all__ = [
 class Sim:
     """Worlds of drones that advance together.
 
-    ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
-    the scene. Physics does not depend on the scene, which is updated lazily, when contacts or images are requested.
+    ``data`` holds everything that changes. ``step_pipeline`` and ``reset_pipeline`` hold the stages that change it.
+    ``spec`` describes the scene. Physics does not depend on the scene, which is updated lazily, when contacts or images
+    are requested.
 
     Threads may share a simulation: a lock lets only one call at a time change its data.
     """
@@ -111,36 +112,36 @@ class Sim:
 
         Args:
             n_worlds: Number of worlds.
-            n_drones: Number of drones in each.
+            n_drones: Number of drones in each world.
             drone: Name of a built-in airframe, path of a TOML file, dict, or airframe; or a list of these, one for each
-                drone, whose length is then ``n_drones``.
+                drone. The length of a list replaces an ``n_drones`` of 1.
             dynamics: Dynamics model.
             control: Command level.
             integrator: Integration scheme.
             freq: Physics steps per second, Hz.
-            state_freq: Rate of the state controller, Hz; 100 for ``"auto"``, ``"pid"`` and ``"crazyflow"``, 500 for
-                other controllers, or the largest divisor of ``freq`` below.
-            attitude_freq: Rate of the attitude controller, Hz; 500, or the largest divisor of ``freq`` below.
-            body_rate_freq: Rate of the body-rate controller, Hz; as ``attitude_freq``.
-            force_torque_freq: Rate of the allocation, Hz; as ``attitude_freq``.
+            state_freq: Rate of the state controller, Hz. None for the largest divisor of ``freq`` up to 100 Hz for the
+                controllers ``"auto"``, ``"pid"`` and ``"crazyflow"``, and up to 500 Hz for others.
+            attitude_freq: Rate of the attitude controller, Hz; None for the largest divisor of ``freq`` up to 500 Hz.
+            body_rate_freq: Rate of the body-rate controller, Hz; None as for ``attitude_freq``.
+            force_torque_freq: Rate of the allocation, Hz; None as for ``attitude_freq``.
             device: Device of the data: a platform such as ``"cpu"`` or ``"gpu"``, or a device.
             xml_path: MJCF scene; None for floor, light and sky.
             rng_key: Seed, or a key.
-            mesh: Devices to spread the worlds over, from ``crazysim.core.sharding.world_mesh``.
+            mesh: Devices over which the worlds are distributed, from ``crazysim.core.sharding.world_mesh``.
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` selects the fastest that
                 can run the step pipeline here, which ``explain`` names.
             strict: True to raise an error where a slower engine would be used with an ``EngineWarning``.
             controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
                 ``crazysim.control.controllers.CONTROLLERS``, such as ``"crazyflow"`` for the cascade of Crazyflow, or a
-                ``crazysim.control.Controller``; or a list of several. The rates above replace its own.
-            switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
-                indices, () or (n_worlds, n_drones).
-            estimator: Filter on whose estimate the controllers fly: ``"kalman"``, with an ``IMU`` and a
-                ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with
-                sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state.
-                Shorthand for its sensors and itself before all other ``plugins``.
+                ``crazysim.control.Controller``; or a list of several. The rates above replace the controller's rates.
+            switch: Index of the controller in use, for a list of controllers: a function
+                ``(state, setpoint, time) -> index`` of one drone, or indices, () or (n_worlds, n_drones).
+            estimator: Filter that provides the state for the controllers: ``"kalman"``, with an ``IMU`` and a
+                ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with its
+                sensors, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state. The
+                sensors and the estimator are added before ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
-                for the model alone. Shorthand for ``Residual()`` before ``plugins``.
+                for the dynamics model only. Shorthand for ``Residual()`` before ``plugins``.
             plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. A
                 plugin whose initial state depends on the drones' poses, such as a load, should be added by ``add``
                 when they are in place.
@@ -192,7 +193,7 @@ class Sim:
         plugins: Sequence[Plugin] = (),
         **settings: Any,
     ) -> Sim:
-        """Return a simulation with the vehicles of an MJCF, at their poses; everything else there is the scene.
+        """Return a simulation with the vehicles of an MJCF, at their poses; everything else in the file is the scene.
 
         Vehicles are the children of the world with a joint, or mocap bodies, whose names are a prefix and a number:
         ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by the airframes' bodies.
@@ -200,8 +201,8 @@ class Sim:
         Args:
             xml_path: MJCF file.
             n_worlds: Number of worlds.
-            kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.known_kinds``
-                returns the known ones.
+            kinds: Airframes, or subclasses of ``Population``, for prefixes other than those in
+                ``crazysim.sim.adopt.known_kinds()``.
             plugins: Plugins, which are added when all vehicles are at their poses.
             **settings: Further arguments of ``Sim``.
 
@@ -265,7 +266,7 @@ class Sim:
 
     @property
     def default_data(self) -> SimData:
-        """The data that resets return to."""
+        """The data that resets restore."""
         self._adopt_scene()
         return self._default_data
 
@@ -278,7 +279,7 @@ class Sim:
         """Update the objects and mocap ids in the data after an edit of the scene, without compiling the scene."""
         if self._adopted_revision == self._scene.revision:
             return
-        with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
+        with self.lock, jax.ensure_compile_time_eval():  # keeps arrays from becoming tracers inside a user's trace
             self._adopted_revision = self._scene.revision
             self.data = self._update_objects(self._stepper.data)
             self._default_data = self._stepper.put_on_device(self._update_objects(self._default_data))
@@ -294,7 +295,7 @@ class Sim:
 
     @locked
     def build_data(self) -> SimData:
-        """Replace the data by data at rest, as at construction, with a new record of every plugin, and return it."""
+        """Replace the data by the data of drones at rest, with new records of all plugins, and return the new data."""
         c, freqs = self.configuration, dict(self.configuration.control_freqs)
         data = SimData.create(
             c.n_worlds, c.n_drones, c.dynamics, c.control, c.airframes, c.freq, freqs, self._scene.drone_mocap_ids,
@@ -305,13 +306,13 @@ class Sim:
         return self.data
 
     def build_default_data(self) -> SimData:
-        """Make the present data the data that resets return to, and return it."""
+        """Make the present data the data that resets restore, and return it."""
         self.default_data = self.data
         return self.default_data
 
     @locked
     def shard(self, mesh: Mesh) -> SimData:
-        """Spread data, default data and scene over devices, and return the data."""
+        """Distribute data, default data and scene over devices, and return the data."""
         default = self.default_data
         self.mesh = self._stepper.mesh = mesh
         self.data = shard(self.data, mesh)
@@ -333,13 +334,13 @@ class Sim:
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add an effect, a sensor, a log or any other plugin, and return it.
 
-        Its record is added to ``data.plugins`` of the data and the default data, its stages to the step pipeline, its
-        influences and states to the integration, and its objects, if it adds any to the scene, to ``data.objects``.
-        Nothing else in the data changes. The step is compiled again.
+        The plugin's record is added to ``plugins`` of the data and the default data, and objects that it adds to the
+        scene are added to ``data.objects``. Nothing else in the data changes. Its stages are added to the step
+        pipeline, and its influences and states to the integration. The step is compiled again.
 
         Args:
             plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
-            name: Name to add it under; None for ``plugin.name``.
+            name: Name of the added plugin; None for ``plugin.name``.
         """
         return self.plugins.add(plugin, name)
 
@@ -354,9 +355,9 @@ class Sim:
 
     @locked
     def replace(self, plugin: P) -> P:
-        """Replace the settings of the plugin of the same name; its states continue.
+        """Replace the settings of the plugin of the same name, and return the new plugin; its states are unchanged.
 
-        Where only numbers change (the fields declared with ``parameter``), nothing is compiled.
+        If only numbers change (fields declared with ``parameter``), nothing is compiled.
         """
         return self.plugins.replace(plugin)
 
@@ -367,7 +368,7 @@ class Sim:
 
     @property
     def control_freq(self) -> int:
-        """Rate at which staged commands take effect, Hz; with rotor commands that is every step."""
+        """Rate at which staged commands take effect, Hz; for rotor speeds, the rate of physics steps."""
         return self.configuration.control_freqs.get(self.configuration.control, self.configuration.freq)
 
     @property
@@ -529,7 +530,7 @@ class Sim:
 
     @locked
     def reset(self, mask: ArrayLike | None = None) -> None:
-        """Return all worlds, or the worlds of a mask, to ``default_data``, and run the reset pipeline.
+        """Reset all worlds, or the worlds of a mask, to ``default_data`` by the reset pipeline.
 
         Args:
             mask: True in worlds to reset, of type bool; None for all. (n_worlds,)
@@ -620,7 +621,8 @@ class Sim:
         """Bring the scene up to date, if anything has changed since the last sync.
 
         Args:
-            world: World to write into ``mj_data``, without touching the others; None for all, in ``mjx_data``.
+            world: World that is written into ``mj_data``, without a sync of other worlds; None for a sync of all worlds
+                in ``mjx_data``.
         """
         data = self._data_with_moved_objects()
         if world is not None:
@@ -639,7 +641,7 @@ class Sim:
         drones per world MJX keeps only the nearest ``max_geom_pairs``; set it to -1 and call ``build_mjx`` for all.
 
         Args:
-            body: Name of a body, such as ``"drone:0"``, to which a slot must belong; None for all.
+            body: Name of a body, such as ``"drone:0"``, to return False for slots of other bodies; None for all slots.
 
         Returns:
             (n_worlds, n_slots), bool
@@ -652,8 +654,8 @@ class Sim:
     def contact_report(self, objects: ObjectSelection = None, floor: bool = True, drones: bool = True) -> ContactReport:
         """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
 
-        Computed by JAX from the poses in the data; the poses of bodies that were attached to ``spec`` and are moved
-        through ``mjx_data`` come from there. Fields that were not requested are None and are not computed.
+        JAX computes the report from the poses in the data, and from the poses in ``mjx_data`` of other bodies that can
+        move. Fields that were not requested are None and are not computed.
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.

@@ -1,4 +1,4 @@
-"""Gaussian splats, where Crazyflow has them."""
+"""Gaussian splats, under Crazyflow's import path."""
 
 from crazysim.sim.crazyflow_splats import attach_splats
 

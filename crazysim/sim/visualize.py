@@ -1,4 +1,4 @@
-"""Overlays of the next image, which depth images do not show, and colours of drones' materials."""
+"""Overlays of the next image, and colours of drones' materials; depth images show no overlays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def draw_line(
     Args:
         sim: Simulation.
         points: World frame, m. (n, 3)
-        rgba: Colour, 0 to 1, one or one per segment; None for red. (4,) or (n - 1, 4)
+        rgba: Colour, 0 to 1, of all segments or of each; None for red. (4,) or (n - 1, 4)
         start_size: Width at the first point, pixels.
         end_size: Width at the last point, pixels.
     """
@@ -94,7 +94,7 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
     Args:
         sim: Simulation with command level ``state``.
         world: Index of the world.
-        rgba: Colour, 0 to 1, one or one per drone; None for red. (4,) or (n_drones, 4)
+        rgba: Colour, 0 to 1, of all drones or of each; None for red. (4,) or (n_drones, 4)
         size: Radius, m.
     """
     if sim.data.controls.state is None:
@@ -118,8 +118,8 @@ def change_material(
         sim: Simulation.
         mat_name: Name of the material without the index of the drone.
         drone_ids: Indices of the drones. (n,)
-        rgba: Colour, 0 to 1, one or one per drone. (4,) or (n, 4)
-        emission: Emission, 0 to 1, one or one per drone. () or (n,)
+        rgba: Colour, 0 to 1, of all these drones or of each; None for no change. (4,) or (n, 4)
+        emission: Emission, 0 to 1, of all these drones or of each; None for no change. () or (n,)
     """
     ids = np.asarray(drone_ids)
     if ids.ndim != 1 or not np.issubdtype(ids.dtype, np.integer):

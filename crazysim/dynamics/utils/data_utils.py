@@ -12,11 +12,11 @@ from crazysim import rotation
 from crazysim.errors import ConfigError
 
 LEVEL_DURATION = 0.1
-"""Duration at the start of a log over which its attitude is taken to be level, s."""
+"""Duration at the start of a log over which the mean attitude is defined as level, s."""
 OUTLIER_DISTANCE = 0.3
 """Distance along an axis from the median over ``MEDIAN_DURATION`` beyond which a position is an outlier, m."""
 MEDIAN_DURATION = 0.1
-"""Duration over which the median is taken, s; over longer ones, fast turns look like outliers."""
+"""Duration over which the median is taken, s; with a longer one, fast turns look like outliers."""
 CUTOFFS = {"translation": 6.0, "rotation": 8.0}
 """Cutoffs of the filters of Crazyflow's identification, Hz."""
 
@@ -29,7 +29,7 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
             ``cmd_f``, collective thrust, N, (n,).
 
     Returns:
-        The same, with ``dt``, s, (n - 1,), and ``rpy``, rad, (n, 3).
+        The same columns, and ``dt``, s, (n - 1,), and ``rpy``, rad, (n, 3).
 
     Raises:
         ConfigError: If a column is missing, the time does not increase, or nearly all positions are outliers.
@@ -70,9 +70,9 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         data: A log from ``preprocessing``.
 
     Returns:
-        The same, with ``SVF_pos``, m, ``SVF_vel``, m/s, ``SVF_acc``, m/s^2, and ``SVF_jerk``, m/s^3, world frame,
-        (n, 3); ``SVF_rpy``, rad, ``SVF_drpy``, rad/s, ``SVF_ddrpy``, rad/s^2, and ``SVF_dddrpy``, rad/s^3, (n, 3);
-        ``SVF_quat``, body to world, unit, xyzw, (n, 4); ``SVF_cmd_f``, N, (n,); ``SVF_cmd_rpy``, rad, (n, 3).
+        The same columns, and ``SVF_pos``, m, ``SVF_vel``, m/s, ``SVF_acc``, m/s^2, and ``SVF_jerk``, m/s^3, world
+        frame, (n, 3); ``SVF_rpy``, rad, ``SVF_drpy``, rad/s, ``SVF_ddrpy``, rad/s^2, and ``SVF_dddrpy``, rad/s^3, (n,
+        3); ``SVF_quat``, body to world, unit, xyzw, (n, 4); ``SVF_cmd_f``, N, (n,); ``SVF_cmd_rpy``, rad, (n, 3).
     """
     log = {key: np.asarray(x, np.float64) for key, x in data.items()}
     time = log["time"]
@@ -98,7 +98,7 @@ def state_variable_filter(
     """Filter a signal by a Butterworth low-pass backward and forward in time; return it and its derivatives.
 
     The low-pass of order ``N_deriv + 2`` is simulated exactly for a signal that is linear between samples, or constant
-    if it is held. Signals at uneven times are resampled.
+    with ``zero_order_hold``. Signals at uneven times are resampled.
 
     Args:
         y: Signals. (n,) or (n_signals, n)
@@ -120,7 +120,8 @@ def state_variable_filter(
         u = np.stack([np.interp(grid, t, x) for x in y])
     order, omega = N_deriv + 2, 2 * np.pi * f_c
     poles = np.exp(1j * np.pi * (2 * np.arange(1, order + 1) + order - 1) / (2 * order))
-    a = np.zeros((order + 2, order + 2))  # filter states in time times omega, input, and the input's change
+    # State: signal and derivatives in the time unit 1 / omega, then the input and its change over a sample.
+    a = np.zeros((order + 2, order + 2))
     a[: order - 1, 1:order] = np.eye(order - 1)
     a[order - 1, :order] = -np.real(np.poly(poles))[:0:-1]
     a[order - 1, order] = 1.0
@@ -140,7 +141,7 @@ def state_variable_filter(
         return states
 
     zero = np.zeros((len(u), 1))
-    if zero_order_hold:  # backward in time, the value before a sample holds after it
+    if zero_order_hold:  # backward in time, the input between two samples is the value of the earlier sample
         backward_pass = low_pass(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
     else:
         backward_pass = low_pass(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]

@@ -19,10 +19,10 @@ from crazysim.errors import ConfigError
 logger = logging.getLogger(__name__)
 
 RATE_RANGE = (0.5, 500.0)
-"""Range of the rate of the thrust's lag that is searched, 1/s."""
+"""Range in which the rate of the thrust's lag is searched, 1/s."""
 BLOCK_DURATION = 5.0
-"""Duration of the blocks whose scatter gives the standard deviations of the rotation, s. The translation has ten blocks
-for each log on average."""
+"""Duration of the blocks of time for the standard deviations of the rotation, which follow from the scatter between
+blocks, s. The translation has ten blocks for each log on average."""
 EDGE_DURATION = 0.5
 """Duration at both ends of a log, s, that is omitted: the 6 Hz filters start there at rest, with a wrong velocity."""
 FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
@@ -112,17 +112,17 @@ def fit_translation(
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}. Weigh the drone.")
     from scipy.optimize import minimize_scalar  # a fifth of a second to import
 
-    kind = Dynamics(dynamics)
+    model = Dynamics(dynamics)
 
     def solve_for_rate(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
-        parts = [_acceleration_terms(kind, mass, log, rate, gravity) for log in logs]
+        parts = [_acceleration_terms(model, mass, log, rate, gravity) for log in logs]
         terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
         coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
         residuals = acc - terms @ coefs
         return float(np.sum(residuals**2)), coefs, terms, residuals
 
     rate = np.inf
-    if kind != Dynamics.so_rpy:
+    if model != Dynamics.so_rpy:
         grid = np.geomspace(*RATE_RANGE, 31)
         k = int(np.argmin([solve_for_rate(x)[0] for x in grid]))
         bounds = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
@@ -132,11 +132,11 @@ def fit_translation(
         rate = float(np.exp(result.x))
     _, coefs, terms, residuals = solve_for_rate(rate)
     names, values, jacobian = ["cmd_f_coef"], [coefs[0]], terms
-    if kind != Dynamics.so_rpy:
+    if model != Dynamics.so_rpy:
         names, values = [*names, "thrust_dyn_coef"], [*values, rate]
         rate_slopes = (solve_for_rate(1.001 * rate)[2] - solve_for_rate(rate / 1.001)[2]) @ coefs / (rate * 0.002)
         jacobian = np.insert(jacobian, 1, rate_slopes, axis=-1)
-    if kind == Dynamics.so_rpy_rotor_drag:
+    if model == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
     deviations = _standard_deviations(jacobian, residuals, np.arange(len(residuals)) * len(logs) * 10 // len(residuals))
     return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, deviations), strict=True))
@@ -177,16 +177,16 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 
 
 def _acceleration_terms(
-    kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
+    model: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
     """Return the acceleration per coefficient, (n, 3, k), and the acceleration without gravity, (n, 3), m/s^2."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
-    thrust = cmd if kind == Dynamics.so_rpy else lag_signal(cmd, float(time[-1] - time[0]) / (len(time) - 1), rate)
+    thrust = cmd if model == Dynamics.so_rpy else lag_signal(cmd, float(time[-1] - time[0]) / (len(time) - 1), rate)
     matrix = np.asarray(rotation.matrix(jnp.asarray(quat)), np.float64)
     terms = [matrix[..., 2] * thrust[:, None]]
-    if kind == Dynamics.so_rpy_rotor_drag:
+    if model == Dynamics.so_rpy_rotor_drag:
         axial_vel = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
         terms += [vel - axial_vel, axial_vel]
     is_inner = (time >= time[0] + EDGE_DURATION) & (time <= time[-1] - EDGE_DURATION)
@@ -223,7 +223,7 @@ def _angle_samples(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[f
 
 
 def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
-    """Return the angles of damped springs, exact for commands that are linear between samples. (n, k)"""
+    """Return the angles of damped springs with parameters ``x``, exact for commands linear between samples. (n, k)"""
     stiffness, damping, gain = x
     zero = jnp.zeros_like(gain)
     system = jnp.array([

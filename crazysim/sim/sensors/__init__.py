@@ -1,1 +1,1 @@
-"""Sensors, under the paths of Crazyflow."""
+"""Sensors, under Crazyflow's import paths."""

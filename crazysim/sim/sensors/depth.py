@@ -1,4 +1,4 @@
-"""Depth images of one camera, where Crazyflow has them."""
+"""Depth images of one camera, under Crazyflow's import path."""
 
 from crazysim.sim.crazyflow import render_depth
 

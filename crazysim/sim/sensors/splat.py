@@ -1,4 +1,4 @@
-"""Images of Gaussian splats, where Crazyflow has them."""
+"""Images of Gaussian splats, under Crazyflow's import path."""
 
 from crazysim.sim.crazyflow_splats import (
     build_render_splat_fn,
