@@ -22,7 +22,7 @@ def load(**numbers):
 
 @pytest.mark.parametrize("numbers", [QUAD, SMALL, HEXA], ids=["quad", "small", "hexa"])
 def test_an_estimated_airframe_hovers(numbers):
-    """It flies with the default controller, which needs no gains."""
+    """The default controller needs no gains."""
     airframe = load(**numbers)
     assert supported_dynamics(airframe) == ("first_principles",)
     sim = Sim(drone=airframe, control="state", controller="auto")

@@ -217,7 +217,7 @@ def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
 
 
 def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
-    """It is a kernel or runs on lanes; a kernel of the CPU supports up to 8 drones that act on each other."""
+    """The gradient is a kernel or runs on lanes; a kernel of the CPU supports up to 8 drones that act on each other."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     for n_drones, planned_for in ((1, "cpu"), (1, "gpu"), (9, "gpu")):

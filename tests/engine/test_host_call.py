@@ -63,7 +63,7 @@ def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
 
 
 def test_two_threads_of_python_may_step_at_once():
-    """One of them uses the threads of the kernel, the other runs without them."""
+    """One caller uses the threads of the kernel; the other caller runs without threads."""
     sims = [Sim(4000, control="attitude") for _ in range(2)]
     for sim in sims:
         sim.step()

@@ -93,7 +93,7 @@ def test_a_folder_in_one_of_another_user_is_refused(cache):
 
 @needs_root
 def test_a_file_of_another_user_is_not_loaded(cache):
-    """It may have been written before the folder became private."""
+    """Such a file may have been written before the folder became private."""
     folder = kernel_cache.folder()
     library = kernel_cache.store(folder, "key", b"library", ".so")
     assert list(kernel_cache.find(folder, "key")) == [library]

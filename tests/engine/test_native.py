@@ -81,7 +81,7 @@ def test_a_kernel_is_compiled_once_for_all_processes(source, cache_folder, compi
 
 
 def test_the_key_holds_machine_compiler_and_versions(source, cache_folder, compilations, monkeypatch):
-    """It changes with the instruction set, features of the CPU, compiler and its options, JAX, and this package."""
+    """The key depends on instruction set, features of the CPU, compiler and its options, JAX, and this package."""
     folder = Path(native.compiler()).parent
     names = [register_anew(source)]
 
@@ -255,7 +255,7 @@ def test_boundaries_between_the_parts_of_a_key_count():
     ],
 )
 def test_wrong_settings_of_the_compiler_are_errors_that_name_them(cache_folder, monkeypatch, variable, value, message):
-    """They are errors even with the default engine, which otherwise falls back to a slower one."""
+    """The settings are errors even with the default engine, which otherwise falls back to a slower one."""
     native.compiler.cache_clear()
     monkeypatch.setenv(variable, value)
     try:
@@ -276,8 +276,8 @@ def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
     assert compilations() == 0
 
 
-def test_lines_that_select_count_for_more(cache_folder, monkeypatch):
-    """They take longer to compile, so a kernel with fewer of them is already refused."""
+def test_lines_with_a_selection_lower_the_largest_size_of_a_kernel(cache_folder, monkeypatch):
+    """Selections take longer to compile than other lines."""
 
     def start_compiler(*args):
         raise LookupError
@@ -305,7 +305,7 @@ def test_a_compiler_is_a_command_with_options(source, cache_folder, monkeypatch)
 
 
 def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, cache_folder, monkeypatch, tmp_path_factory):
-    """It compiles without its libraries, in one second instead of 20. The key ignores the working directory."""
+    """That takes one second instead of 20, without the libraries of ziglang. The key ignores the working directory."""
     pytest.importorskip("ziglang")
     monkeypatch.setenv("CXXFLAGS", "")  # the tests have options of g++
     which = shutil.which

@@ -140,7 +140,7 @@ def test_an_error_of_a_stage_is_raised_unchanged(sim):
 
 
 def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
-    """They are an undeclared stage, a large swarm, and a machine without a compiler."""
+    """The limits are an undeclared stage, a large swarm, and a machine without a compiler."""
 
     def everything(data):
         return data.replace(states=data.states.replace(force=0 * data.states.force))
@@ -310,7 +310,7 @@ drop = Stage(lambda data: data.replace(states=data.states.replace(force=0 * data
 
 
 def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tmp_path):
-    """This holds for any number of worlds. Stages of users are traced for every simulation, since they may change."""
+    """One trace serves any number of worlds. Stages of users are traced for every simulation, since they may change."""
     traced = []
 
     class Counted(tracing.TracedStage):

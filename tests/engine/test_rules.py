@@ -112,8 +112,8 @@ def test_a_refused_operation_is_named_with_its_stage(data, name):
     assert unfused.error.primitive
 
 
-def test_a_refused_stage_runs_as_it_is_written(data):
-    """It splits the step there."""
+def test_a_refused_stage_runs_without_fusion(data):
+    """The stage splits the step."""
     mine = {"mine": stage("drone")(REFUSED["eigh"][0])}
     expected = mine["mine"](mine["mine"](data)).states.pos
     with pytest.warns(EngineWarning, match="stage 'mine' is not fused: primitive 'eigh' has no rule"):

@@ -147,7 +147,7 @@ def _number(rng, dtype, low, high):
 
 @pytest.mark.usefixtures("casadi")
 def test_casadi_agrees_with_the_interpreter_or_refuses():
-    """They are compared in float64, on finite numbers, since CasADi has neither NaN nor infinity."""
+    """The comparison is in float64, on finite numbers, since CasADi has neither NaN nor infinity."""
     import casadi
 
     refused = set()

@@ -77,7 +77,7 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mes
 
 @pytest.mark.long("compiles an environment for one device and for four")
 def test_gymnasium_worlds_on_four_devices_are_those_of_one(mesh):
-    """Also with actions that are JAX arrays on the default device, and with states that are read in between."""
+    """Actions may be JAX arrays on the default device, and states may be read in between."""
     settings = {"num_envs": N_WORLDS, "seconds": 0.1}
     envs = [gymnasium.make_vec("crazysim/Race-v0", **settings, **options) for options in ({}, {"mesh": mesh})]
     shape = envs[0].action_space.shape

@@ -164,7 +164,7 @@ def test_gaps_are_those_of_mujoco(rng):
 
 
 def test_law_07_values_and_gradients_are_finite(rng):
-    """Also for boxes that coincide, share an axis, or lie far away."""
+    """Boxes coincide, share an axis, or lie far away."""
     pos, rot_a, rot_b = poses(rng, 30)
     pos = np.concatenate([pos, [[0, 0, 0], [0, 0, 0.14], [1e4, 0, 0]]])
     rot_a, rot_b = (np.concatenate([r, np.tile(EYE, (3, 1, 1))]) for r in (rot_a, rot_b))

@@ -147,7 +147,7 @@ def test_a_vmapped_gradient_equals_gradients_one_by_one():
 
 @pytest.mark.parametrize("n_drones", [1, 12])
 def test_the_gradient_runs_where_the_state_is(n_drones):
-    """It does not matter where the step was planned to run; CPU kernels support up to 8 drones that interact."""
+    """The step may be planned for another platform; CPU kernels support up to 8 drones that interact."""
     sims = {name: make_flying_sim(name, 2, n_drones, control="attitude") for name in NAMES}
     for sim in sims.values():
         insert_fn_before(sim.step_pipeline, "integration", repulsion)

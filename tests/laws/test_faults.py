@@ -205,7 +205,7 @@ def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(d
 
 
 def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():
-    """It falls from rest as the exact solution with linear drag: v = -g tau (1 - exp(-t / tau))."""
+    """The speed from rest is the exact solution with linear drag: v = -g tau (1 - exp(-t / tau))."""
     data, step, _ = build_program("first_principles", "attitude")
     data = run_steps(step, send(with_states(data, pos=[0, 0, 100.0]), np.zeros((3, 2, 4))), 250)
     tau = float(data.params.mass[0]) / -float(data.params.drag_matrix[2, 2])

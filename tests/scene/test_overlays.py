@@ -117,7 +117,7 @@ def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
 
 
 def test_overlays_are_kept_through_steps_and_failed_images(sim):
-    """They appear in the next image that succeeds."""
+    """Overlays appear in the next image that succeeds."""
     data = sim.data
     draw_points(sim, [[0.0, 0.4, 1.0]], rgba=GREEN, size=0.05)
     sim.step()

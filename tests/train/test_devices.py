@@ -176,7 +176,7 @@ def test_devices_that_cannot_be_used_are_errors(texts, tmp_path, capsys):
 
 
 def test_the_mesh_of_a_training_is_an_option_of_neither_task_nor_simulation():
-    """Each is an error that names the other option."""
+    """A wrong ``mesh`` is an error that names the option to use."""
     with pytest.raises(ConfigError, match=r"expected no option 'mesh' of a training, got .*devices='all' in Python"):
         TrainConfig.create("hover", options={"mesh": world_mesh(jax.devices())})
     with pytest.raises(

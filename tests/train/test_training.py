@@ -272,7 +272,7 @@ def test_metrics_of_each_iteration_are_passed_on(uninterrupted_run, tmp_path, mo
 
 
 def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path, monkeypatch):
-    """They add up to the return, and the plot of an episode returns them over time."""
+    """Terms add up to the return, and the plot of an episode returns them over time."""
     point = read_curve(uninterrupted_run.folder)[-1]
     terms = [x for name, x in point.items() if name.startswith("reward ")]
     assert len(terms) == 4
@@ -335,7 +335,7 @@ def replace_meta(content):
                          [truncate, flip_bit, replace_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
                          ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
 def test_a_damaged_run_is_refused_with_the_name_of_the_file(uninterrupted_run, tmp_path, damage):
-    """It is refused before anything is compiled."""
+    """The run is refused before anything is compiled."""
     for name in (CHECKPOINT_FILE, POLICY_FILE):
         content = (uninterrupted_run.folder / name).read_bytes()
         (tmp_path / name).write_bytes(damage(content) if damage is not np.random.bytes else damage(1000))

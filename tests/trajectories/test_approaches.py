@@ -42,7 +42,7 @@ def test_distances_agree_with_dense_samples(seed, n_drones):
 
 
 def test_crossing_flights_by_hand():
-    """They pass the crossing half a second apart, at 1 m/s and at right angles: sqrt(2) / 4 m."""
+    """The drones pass the crossing half a second apart, at 1 m/s and at right angles: sqrt(2) / 4 m."""
     first = fly_straight([-5, 0, 1], [5, 0, 1], 10.0)
     second = fly_straight([0, -5.5, 1], [0, 4.5, 1], 10.0)
     (approach,) = closest_approaches(PieceTable.create([first, second]))

@@ -92,8 +92,8 @@ def simulate_both(bodies, seconds, friction=0.6):
     return track(sim, plugin, seconds), mujoco_track(bodies, seconds, friction)
 
 
-def test_boxes_and_balls_rest_where_they_are():
-    """They neither creep nor sink nor turn in ten seconds."""
+def test_boxes_and_balls_rest_at_their_poses():
+    """Bodies neither creep nor sink nor turn in ten seconds."""
     sim, plugin = build(
         2, [(0.2, 0.3, 0.1), 0.1], pos=[[1, 0, 0.05], [2, 0, 0.1]], quat=[[0, 0, 0.2588190, 0.9659258], [0, 0, 0, 1]]
     )
@@ -106,7 +106,7 @@ def test_boxes_and_balls_rest_where_they_are():
 
 
 def test_a_tilted_box_comes_to_rest_as_in_mujoco():
-    """Its lowest corner falls 2 cm, then the others: it ends level, at the same place, and sinks in by micrometres.
+    """The lowest corner falls 2 cm, then the others: the box ends level, at the same place, and sinks by micrometres.
 
     In MuJoCo it sinks in by 0.9 mm at the impact and bounces a little (with 0.14 of the speed at a damping ratio of 1).
     In crazysim a corner stops at once. The positions differ by up to that depth.
@@ -134,7 +134,7 @@ def test_a_slide_as_in_mujoco():
 
 
 def test_a_ball_that_slides_begins_to_roll_as_in_mujoco():
-    """It rolls with 5/7 of its speed."""
+    """The ball rolls with 5/7 of its initial speed."""
     ours, theirs = simulate_both([(0.1, 0.3, (0, 0, 0.1), (1.4, 0, 0))], 1.0)
     assert np.abs(ours[0] - theirs[0]).max() < 0.01
     speed = (ours[0][-1, 0, 0] - ours[0][-6, 0, 0]) * FREQ / 25
@@ -268,7 +268,7 @@ def test_law_08_momentum_and_angular_momentum_are_kept(rng):
 
 @pytest.mark.long("compiles contacts of a scene of its own")
 def test_a_drone_lands_on_a_body_and_rides_on_it():
-    """It comes to rest on a sliding slab, and moves with it; the slab carries its weight."""
+    """The drone comes to rest on a sliding slab, and moves with it; the slab carries the drone's weight."""
     sim, plugin = build(1, (0.6, 0.6, 0.1), 1.0, pos=(0, 0, 0.05), friction=0.9, drone_pos=(0.0, 0.0, 0.2))
     sim.step(800)
     half = float(sim.airframe.value("shape.collision_box")[5] - sim.airframe.value("shape.collision_box")[2])

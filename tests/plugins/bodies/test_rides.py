@@ -62,7 +62,7 @@ def test_a_car_pushes_a_body():
 
 
 def test_the_deck_of_a_turning_car_moves_with_its_points():
-    """It moves at v + w x r below each corner of the drone, for a car with 0.5 m/s and 2 rad/s."""
+    """The deck moves at v + w x r below each corner of the drone, for a car with 0.5 m/s and 2 rad/s."""
     sim, cars = build()
     car = cars.read(sim.data)
     sim.data = cars.write(sim.data, car.with_vel(np.float32([[[0.5, 0, 0]]]), np.float32([[[0, 0, 2.0]]])))

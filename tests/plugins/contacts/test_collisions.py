@@ -105,7 +105,7 @@ def test_without_a_response_a_load_swings_through_a_wall():
 
 
 def test_a_released_load_slides_on_a_box_until_friction_stops_it():
-    """It slides by v^2 / (2 mu g)."""
+    """The load slides by v^2 / (2 mu g)."""
     sim = build()
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     sim.scene.add("box", pos=[0, 0, 0.5], size=(3.0, 3.0, 0.2), mocap=False)
@@ -224,7 +224,7 @@ def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng
 
 
 def test_an_empty_hook_stops_at_an_obstacle_and_pushes_a_load():
-    """It hits a box 1 cm ahead of it, in the other world a load of the same mass, both at its height."""
+    """In the first world the hook hits a box 1 cm ahead, in the second a load of the same mass."""
     sim = remove_gravity(build(2, strict=True, engine="interpret"))
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     hook = sim.add(Hook(mass=0.1, hook_mass=0.1, damping=0.0, size=RADIUS, ring=0.01, load_at=[0, 0, 1.0]))

@@ -8,7 +8,7 @@ from crazysim.plugins.contacts.contact_points import contact_points, find_surfac
 
 
 def test_points_on_a_turning_car_have_the_velocity_of_the_car_there():
-    """It is the cross product of the car's angular velocity and the position relative to the car."""
+    """The velocity is the cross product of the car's angular velocity and the position relative to the car."""
     sim = Sim(plugins=[Cars()], engine="interpret")
     cars = sim.data.plugins["cars"]
     turning = cars.with_vel(jnp.zeros_like(cars.vel), jnp.zeros_like(cars.ang_vel).at[..., 2].set(3.0))

@@ -42,7 +42,7 @@ def track(sim, n, every=1):
 
 
 def test_a_drone_on_the_floor_rests():
-    """It does not sink, slide, yaw or tip, at any heading, with motors off or idling."""
+    """The drone does not sink, slide, yaw or tip, at any heading, with motors off or idling."""
     sim = build(4)
     yaw = np.array([0, 0.3, 1.0, 2.0])
     quat = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)[:, None]

@@ -108,7 +108,7 @@ def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
 
 @pytest.mark.parametrize("name", sorted(set(supported_drones("first_principles")) - {"bumblebee_lab"}))
 def test_without_arguments_a_battery_is_that_of_the_airframe(name):
-    """It is full, its voltage falls under load, and it lasts minutes of hover. bumblebee_lab has none."""
+    """The battery is full, its voltage falls under load, and it lasts minutes of hover. bumblebee_lab has none."""
     sim = Sim(drone=name, control="state", controller="auto")
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
     sim.add(Battery())

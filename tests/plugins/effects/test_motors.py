@@ -58,7 +58,7 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak_sim):
 
 
 def test_a_drone_without_rotors_falls(weak_sim):
-    """It falls as explicit Euler with linear drag computes, however fast its rotors still turn; commands do not
+    """The drone falls as explicit Euler with linear drag computes, however fast its rotors still turn; commands do not
     change."""
     sim, before = weak_sim, weak_sim.data
     sim.step(100)

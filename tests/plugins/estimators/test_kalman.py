@@ -167,7 +167,7 @@ def test_removal_restores_the_controllers():
 
 
 def test_one_argument_adds_filter_and_sensors():
-    """It is the same as adding them, bit for bit, and controllers fly on the estimate."""
+    """The flight equals that with added plugins, bit for bit, and controllers fly on the estimate."""
     sims = [
         Sim(n_worlds=2, control="state", rng_key=3, estimator="kalman"),
         Sim(n_worlds=2, control="state", rng_key=3),

@@ -81,7 +81,7 @@ def test_a_batch_has_the_derivatives_of_single_states():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_single_track_tends_to_the_gym_at_small_angles(seed):
-    """Both are the same model to first order in slip, steering angle and yaw rate: the difference is of order three."""
+    """The models agree to first order in slip, steering angle and yaw rate: the difference is of order three."""
     with jax.enable_x64(True):
         gym = jax.tree.map(np.asarray, CommonRoadParams.create())
         g, (front, rear) = 9.81, np.asarray(gym.axle_distances)
