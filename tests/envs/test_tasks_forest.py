@@ -43,7 +43,7 @@ def standing_trees(env, data):
     """Return positions, radii and presence of all trees. (n_worlds, n) each, and (n_worlds, n, 2) for positions"""
     forest = env.task.trees(env.sim.n_drones)
     pos = np.asarray(vmap_worlds(lambda data: forest.poses(data)[0])(data))
-    cells = np.divmod(forest.order, forest.n_cells[1])
+    cells = np.divmod(forest.cells_by_size, forest.n_cells[1])
     trees = vmap_worlds(lambda data: forest.obstacles_in_cells(data, *cells))(data)
     np.testing.assert_allclose(pos[..., 0], trees.x, atol=1e-5)
     radius = np.broadcast_to(np.asarray(trees.size), trees.is_standing.shape)

@@ -322,7 +322,7 @@ def test_law_09_wrong_sensors_of_a_task(options, message):
 
 def test_law_09_measured_needs_a_sensor():
     env = make("hover")
-    with pytest.raises(ConfigError, match="expected a sensor of states"):
+    with pytest.raises(ConfigError, match="with a sensor of states"):
         DroneEnv(env.sim, env.task, measured=True)
 
 
