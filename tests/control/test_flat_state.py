@@ -74,7 +74,7 @@ def test_hover_takes_the_weight_and_no_torque():
     np.testing.assert_array_equal(state.torque, np.zeros(3))
 
 
-def test_law_01_and_07_many_setpoints_free_fall_and_finite_gradients():
+def test_law_01_and_07_a_batch_equals_single_states_and_gradients_are_finite():
     """In free fall, nose down and upside down, values and gradients are finite, and equal for one state and a batch."""
     accelerations = np.array([[0, 0, 0], [0, 0, -9.81], [9.81, 0, -9.81], [0, 0, -30.0], [1.0, 2.0, 3.0]])
     ones = np.ones((5, 1))

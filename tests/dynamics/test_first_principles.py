@@ -85,7 +85,7 @@ def test_nothing_accelerates_at_hover(name):
 
 
 @pytest.mark.parametrize("name", ["cf2x_L250", "cf21B_500", "crazyflie", "bumblebee"])
-def test_limits_of_rotor_speed_are_those_of_thrust(name):
+def test_limits_of_rotor_speed_give_the_limits_of_thrust(name):
     airframe = load_airframe(name)
     p = first_principles.Params.create(airframe)
     ends = quadratic_curve(jnp.stack([p.rotor_vel_min, p.rotor_vel_max]), p.rpm2thrust)[:, 0]

@@ -53,11 +53,14 @@ def test_law_07_rotor_acceleration_has_the_gradient_of_one_side_where_rise_turns
 
 @given(rotor_vel=speeds)
 def test_curve_is_a_polynomial_one_for_all_or_one_per_rotor(rotor_vel):
-    each = np.array([[1e-3, -3e-7, 4e-10], [0, 1e-7, 5e-10], [0, 0, 6e-10], [2e-3, 0, 0]])
-    expected = [np.polyval(k[::-1], r) for k, r in zip(each, rotor_vel, strict=True)]
-    np.testing.assert_allclose(quadratic_curve(rotor_vel, each), expected, rtol=1e-12, atol=1e-15)
+    coefficients = np.array([[1e-3, -3e-7, 4e-10], [0, 1e-7, 5e-10], [0, 0, 6e-10], [2e-3, 0, 0]])
+    expected = [np.polyval(k[::-1], r) for k, r in zip(coefficients, rotor_vel, strict=True)]
+    np.testing.assert_allclose(quadratic_curve(rotor_vel, coefficients), expected, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(
-        quadratic_curve(rotor_vel, each[:1]), np.polyval(each[0][::-1], rotor_vel), rtol=1e-12, atol=1e-15
+        quadratic_curve(rotor_vel, coefficients[:1]),
+        np.polyval(coefficients[0][::-1], rotor_vel),
+        rtol=1e-12,
+        atol=1e-15,
     )
 
 
@@ -97,9 +100,9 @@ def test_rotor_torque_is_the_sum_of_lever_arms_times_thrusts(position, thrust):
 
 
 def test_law_08_gyroscopic_torque_of_a_rotor_by_hand():
-    """Size and sign, which a test of its work would not find: it does no work.
+    """A gyroscopic torque does no work, so tests of energy would not find a wrong size or sign.
 
-    One rotor of 4e-8 kg m^2 at 15,000 rpm = 500 pi rad/s whose drag turns the body to the left spins to the right:
+    One rotor of 4e-8 kg m^2 at 15,000 rpm = 500 pi rad/s spins to the right, as its drag turns the body to the left:
     h = -2e-5 pi along z. Rolling with 2 rad/s: -w x h = -(2, 0, 5) x (0, 0, h) = (0, 2 h, 0) = (0, -4e-5 pi, 0).
     """
     momentum = rotor_momentum(np.array([0.0, 15_000.0, 0.0, 0.0]), SIGN, np.array([4e-8]))

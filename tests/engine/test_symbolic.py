@@ -48,11 +48,11 @@ def call(function, *args):
 def test_a_case_gives_the_results_of_jax(g, name):
     function, compiled = casadi_function(CASES[name], drone_shapes(g)), jax.jit(CASES[name])
     for world, drone in ((0, 0), (3, 1), (6, 2)):
-        one = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=np.tile(g.table, (7, 3, 1))))
-        expected = np.asarray(compiled(one), float).ravel()
+        drone_inputs = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=np.tile(g.table, (7, 3, 1))))
+        expected = np.asarray(compiled(drone_inputs), float).ravel()
         assert expected.size
         # Solves multiply rounding by the condition number of the system, which is below 1e3.
-        np.testing.assert_allclose(call(function, *jax.tree.leaves(one)), expected, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(call(function, *jax.tree.leaves(drone_inputs)), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", REFUSED_CASES)
@@ -79,7 +79,7 @@ def test_whole_numbers_divide_as_in_jax():
     np.testing.assert_array_equal(call(function, i), np.ravel([np.trunc(i / 3), i // 3, i % 3, -i]))
 
 
-def test_conversions_cut_saturate_and_wrap_as_in_jax():
+def test_conversions_truncate_saturate_and_wrap_as_in_jax():
     def convert(x, i):
         words = (x > 0).astype(jnp.uint32) - i[:1].astype(jnp.uint32)
         return jnp.concatenate([(1e3 * x).astype(jnp.int32), i.astype(bool), words, (1e10 * x).astype(jnp.uint32)])

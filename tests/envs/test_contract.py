@@ -39,7 +39,7 @@ N_FLYING, N_STEPS = 32, 1250
 IS_ENDING = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
-SAME_CLASS = pytest.mark.slow("another task of its class does it")
+SAME_CLASS = pytest.mark.slow("another task of its class is tested")
 FLIGHT_TASKS = [x if x in task_names(one_per_class=True) else pytest.param(x, marks=SAME_CLASS) for x in task_names()]
 """Names of the tasks of the random flights."""
 
@@ -92,15 +92,15 @@ class Flight(NamedTuple):
 
 
 @functools.cache
-def vector(name):
+def make_vector_env(name):
     """Return Gymnasium's vector environment of a task."""
     return gymnasium.make_vec(TASKS[name].id, num_envs=N_FLYING)
 
 
 @functools.cache
-def flight(name):
+def fly_randomly(name):
     """Return a random flight with new episodes as they end. Its steps are one kernel."""
-    vector_env = DroneVectorEnv(EpisodeStatistics(vector(name).unwrapped.env.env), "SameStep")
+    vector_env = DroneVectorEnv(EpisodeStatistics(make_vector_env(name).unwrapped.env.env), "SameStep")
     obs, info = vector_env.reset(seed=0)
     actions = np.random.default_rng(1).uniform(-1.2, 1.2, (N_STEPS, *vector_env.action_space.shape)).astype(np.float32)
     steps = [vector_env.step(action) for action in actions]
@@ -112,7 +112,7 @@ def flight(name):
 
 @pytest.fixture(scope="module")
 def random_flight(name):
-    return flight(name)
+    return fly_randomly(name)
 
 
 def assert_close(a, b):
@@ -127,7 +127,7 @@ def first_worlds(state, n=N_WORLDS):
 
 
 def test_shapes_and_types_are_those_of_the_spaces(name, env, start_state):
-    spaces = vector(name)
+    spaces = make_vector_env(name)
     single = env.sim.n_drones == 1
     for state in (start_state, env.step(start_state, random_action(start_state))):
         assert set(state.obs) == set(spaces.single_observation_space.spaces)
@@ -225,16 +225,16 @@ def test_the_same_seed_gives_the_same_numbers(env, start_state):
     assert trees_equal(env.reset(jax.random.key(0)), start_state)
     other = env.reset(jax.random.key(5))
     assert not trees_equal(other.obs, start_state.obs)
-    all_anew, some_anew = (
+    all_restarted, some_restarted = (
         env.restart(start_state, jnp.ones(N_WORLDS, bool)),
         env.restart(start_state, jnp.asarray(IS_ENDING)),
     )
-    assert trees_equal(select_state(all_anew, IS_ENDING), select_state(some_anew, IS_ENDING))
-    assert trees_equal(select_state(some_anew, ~IS_ENDING), select_state(start_state, ~IS_ENDING))
+    assert trees_equal(select_state(all_restarted, IS_ENDING), select_state(some_restarted, IS_ENDING))
+    assert trees_equal(select_state(some_restarted, ~IS_ENDING), select_state(start_state, ~IS_ENDING))
 
 
 def test_gymnasium_makes_every_task(name):
-    vector_env = vector(name)
+    vector_env = make_vector_env(name)
     assert isinstance(vector_env.unwrapped, DroneVectorEnv)
     assert (vector_env.spec.id, vector_env.num_envs) == (TASKS[name].id, N_FLYING)
     assert vector_env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
@@ -245,7 +245,7 @@ def test_gymnasium_makes_every_task(name):
 @pytest.mark.long("compiles the vector environment of each task")
 @pytest.mark.parametrize("name", FLIGHT_TASKS, indirect=True)
 def test_the_number_of_worlds_changes_nothing(env, start_state, random_flight):
-    """Law 10 again: the first of many worlds fly as a few do."""
+    """Law 10: the first of many worlds fly like those of an environment with few worlds."""
     (obs, info), state = random_flight.start, start_state
     for step in range(4):
         assert {k: np.asarray(x) for k, x in obs.items()} in random_flight.env.observation_space
@@ -306,7 +306,7 @@ SLOW_STAGES = pytest.mark.slow("other tasks have all operations, and tests/gpu c
     [x if x in TASKS_WITH_INDICES else pytest.param(x, marks=SLOW_STAGES) for x in task_names()],
     indirect=True,
 )
-def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_flight):
+def test_the_kernel_of_a_step_agrees_with_the_stages(name, env, random_flight):
     """Actions, physics, task and new episodes in one kernel equal the reference, at states of the random flight."""
     vector_env, plain = (
         random_flight.env,
@@ -339,7 +339,7 @@ def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, random_fligh
 
 @pytest.fixture(scope="module", params=["hover", "swarm"])
 def task_name(request):
-    """Return the name of one of two tasks, one with several drones: the reset modes do not depend on the task."""
+    """Return the name of a task with one drone or with several: the reset modes do not depend on the task."""
     return request.param
 
 
@@ -350,8 +350,11 @@ def test_next_step_begins_episodes_in_the_step_after_the_last(task_name):
     np.testing.assert_array_equal(last.done, IS_ENDING)
     assert trees_equal(last, env.step(set_last_step(env, start_state, IS_ENDING), random_action(start_state)))
     ignored, other = random_action(start_state, 1), random_action(start_state, 2)
-    after, again = auto.step(last, ignored), auto.step(last, np.where(IS_ENDING[:, None, None], other, ignored))
-    assert trees_equal(select_state(after, IS_ENDING), select_state(again, IS_ENDING)), (
+    after, after_other_action = (
+        auto.step(last, ignored),
+        auto.step(last, np.where(IS_ENDING[:, None, None], other, ignored)),
+    )
+    assert trees_equal(select_state(after, IS_ENDING), select_state(after_other_action, IS_ENDING)), (
         "the action of this step has no effect"
     )
     assert not after.done[IS_ENDING].any()
@@ -404,7 +407,7 @@ def test_disabled_begins_episodes_only_in_restarts(task_name):
 
 
 def test_a_nonfinite_world_ends_and_changes_no_other(env, start_state):
-    """Law 7: it is terminated and reported, and other worlds do not change."""
+    """Law 7: the world is terminated and reported, and other worlds do not change."""
     action = random_action(start_state)
     bad = np.array(action)
     bad[1] = np.nan

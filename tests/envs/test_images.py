@@ -90,8 +90,8 @@ def test_adapters_have_the_images_in_their_spaces():
     obs, *_ = env.step(env.action_space.sample())
     assert obs["depth"].shape == (2, 12)
     assert env.observation_space.contains(jax.device_get(obs))
-    again, _ = env.reset(options={"reset_mask": np.array([True, False])})
-    np.testing.assert_array_equal(again["depth"][1], obs["depth"][1])
+    obs_after_reset, _ = env.reset(options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(obs_after_reset["depth"][1], obs["depth"][1])
     env.reset()
 
 

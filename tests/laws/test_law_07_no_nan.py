@@ -208,7 +208,11 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
     """
     airframes = [load_airframe(name) for name in Drone if dynamics in supported_dynamics(name)]
     commands = [extreme_commands(airframe, control) for airframe in airframes]
-    airframe_by_world = [airframe for airframe, mine in zip(airframes, commands, strict=True) for _ in mine]
+    airframe_by_world = [
+        airframe
+        for airframe, commands_of_airframe in zip(airframes, commands, strict=True)
+        for _ in commands_of_airframe
+    ]
     sim = Sim(len(airframe_by_world), dynamics=dynamics, control=control, integrator=integrator)
     sim.data = with_states(with_airframes(sim, airframe_by_world), pos=[0.0, 0.0, 100.0])
     getattr(sim, f"{control}_control")(np.concatenate(commands)[:, None])

@@ -209,15 +209,15 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     env = AutoReset(PrivilegedObservation(RandomizeWith(base, draw_masses, params=("mass",))))
     state = env.reset(jax.random.key(0))
     for _ in range(2):
-        data, seen = state.data, np.asarray(state.obs["privileged"])
+        data, privileged = state.data, np.asarray(state.obs["privileged"])
         nominal = base.sim.default_data.params.mass
         record = data.plugins["randomize"]
         expected = [flatten(state_of(data)), data.states.rotor_vel, data.params.mass / nominal]
         expected += [record.factors, record.thrust_factors]
-        np.testing.assert_allclose(seen, np.concatenate(expected, axis=-1), rtol=1e-6)
+        np.testing.assert_allclose(privileged, np.concatenate(expected, axis=-1), rtol=1e-6)
         state = env.step(state, jnp.zeros((3, 1, 4)))
     assert np.abs(state.obs["pos"] - state.data.states.pos).max() > 0.01
-    assert len(np.unique(seen[..., -5:])) > 10
+    assert len(np.unique(privileged[..., -5:])) > 10
     learner, _ = init_learner(env, minibatches=1, critic="privileged")
     other = state.obs | {"privileged": 1 + state.obs["privileged"]}
     config = ppo.Config(critic="privileged")
@@ -247,9 +247,9 @@ def test_an_observation_of_the_task_may_be_named_privileged(rng):
 
 def test_a_critic_of_all_drones_gets_all_observations_with_those_of_its_drone_first():
     obs = jnp.arange(2 * 3 * 2).reshape(2, 3, 2)
-    seen = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
-    np.testing.assert_array_equal(seen[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
-    np.testing.assert_array_equal(seen[1, 2], [10, 11, 6, 7, 8, 9])
+    inputs = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
+    np.testing.assert_array_equal(inputs[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
+    np.testing.assert_array_equal(inputs[1, 2], [10, 11, 6, 7, 8, 9])
 
 
 def test_a_critic_may_see_all_drones_and_their_true_states():
