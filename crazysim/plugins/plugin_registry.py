@@ -403,7 +403,7 @@ def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> d
         return {f"{p.name}.{key}": x for p, values in sources for key, x in p.observations(values).items()}
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
-    worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
+    world_axes = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
     observe_drones = vmap_drones(observe_drone)
     world_leaves = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
-    return jax.vmap(lambda values: observe_drones(axes.treedef.unflatten(values)), (worlds,))(world_leaves)
+    return jax.vmap(lambda values: observe_drones(axes.treedef.unflatten(values)), (world_axes,))(world_leaves)

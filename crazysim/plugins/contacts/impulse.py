@@ -15,8 +15,8 @@ from crazysim.plugins.contacts.contact_points import ContactPoints
 BOUNCE_SPEED = 0.1
 """Approach speed below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
 PENALTY_STIFFNESS = 300.0
-"""Penalty on the speed into a surface, as a multiple of the mass: a bounce loses a third of a percent of its speed to
-it, and the linear systems can be solved in float32."""
+"""Penalty on the speed into a surface, as a multiple of the mass. With this value a bounce loses a third of a percent
+of its speed to the penalty, and the linear systems can be solved in float32."""
 STICKING_SPEED = 1e-4
 """Slip speed treated as zero, m/s."""
 MAX_PUSH_SPEED = 0.25

@@ -123,7 +123,7 @@ def velocity_change(
         normal: Outward normal of the other body. (..., 3)
         vel: Velocity relative to the other body, m/s. (..., 3)
         material: Parameters of the contact.
-        response: Returns the change of the relative velocity for a change of the body's velocity, both m/s.
+        response: Function from a change of the body's velocity to the change of the relative velocity, both m/s.
     """
     separation_speed = rotation.dot(vel, normal)
     push_speed = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)

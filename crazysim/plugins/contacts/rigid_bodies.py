@@ -34,8 +34,8 @@ from crazysim.scene.collision import CollisionGeom
 MAX_CONTACTS = 250_000
 """Largest number of contact points in a world; 250 drones or boxes have about as many."""
 EXACT_KINDS = ("sphere", "box")
-"""Kinds of geoms that touch balls and boxes in the same way as bodies do; geoms of other kinds touch only their corners
-and nearest point."""
+"""Kinds of geoms with the same contacts as free bodies. Geoms of other kinds touch a box only at its corners and at its
+nearest point."""
 
 
 class BodyContacts:

@@ -100,7 +100,7 @@ def solve_contacts(
     would add energy, all impulses are scaled down to conserve it.
 
     Overlaps shrink with the time constant ``softness``, at up to 0.25 m/s. For this the bodies are moved without
-    changing their velocities, which would set a stack in motion.
+    changing their velocities, because added velocities would set a stack in motion.
 
     Args:
         bodies: The bodies.
@@ -224,7 +224,7 @@ def _shared_response(
     normal_weight: Array,
     slip_weight: Array,
 ) -> Array:
-    """Return for each body the response of its contacts to all impulses, per response to their own impulse alone. (n,)
+    """Return for each body the ratio of its contacts' response to all impulses to that to their own impulse. (n,)
 
     The ratio is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter.
     ``M`` is the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` contains the
@@ -274,5 +274,5 @@ def _energy_factor(impulse: Array, initial_vel: Array, vel_change: Array) -> Arr
 
 
 def _sum_for_bodies(sum_matrix: Array, values: Array) -> Array:
-    """Sum the values of pairs for every body. (n, m) It is no matrix product, which a GPU may round."""
+    """Return the sums of the pairs' values for every body, without a matrix product, which a GPU may round. (n, m)"""
     return jnp.sum(sum_matrix[:, :, None] * values[None], axis=1)

@@ -26,7 +26,7 @@ from crazysim.storage import read_bytes
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG image. Bytes 16 to 23 of the file are width and height."""
 MAX_FILE_BYTES = 256 * 2**20
-"""Largest file of an image, bytes."""
+"""Largest size of an image file, bytes."""
 MAX_PIXELS = 2**24
 """Largest number of pixels of an image, 4096 x 4096, which take 0.5 GB."""
 BASE_THICKNESS = 1.0

@@ -106,8 +106,8 @@ def hover_jet_speed(offset: Array, axis: Array, thrust: Array, diameter: Array, 
     """Return the speed of the air in the jet of a hovering drone, m/s.
 
     From 2.5 drone diameters downwards the mean flow below a quadrotor is one round turbulent jet (Bauersfeld
-    et al., Robotics meets Fluid Dynamics, RA-L 2025), whose speed falls as one over the distance and whose profile
-    keeps its shape (Pope 2000, sections 5.1 and 5.2):
+    et al., Robotics meets Fluid Dynamics, RA-L 2025). The speed of such a jet falls as one over the distance, and its
+    profile keeps its shape (Pope 2000, sections 5.1 and 5.2):
 
         u = u_0 / (1 + s / (B d)) / (1 + (sqrt(2) - 1) (r / b)^2)^2,  b = S (s + B d)
 

@@ -23,7 +23,7 @@ step."""
 UNFUSED_REASON = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
 """Reason why a stage that reads a larger table is not fused."""
 MAX_FILE_BYTES = 2**30
-"""Largest file of a grid, bytes."""
+"""Largest size of a file with a grid, bytes."""
 MAX_SPACING_ERROR = 1e-3
 """Largest relative difference between the distances of nodes along an axis of a regular grid."""
 

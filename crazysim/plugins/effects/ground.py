@@ -23,7 +23,7 @@ class TerrainData(PyTree):
     height_below: Array = leaf("drone", 1)
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
     floor: bool = static()
-    """True if a flat floor at z = 0 surrounds the terrain; False if its border extends outwards without end."""
+    """True if a flat floor at z = 0 surrounds the terrain; False if the terrain's border extends without end."""
 
     @jit_eager_calls()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
@@ -61,7 +61,7 @@ class TerrainData(PyTree):
 
 @jit_eager_calls()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return height and normal of the ground at the x and y of a position; height zero and normal z without terrain.
+    """Return height and normal of the ground at the x and y of a position; zero and upwards without terrain.
 
     Where terrains overlap, the highest one is used.
 

@@ -64,12 +64,12 @@ def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:
     """Return the ratio of the rotors' thrust near the ground to their thrust far from it, at the same speed.
 
     ``1 / (1 - (R / 4 z)^2)`` (Cheeseman and Bennett 1955, ARC R&M 3021, for hover). Their image source has a pole at
-    z = R / 4; ``z^2 + R^2 / 4`` replaces ``z^2`` here, so that the ratio is at most 4/3, on the floor. At z = R it is
-    1.3 % below theirs; the difference shrinks with height. The increase is proportional to the cosine of the tilt to
-    first order. The replacement and the dependence on the tilt are assumptions.
+    z = R / 4; ``z^2 + R^2 / 4`` replaces ``z^2`` here, so that the ratio is at most 4/3, on the floor. At z = R the
+    ratio is 1.3 % below theirs; the difference shrinks with height. To first order, the increase is proportional to the
+    cosine of the tilt. The replacement and the dependence on the tilt are assumptions.
 
     Args:
-        height: Height of the rotors above the floor, m; below zero counts as zero. (..., n_rotors)
+        height: Height of the rotors above the floor, m; negative heights are treated as zero. (..., n_rotors)
         upright: Cosine of the tilt; below zero, upside down, thrust does not increase. (..., 1)
         radius: Radius of a propeller, m. (..., 1)
     """

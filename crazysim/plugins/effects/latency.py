@@ -48,7 +48,7 @@ class Latency(Plugin):
     max_delay: int | None = setting(default=None, low=0, high=MAX_DELAY)
     """Largest delay to which the record can be changed later, steps; None for the largest value of ``delay``."""
     name: str = "latency"
-    order: ClassVar[int] = -1  # before the effects that limit commands, so that they limit a late one too
+    order: ClassVar[int] = -1  # before the effects that limit commands, so that they also limit late commands
 
     def record(self, sim: Simulation) -> LatencyData:
         return self._initial_record(sim, sim.data)
@@ -71,7 +71,7 @@ class Latency(Plugin):
         return _with_command(data, self.read(data).arrived) if data.controls.mode == Control.rotor_vel else data
 
     def move_queue(self, data: SimData) -> SimData:
-        """Put the command of one drone into its queue, and take out the one that arrives."""
+        """Put the staged command of one drone into its queue, and take the arriving command out."""
         latency, step = self.read(data), data.core.steps
         length = latency.queue.shape[0]
         queue = latency.queue.at[step % length].set(_staged_command(data))

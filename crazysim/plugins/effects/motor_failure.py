@@ -41,7 +41,7 @@ class MotorFailure(Plugin):
     """Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     fail_step: ArrayLike | None = parameter(default=None, dtype=np.int32)
-    """Step of the episode in which a rotor fails, a whole number, negative for never; None if no rotor does.
+    """Step of the episode in which a rotor fails, a whole number, negative for never; None if no step is set.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     rate: ArrayLike | None = parameter(default=None, low=0.0)
     """Random failures per second of a working rotor, 1/s; None for no random failures.

@@ -97,8 +97,8 @@ class Randomize(Plugin):
     delay: ArrayLike | None = parameter(default=None, low=0.0)
     """Delay of commands, steps, rounded down; needs ``Latency`` with one delay per drone."""
     optional: Sequence[str] = ()
-    """Settings that are ignored if the simulation lacks what they act on, where other settings raise an error. This
-    concerns ``charge``, ``drag``, ``wind`` and ``delay``. The ranges of presets are optional."""
+    """Settings, of ``charge``, ``drag``, ``wind`` and ``delay``, that are ignored if the simulation lacks what they act
+    on; without this, they raise an error. The ranges of presets are optional."""
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 

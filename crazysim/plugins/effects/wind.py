@@ -206,7 +206,7 @@ def shape_noise(x1: Array, x2: Array, noise: Array, loss: Array) -> Array:
     """Return the states of the shaping filters one step later.
 
     ``x1' + x1 / t = sqrt(2 / t) w`` and ``x2' = (x1 - x2) / t``, both by the trapezoidal rule, which preserves the
-    covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly for steps of any and of varying length.
+    covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly for steps of any length, also varying ones.
 
     Args:
         x1: First states, along the mean wind, across and vertically, 1. (..., 3)

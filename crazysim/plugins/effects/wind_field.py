@@ -103,7 +103,7 @@ class WindField(Plugin):
         return self.write(data, record.replace(shift=record.spread * sample))
 
     def look_up(self, data: SimData) -> SimData:
-        """Look up the velocity of the air at a drone; at its loads, the sum over all wind fields."""
+        """Return the data with the velocity of the air at a drone, and at its loads the sum over all wind fields."""
         record = self.read(data)
         data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
         fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]

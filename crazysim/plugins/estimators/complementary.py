@@ -31,7 +31,7 @@ HEIGHT_WEIGHT, VELOCITY_DECAY = 0.9, 0.995
 """Weight of the previous height in an update, and factor of the velocity in each update
 (position_estimator_altitude.c)."""
 CLIMB_DEADBAND = 0.04
-"""Vertical acceleration below which it is set to zero, in units of gravity (position_estimator_altitude.c)."""
+"""Largest vertical acceleration that is treated as zero, in units of gravity (position_estimator_altitude.c)."""
 MAX_RANGE_AGE = 0.05
 """Greatest age of a distance to the ground that is used, s (position_estimator_altitude.c)."""
 

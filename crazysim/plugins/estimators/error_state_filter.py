@@ -77,7 +77,11 @@ class ErrorStateFilter(Estimator):
         return self.fill_record(sim, record_type, estimate=estimate, used_steps=used_steps, failures=failures, **fields)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
-        """Return the steps between predictions, at ``freq`` steps per second, and a function: True if one is due."""
+        """Return the number of steps between predictions, and a function that returns True in steps with a prediction.
+
+        Args:
+            freq: Steps of the simulation per second, Hz.
+        """
         period = freq // dividing_rate("freq", self.freq, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 

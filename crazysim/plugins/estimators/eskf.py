@@ -78,8 +78,8 @@ class ESKF(ErrorStateFilter):
     errors of the other sensors are treated as white noise.
 
     The filter takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``,
-    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``. It assumes that they are at the centre of mass, except for the diodes
-    of ``Lighthouse``, and that the body that ``MotionCapture`` tracks has the attitude of the drone.
+    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``. It assumes that these sensors are at the centre of mass, except for
+    the diodes of ``Lighthouse``, and that the body that ``MotionCapture`` tracks has the attitude of the drone.
     """
 
     _: dataclasses.KW_ONLY

@@ -27,7 +27,7 @@ from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, device_array, leaf
 
 FIRMWARE_RATE = 1000
-"""Rate of the loop of the firmware's filter, which adds process noise each time, Hz (estimator_kalman.c)."""
+"""Rate of the loop of the firmware's filter, Hz; every loop adds process noise (estimator_kalman.c)."""
 INITIAL_STD = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad (kalman_core_params_defaults.h)."""
 MEASUREMENT_STD = {

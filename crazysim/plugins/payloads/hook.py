@@ -155,7 +155,7 @@ class Hook(CollidingPlugin, Plugin):
         """Pick up one drone's load if it is near and slow, or let it go, as commanded by ``grip`` of the record.
 
         Hook and ring stay together after an impact that conserves momentum: they get the mass-weighted mean of their
-        velocities, and then the rigid rod passes on an impulse along itself to the drone.
+        velocities. Then the rigid rod transmits an impulse along its axis to the drone.
         """
         load, p, s = self.read(data), data.params, data.states
         offset, relative_vel = load.pos - load.tip_pos, load.vel - load.tip_vel
@@ -278,7 +278,7 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
 
     def joined_head_mask(self, data: SimData) -> Array:
-        """Return True where a hook belongs to a drone, in one world. (n_drones, n_drones)"""
+        """Return True where a hook hangs from a drone, in one world. (n_hooks, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
     @staticmethod

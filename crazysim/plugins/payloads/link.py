@@ -304,7 +304,7 @@ def _tip_pos_rate(
     state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array,
     attach_acc: Array, dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
-    """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
+    """Return the rate of the tip's position, including the correction of errors in length, m/s. (3,)"""
     is_attached, stretch = link.is_attached, geometry.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)

@@ -1,9 +1,9 @@
 """Differential flatness of a drone with a point load: states and inputs from the path of the load.
 
 The load's position and the yaw are a flat output (Sreenath, Lee and Kumar 2013). With the load's mass m_L, the drone's
-mass m and the rod's length L the tension is ``T q = -m_L (x_L'' - g)``, so the load's acceleration gives the direction
-q of the rod, its next two derivatives give q' and q'', the drone is at ``x = x_L - L q``, and its thrust is
-``F = m (x'' - g) + m_L (x_L'' - g)``. The drone's jerk and snap need the fifth and sixth derivative of the path.
+mass m and the rod's length L, the tension is ``T q = -m_L (x_L'' - g)``. So the load's acceleration gives the direction
+q of the rod, and the next two derivatives of the path give q' and q''. The drone is at ``x = x_L - L q``, with the
+thrust ``F = m (x'' - g) + m_L (x_L'' - g)``. The drone's jerk and snap need the fifth and sixth derivative of the path.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def load_flat_state(
 ) -> LoadedState:
     """Return states and inputs with which a drone carries a point load along a path.
 
-    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` defines attitudes that
-    thrust and yaw do not determine. A load in free fall has no tension and no direction; there the results are not
-    finite.
+    The rod is attached at the drone's centre of mass. Where thrust and yaw do not determine the attitude, it is as in
+    ``control.flatness.attitude_of_thrust``. For a load in free fall, which has no tension and no direction, the results
+    are not finite.
 
     Args:
         path: Position of the load and its time derivatives up to the sixth, world frame, m, m/s, ... (..., 7, 3)

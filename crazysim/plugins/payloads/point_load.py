@@ -63,7 +63,7 @@ class LoadData(BodiesInAir):
     friction: Array = leaf("parameter", 1, (1,))
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("parameter", 1, (1,))
-    """Height of the load's position above the floor where it rests, m. (1,)"""
+    """Height of the load's position above the floor when it rests there, m. (1,)"""
 
 
 class PointLoad(CollidingPlugin):
@@ -133,7 +133,7 @@ def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> 
     Args:
         pos: Position, world frame, m. (..., 3)
         vel: Velocity, world frame, m/s. (..., 3)
-        clearance: Height of the body above the floor where it rests, m. (..., 1)
+        clearance: Height of the body above the floor when it rests there, m. (..., 1)
         friction: Coulomb's coefficient, 1. (..., 1)
     """
     height, climb_rate, horizontal_vel = pos[..., 2:], vel[..., 2:], vel[..., :2]
@@ -154,7 +154,7 @@ def hanging_state(
         state: State of the drones. Leaves (..., k)
         attach: Attachment point, body frame, m; None for the centre of mass. (..., 3)
         length: Length of the link, m. (..., 1)
-        clearance: Height of the load above the floor where it rests, m. (..., 1)
+        clearance: Height of the load above the floor when it rests there, m. (..., 1)
         is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
     """
     rot = rotation.matrix(state.quat)

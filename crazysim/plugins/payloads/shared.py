@@ -58,7 +58,7 @@ class SharedLoadData(PyTree):
     friction: Array = leaf("shared", 1)
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("shared", 1)
-    """Height of the load above the floor where it rests, m. (1,)"""
+    """Height of the load above the floor when it rests there, m. (1,)"""
 
 
 @jit_eager_calls()
@@ -68,7 +68,7 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
     Args:
         states: States of the drones. (n_worlds, n_drones, ...)
         length: Length of each rod or cable, m. (1,) or (n_worlds, n_drones, 1)
-        clearance: Height of the load above the floor where it rests, m. (1,)
+        clearance: Height of the load above the floor when it rests there, m. (1,)
 
     Returns:
         Position and velocity, world frame, m and m/s. (n_worlds, 1, 3) each

@@ -56,7 +56,7 @@ class SlungLoad(PointLoad, Plugin):
     restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
     drag: ArrayLike = parameter(default=0.0, low=0.0)
-    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it.
+    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on the load.
     () or (n_worlds, n_drones)"""
     friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
@@ -161,7 +161,7 @@ def load_record(
         sim: Simulation.
         record_type: Class of the record.
         is_cable: True for cables.
-        clearance: Height of a load's position above the floor where it rests, m.
+        clearance: Height of a load's position above the floor when it rests there, m.
         ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
         **fields: Further fields of the record.
     """

@@ -19,8 +19,8 @@ from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
 class Rooms(Scenery):
     """A building of square rooms in rows, with a door at a random position in each wall between two rooms.
 
-    There is a path between any two rooms. A wall between rooms consists of panels, and its door is a missing panel
-    without a lintel. The outer walls have no doors. ``free`` and ``speed`` have no effect.
+    There is a path between any two rooms. A wall between rooms consists of panels; its door is a missing panel, as high
+    as the wall. The outer walls have no doors. ``free`` and ``speed`` have no effect.
 
     ``difficulty`` is the fraction of the walls between rooms that are present: with 0 the building is a hall.
     """

@@ -85,7 +85,7 @@ MPU9250: dict[str, Any] = {
 }
 """InvenSense MPU-9250, of the Crazyflie 2.0: product specification PS-MPU-9250A-01, revision 1.0, tables 1 and 2, at
 2000 degrees/s, 16 g and DLPFCFG = 2. Tolerances are used as standard deviations, and the cross-axis sensitivity as the
-standard deviation of a rotation. It states no instability or random walk of the bias: they are zero."""
+standard deviation of a rotation. The specification states no instability or random walk of the bias: they are zero."""
 
 MPU6050: dict[str, Any] = {
     "gyro": dataclasses.replace(

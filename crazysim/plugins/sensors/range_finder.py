@@ -48,8 +48,7 @@ class RangeFinderData(PyTree):
 class RangeFinder(Plugin):
     """Rays from the centre of mass of every drone that measure distances.
 
-    A ray ignores its own drone, and rods and cables of loads, which are thin. Other drones have the shapes that they
-    collide with.
+    A ray ignores its own drone, and rods and cables of loads, which are thin. Other drones have their collision shapes.
     """
 
     MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER_DIRECTIONS

@@ -68,7 +68,7 @@ class TriadData(PyTree):
         return misaligned + self.scale * misaligned + self.bias + self.wander
 
     def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, TriadData]:
-        """Return the measurement of one sensor, u, (3,), an interval after the last one, and the errors after it.
+        """Return the next measurement of one sensor, u (3,), and the errors after it.
 
         Args:
             truth: True quantity in the sensor's frame, u. (3,)

@@ -44,9 +44,10 @@ SETTLING_TIME = 0.02
 class Cars(Population):
     """Cars, driven by commands, or along paths by a controller, on level ground or on terrain.
 
-    Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
-    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are the same as on
-    level ground, plus the pull of the slope; height and tilt follow the ground. Wheels do not leave the ground.
+    A command is the motor reference and the steering angle at the level ``drive``, and the speed and the steering angle
+    at the level ``speed``. It stays in force until the next command. With a path the cars need no commands. On terrain
+    the dynamics are the same as on level ground, plus the pull of the slope; height and tilt follow the ground. Wheels
+    do not leave the ground.
     """
 
     members: int | Sequence[str] = 1

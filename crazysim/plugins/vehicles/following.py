@@ -35,7 +35,7 @@ class PathState(NamedTuple):
     arc: Array
     """Arc length of the projection of the vehicle, m. (1,)"""
     offset: Array
-    """Distance of the projected point of the vehicle from the path, m, positive to the left of it. (1,)"""
+    """Distance of the vehicle's projected point from the path, m, positive if the point is left of the path. (1,)"""
     heading_error: Array
     """Heading relative to the path, rad, from -pi to pi, positive to the left. (1,)"""
     curvature: Array
@@ -55,7 +55,7 @@ class PathState(NamedTuple):
 def path_state(
     state: CarState, path: Path, index: Array, guess: Array, reference_offset: Array, time: Array | None
 ) -> PathState:
-    """Return where a vehicle is relative to its path.
+    """Return the state of a vehicle relative to its path.
 
     Args:
         state: State of the vehicle.
@@ -109,7 +109,7 @@ def motor_reference(speed: Array, acc: Array, car: CarParams) -> Array:
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(setting, dataclasses.field))
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PathController:
-    """Base class of controllers that follow paths, with the speed control that they share.
+    """Base class of controllers that follow paths, including their speed control.
 
     A subclass lists its settings as annotated fields with defaults and overrides ``steering``; it becomes a frozen
     dataclass. Its methods are pure and written for one vehicle.
