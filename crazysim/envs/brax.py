@@ -6,11 +6,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree
 
 
@@ -101,12 +103,12 @@ class BraxEnv:
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)
         """
         shape = (self.sim.n_worlds, self.action_size)
-        if jnp.shape(action) != shape:
+        if np.shape(action) != shape:
             raise ValueError(
-                f"expected an action of shape {shape} = (n_worlds, action_size), got {jnp.shape(action)}. The worlds "
+                f"expected an action of shape {shape} = (n_worlds, action_size), got {np.shape(action)}. The worlds "
                 f"are batched already: leave out vmap and Brax's wrappers (wrap_env=False)."
             )
-        env_state = self.env.step(state.pipeline_state, jnp.reshape(action, self._action_shape))
+        env_state = self.env.step(state.pipeline_state, jnp.reshape(jnp.asarray(action), self._action_shape))
         dtype = state.reward.dtype
         done, reward = env_state.done.astype(dtype), self._mean_over_drones(env_state.reward)
         metrics = {"error": self._mean_over_drones(env_state.info["error"])}
@@ -130,6 +132,8 @@ class BraxEnv:
 
     def _seed_key(self, rng: Array) -> Array:
         """Return the key that seeds all worlds."""
+        if not hasattr(rng, "dtype"):
+            raise ConfigError(f"expected a random key, got {short_repr(rng)}. Use jax.random.key(0).")
         n_worlds, typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         shape = rng.shape if typed else rng.shape[:-1]
         if shape not in ((), (n_worlds,)):

@@ -25,6 +25,7 @@ from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.phases import Phases, select_states, vectorize_over_worlds
+from crazysim.envs.random import check_key
 from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_of_data, validate_action, validate_goals
 from crazysim.envs.task import Task
@@ -125,6 +126,7 @@ class Env(ABC):
                 that is not finite. A compiled reset, such as ``jax.jit(env.reset)``, cannot raise an error for such a
                 state: the episode then ends at its first step, with ``info["nonfinite"]``.
         """
+        check_key(key)
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
         with use_device_of(key):
             data = self.base.initial_data(key)

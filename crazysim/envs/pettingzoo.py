@@ -17,7 +17,8 @@ from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
-from crazysim.errors import ConfigError, UnknownNameError, not_installed
+from crazysim.errors import ConfigError, UnknownNameError, not_installed, short_repr
+from crazysim.tables import read_floats
 
 try:
     from pettingzoo import ParallelEnv
@@ -149,14 +150,16 @@ class DroneParallelEnv(ParallelEnv):
 
     def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
         """Return the validated actions of all agents as one array. (n_drones, k)"""
-        if unknown_agents := set(actions) - set(self.agents):
-            raise UnknownNameError(
-                f"expected actions of {', '.join(self.agents)}, got one of {', '.join(sorted(unknown_agents))}"
+        if not isinstance(actions, Mapping):
+            raise ConfigError(
+                f"expected a dict with an action of every drone, got {short_repr(actions)}. Use {{'drone_0': ...}}."
             )
+        if unknown := [agent for agent in actions if agent not in self.agents]:
+            raise UnknownNameError(f"expected actions of {', '.join(self.agents)}, got one of {unknown[0]}")
         if missing_agents := [agent for agent in self.agents if agent not in actions]:
             raise ConfigError(f"expected an action of every drone, got none of {', '.join(missing_agents)}")
         shape = self.action_spaces[self.agents[0]].shape
-        rows = [np.asarray(actions[agent], np.float32) for agent in self.agents]
+        rows = [np.float32(read_floats(f"action of {agent}", actions[agent])) for agent in self.agents]
         for agent, row in zip(self.agents, rows, strict=True):
             if row.shape != shape:
                 raise ValueError(f"expected an action of {agent} of shape {shape}, got {row.shape}")

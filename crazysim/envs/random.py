@@ -32,6 +32,15 @@ def as_seed(seed: object) -> int | None:
     return int(seed)
 
 
+def check_key(key: object) -> None:
+    """Check that an argument is a typed random key, or an array of them."""
+    if not isinstance(key, Array) or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        raise ConfigError(
+            f"expected a random key, got {short_repr(key)}. Use jax.random.key(0), or jax.random.wrap_key_data(key) if "
+            f"it comes from jax.random.PRNGKey."
+        )
+
+
 def episode_key(data: SimData, name: str) -> Array:
     """Return the random key of a world's episode.
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from crazysim.core.settings import check_image_size
 from crazysim.envs.state import EnvState
 from crazysim.errors import ConfigError, short_repr
 from crazysim.sim.sim import Sim
@@ -37,7 +38,11 @@ class Renderer:
                 f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {short_repr(worlds)}. "
                 f"Use [0], or None for all."
             )
-        self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), size
+        if not isinstance(size, (tuple, list)) or len(size) != 2:
+            raise ConfigError(
+                f"expected render_size as width and height in pixels, got {short_repr(size)}. Use (640, 480)."
+            )
+        self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), check_image_size(*size)
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
         """Return an image of each chosen world, (height, width, 3), or an empty list after drawing into the window.

@@ -7,11 +7,14 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
+from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs, validate_action
+from crazysim.errors import ConfigError, short_repr
 from crazysim.jaxcompat import is_key
 from crazysim.pytree import PyTree, select_worlds
 
@@ -90,14 +93,25 @@ def rollout(
         The state and the memory after the last step, and the results of ``keep``, stacked over time, (n_steps, ...).
     """
     n_steps = positive_integer("n_steps", n_steps)
+    check_key(key)
+    for name, function in (("policy", policy), ("keep", keep)):
+        if not callable(function):
+            raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
     memory = initial_memory if memory is None else memory
     flat = env.flatten(state)
+    if env.reset_policy is not None:
+        n_worlds = state.reward.shape[0]
+        if shapes := [jnp.shape(x) for x in jax.tree.leaves(initial_memory) if jnp.shape(x)[:1] != (n_worlds,)]:
+            raise ConfigError(
+                f"expected initial_memory of shape ({n_worlds}, ...) = (n_worlds, ...), got {shapes[0]}. Use "
+                f"jnp.broadcast_to(x, (n_worlds, *x.shape))."
+            )
     carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf})
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
         flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]
         state = EnvState(flat_before.data())
-        action, memory, extras = policy(state.obs, memory, key)
+        action, memory, extras = _evaluate(policy, state.obs, memory, key)
         flat_after = env.advance(flat_before, validate_action(action, state, env.actions))
         new_state = EnvState(flat_after.data())
         if env.reset_policy is not None:
@@ -111,3 +125,22 @@ def rollout(
     keys = jax.vmap(split_key, out_axes=1)(key) if is_key(key) and key.ndim else split_key(key)
     (leaves, memory), outputs = jax.lax.scan(step, carry, keys)
     return EnvState(flat.replace(carried_indices, leaves).data()), memory, outputs
+
+
+def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+    """Return action, memory and extras of a policy, after checking that the memory keeps its shapes and types."""
+    results = policy(obs, memory, key)
+    if not isinstance(results, (tuple, list)) or len(results) != 3:
+        raise ConfigError(
+            f"expected a policy that returns (action, memory, extras), got {short_repr(results)}. Return (action, "
+            f"memory, ()) with the memory that it receives if it needs none."
+        )
+    before, after = (
+        jax.tree.map(lambda x: (jnp.shape(x), jnp.asarray(x).dtype), tree) for tree in (memory, results[1])
+    )
+    if before != after:
+        raise ConfigError(
+            f"expected a policy that returns a memory of the shapes and types {before}, which it received, got "
+            f"{after}. Pass initial_memory= of the shapes that it returns."
+        )
+    return results[0], results[1], results[2]

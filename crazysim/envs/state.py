@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.envs.actions import Actions
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, leaf
 from crazysim.tables import read_numbers
 
@@ -210,7 +210,10 @@ def flatten(obs: Obs) -> Array:
 
 def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Return actions for all worlds as a float32 host array, after checking shape and values. (n_worlds, ...)"""
-    actions = np.asarray(actions, np.float32)
+    try:
+        actions = np.asarray(actions, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"expected actions as an array of numbers {shape}, got {short_repr(actions)}") from error
     if actions.shape != shape:
         raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
     if not np.all(np.isfinite(actions)):

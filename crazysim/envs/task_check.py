@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import keystr, tree_leaves_with_path
+from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
@@ -70,6 +70,11 @@ def check_record(state: EnvState, stepped: EnvState) -> None:
             raise ConfigError(
                 f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
                 f"Return one row for every drone."
+            )
+        if path[0] == GetAttrKey("obs") and x.ndim != 3:
+            raise ConfigError(
+                f"expected {name} of shape (n_drones, k) in one world, got {x.shape[1:]}. For one number per drone use "
+                f"x[:, None]; for one array per drone use x.reshape(n_drones, -1)."
             )
         y = stepped_leaves.get(path)
         if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):

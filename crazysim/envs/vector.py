@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.cache import announce_if_slow
-from crazysim.core.settings import as_mask, enum_member, positive_integer
+from crazysim.core.settings import as_mask, check_flag, enum_member, positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
@@ -62,7 +62,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             "render_modes": list(RENDER_MODES),
             "render_fps": round(env.max_steps / env.task.seconds),
         }
-        self.num_envs, self._numpy = env.sim.n_worlds, bool(numpy)
+        self.num_envs, self._numpy = env.sim.n_worlds, check_flag("numpy", numpy)
         self._has_single_drone = env.sim.n_drones == 1
         self._reset_fn = jax.jit(self.env.reset)
         self._restart_fn = jax.jit(self.env.restart)
@@ -84,6 +84,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
+        if not isinstance(options, (Mapping, type(None))):
+            raise ConfigError(f"expected options of reset as a dict, got {short_repr(options)}")
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
         if options:

@@ -120,6 +120,8 @@ def test_entries_of_wrappers_are_kept(env, reset):
 
 
 def test_wrong_input_is_an_error(drone_env, env, reset):
+    with pytest.raises(ConfigError, match="expected a random key, got 0"):
+        env.reset(0)
     with pytest.raises(ConfigError, match="without AutoReset"):
         BraxEnv(AutoReset(drone_env))
     state = reset(jax.random.key(0))

@@ -108,6 +108,9 @@ def test_wrong_actions_are_refused(env):
         ),
         ({"drone_0": good, "drone_1": np.zeros(3)}, ValueError, r"drone_1 of shape \(4,\), got \(3,\)"),
         ({"drone_0": good * np.nan, "drone_1": good}, ConfigError, "expected a finite action of drone_0"),
+        ({"drone_0": "up", "drone_1": good}, ConfigError, "expected action of drone_0 as a number or array, got 'up'"),
+        ({1: good, "drone_2": good}, KeyError, "got one of 1"),
+        ([good, good], ConfigError, "expected a dict with an action of every drone"),
     ):
         with pytest.raises(error, match=message):
             env.step(actions)

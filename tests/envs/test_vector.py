@@ -152,6 +152,8 @@ def test_a_step_transfers_no_arrays_and_is_traced_once(next_step):
         (np.zeros((3, 5)), ValueError, r"expected actions of shape \(3, 4\), got \(3, 5\)"),
         (jnp.zeros((2, 4)), ValueError, r"expected actions of shape \(3, 4\), got \(2, 4\)"),
         (np.zeros(4), ValueError, r"expected actions of shape \(3, 4\), got \(4,\)"),
+        ("up", ConfigError, r"expected actions as an array of numbers \(3, 4\), got 'up'"),
+        ({"drone": np.zeros(4)}, ConfigError, "expected actions as an array of numbers"),
         (
             np.array([[0.0] * 4, [np.nan] * 4, [0, 0, 0, np.inf]]),
             ConfigError,
@@ -185,6 +187,7 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
         ({"seed": -1}, ConfigError, "as seed of all worlds, .*, got -1"),
         ({"seed": 2**63}, ConfigError, "as seed of all worlds, .*, got 9223372036854775808"),
         ({"options": {"colour": 1}}, ConfigError, "expected no option of reset but reset_mask, got colour"),
+        ({"options": "all"}, ConfigError, "expected options of reset as a dict, got 'all'"),
         ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
         ({"options": {"reset_mask": np.ones(3)}}, ValueError, r"expected a mask of shape \(3,\) and bool"),
         (
@@ -207,6 +210,9 @@ def test_wrong_resets_are_errors(next_step, kwargs, error, message):
         ({"autoreset_mode": "sometimes"}, "autoreset_mode is 'sometimes'; it must be one of 'NextStep'"),
         ({"render_worlds": [2]}, r"expected render_worlds as a list of worlds from 0 to 1, got \[2\]"),
         ({"render_worlds": 0}, "expected render_worlds as a list of worlds from 0 to 1, got 0"),
+        ({"render_size": (0, 480)}, "expected positive integers as width and height of an image, got 0 x 480"),
+        ({"render_size": 480}, "expected render_size as width and height"),
+        ({"numpy": "no"}, "expected numpy as True or False, got 'no'"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"color": "red"}, "effects, randomize, camera, depth_image; the simulation has"),
         ({"n_world": 2}, "did you mean n_worlds"),

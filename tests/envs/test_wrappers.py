@@ -22,11 +22,13 @@ from crazysim.envs import (
     RewardTerms,
     Wrapper,
     make,
+    rollout,
 )
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 
 FIRST = np.array([True, False, False, False])
+KEY = jax.random.key(0)
 
 
 @pytest.fixture(scope="module")
@@ -374,3 +376,37 @@ def test_parameters_that_cannot_be_randomised_are_errors(env):
         RandomizeWith(env, draw_masses, params=("mass", "colour"))
     with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
         jax.eval_shape(RandomizeWith(env, draw_masses).reset, jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env: Observe(env, None), "expected a function"),
+        (lambda env: Observe(env, lambda obs, data: 1).reset(KEY), "a dict of names to arrays, got 1"),
+        (lambda env: Observe(env, lambda obs, data: {}).reset(KEY), "a dict of names to arrays"),
+        (lambda env: Observe(env, lambda obs, data: {"z": data.states.pos[:, 2]}).reset(KEY), r"\(n_drones, k\)"),
+        (lambda env: RandomizeWith(env, None), "expected a function"),
+        (lambda env: RandomizeWith(env, lambda data, key: None).reset(KEY), "to return the data"),
+        (lambda env: Normalize(env, 5), "stats as a dict"),
+        (lambda env: env.reset(0), r"random key, got 0.*jax.random.key\(0\)"),
+        (lambda env: env.reset(jax.random.PRNGKey(0)), "wrap_key_data"),
+        (lambda env: fly(env, key=0), "random key, got 0"),
+        (lambda env: fly(env, policy=None), "policy as a function, got None"),
+        (lambda env: fly(env, keep="x"), "keep as a function, got 'x'"),
+        (lambda env: fly(env, policy=lambda obs, memory, key: obs), "returns .action, memory, extras."),
+        (lambda env: fly(env, policy=lambda *args: (jnp.zeros((4, 1, 4)), 5.0, ())), "initial_memory="),
+        (lambda env: fly(env, initial_memory=5), r"initial_memory of shape \(4, ...\)"),
+    ],
+)
+def test_law_09_wrong_functions_keys_and_memories_are_named(env, call, message):
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
+        call(env)
+
+
+def fly(env, policy=lambda obs, memory, key: (jnp.zeros((4, 1, 4)), memory, ()), key=KEY, **options):
+    auto = AutoReset(env)
+    return rollout(auto, auto.reset(KEY), policy, key, 3, **options)
+
+
+def test_one_parameter_may_be_named_without_a_tuple(env):
+    assert RandomizeWith(env, lambda data, key: data, params="mass").params == ("mass",)

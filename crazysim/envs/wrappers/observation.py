@@ -32,13 +32,24 @@ class Observe(Wrapper):
 
     def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
         super().__init__(env)
+        if not callable(fn):
+            raise ConfigError(f"expected a function (obs, data) -> obs, got {short_repr(fn)}")
         self.fn = fn
 
     def after_reset(self, state: EnvState) -> EnvState:
-        return state.replace(obs=self.fn(state.obs, state.data))
+        return self._observe(state)
 
     def after_step(self, state: EnvState) -> EnvState:
-        return state.replace(obs=self.fn(state.obs, state.data))
+        return self._observe(state)
+
+    def _observe(self, state: EnvState) -> EnvState:
+        obs = self.fn(state.obs, state.data)
+        if not isinstance(obs, Mapping) or not obs:
+            raise ConfigError(
+                f"expected the function of {self.name!r} to return a dict of names to arrays, got {short_repr(obs)}. "
+                f"Use for example {{'vector': flatten(obs)}}."
+            )
+        return state.replace(obs=jax.tree.map(jnp.asarray, dict(obs)))
 
 
 class PrivilegedObservation(Observe):
@@ -120,6 +131,8 @@ class Normalize(Wrapper):
 
     def __init__(self, env: Env, stats: dict[str, RunningStats] | None = None):
         super().__init__(env)
+        if not isinstance(stats, (Mapping, type(None))):
+            raise ConfigError(f"expected stats as a dict of RunningStats by name, or None, got {short_repr(stats)}")
         self.stats = stats
 
     def after_reset(self, state: EnvState) -> EnvState:

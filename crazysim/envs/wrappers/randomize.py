@@ -14,7 +14,7 @@ from crazysim.core.stage import Axes
 from crazysim.envs.env import Env
 from crazysim.envs.random import episode_key
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import scopes
 
 
@@ -28,6 +28,9 @@ class RandomizeWith(Wrapper):
 
     def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
         super().__init__(env)
+        if not callable(fn):
+            raise ConfigError(f"expected a function (data, key) -> data, got {short_repr(fn)}")
+        params = (params,) if isinstance(params, str) else params
         sim_params = env.sim.data.params
         fields = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
         if unknown_params := [name for name in params if fields.get(name) is None]:
@@ -45,6 +48,11 @@ class RandomizeWith(Wrapper):
 
     def after_spawn(self, data: SimData) -> SimData:
         randomised = self.fn(data, episode_key(data, "randomize"))
+        if jax.tree.structure(randomised) != jax.tree.structure(data):
+            raise ConfigError(
+                f"expected the function of RandomizeWith to return the data that it gets with other values, got a "
+                f"{type(randomised).__name__}. Use data.replace(params=...)."
+            )
         axes = Axes(data)
         leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)
         shared_names = [name for name, scope, x, y in leaves if scope in ("shared", "opaque") and y is not x]
