@@ -10,7 +10,7 @@ from crazysim.errors import ConfigError, EngineWarning, UnsupportedError, warn
 
 
 class LimitError(UnsupportedError):
-    """A documented limit of the engine: a stage runs unfused, or a derivative on lanes, without a warning."""
+    """A documented limit of the engine. The stage runs unfused, or the derivative on ``lanes``, without a warning."""
 
 
 class KernelError(UnsupportedError):
@@ -18,12 +18,12 @@ class KernelError(UnsupportedError):
 
 
 def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str], remedy: str) -> None:
-    """Warn once about operations that the engine does not support, so that they run more slowly, or raise an error.
+    """Warn once that operations are not supported and run more slowly; with ``strict``, raise an error instead.
 
     Args:
-        problems: Unsupported operations, each with the reason. Without any, there is no warning.
+        problems: Unsupported operations, each with the reason. If empty, nothing is reported.
         strict: True to raise an error instead of the warning.
-        reported: Warnings that were given before; the new one is added.
+        reported: Texts of the warnings that were given before; the text of a new warning is added.
         remedy: Remedy for the error: the beginning of a sentence that ends with ``or use strict=False``.
     """
     if not problems:

@@ -16,7 +16,7 @@ from crazysim.pytree import leaf_flags, leaf_indices, scopes
 
 
 class PackCache:
-    """Shared parameters concatenated to one array, which is made again only after one of them was replaced.
+    """Shared parameters concatenated to one array. It is made again only after one of the parameters was replaced.
 
     On a CPU the first array is made by NumPy: compiling a program would take 20 ms for each set of shapes, and most
     simulations need no second array. Later arrays are made by a compiled program, in a sixth of the time.
@@ -30,9 +30,9 @@ class PackCache:
             return _concatenate(arrays)
         cached_arrays, packed = self._cached
         if packed is None or not _are_same(arrays, cached_arrays):
-            with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
+            with jax.ensure_compile_time_eval():  # inside a user's trace too, the cached value must not be a tracer
                 packed = (
-                    _pack_arrays(arrays)
+                    _concatenate_in_numpy(arrays)
                     if packed is None and _are_on_one_cpu(arrays)
                     else _compiled_concatenate(arrays)
                 )
@@ -46,8 +46,8 @@ def _are_on_one_cpu(arrays: list[Any]) -> bool:
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
 
 
-def _pack_arrays(arrays: list[Any]) -> Array:
-    """Concatenate arrays of one device to an array on it, which is committed if one of them is."""
+def _concatenate_in_numpy(arrays: list[Any]) -> Array:
+    """Return arrays of one device concatenated on that device; the result is committed if one of the arrays is."""
     committed_sharding = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
     return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed_sharding)
 
@@ -60,20 +60,20 @@ _compiled_concatenate = jax.jit(_concatenate)
 
 
 class ZerosCache:
-    """Elements of shared parameters that are zero, such as the products of an inertia.
+    """Elements of shared parameters that are zero, such as the products of inertia.
 
     Only parameters of drones and controllers, and parameters of plugins that are declared sparse, are examined.
 
-    Values are read again only after one of the arrays was replaced. Under a trace they are unknown, and no element
-    counts as zero.
+    Values are read again only after one of the arrays was replaced. Under a trace the values are unknown, and the
+    result is empty.
     """
 
     def __init__(self) -> None:
         self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one attribute: other threads may replace it
-        self._shared: dict[Any, list[int]] = {}
+        self._indices_by_structure: dict[Any, list[int]] = {}
 
     def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
-        indices = self._indices(data, leaves, treedef)
+        indices = self._find_parameters(data, leaves, treedef)
         arrays = [leaves[i] for i in indices]
         cached_arrays, zeros = self._cached
         if _are_same(arrays, cached_arrays):
@@ -87,22 +87,23 @@ class ZerosCache:
         self._cached = _without_numpy(arrays), zeros
         return zeros
 
-    def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
+    def _find_parameters(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
+        """Return the indices of the leaves to examine."""
         key = (treedef, *[x.ndim for x in leaves])
-        if key not in self._shared:
+        if key not in self._indices_by_structure:
             indices = leaf_indices(data)
             parameters = set(jax.tree.leaves((indices.params, indices.controls)))
-            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(leaf_flags(data, "sparse")), leaves, strict=True)
-            self._shared[key] = [
+            leaf_scopes, sparse_flags = jax.tree.leaves(scopes(data)), jax.tree.leaves(leaf_flags(data, "sparse"))
+            self._indices_by_structure[key] = [
                 i
-                for i, (scope, is_sparse, x) in enumerate(rows)
+                for i, (scope, is_sparse, x) in enumerate(zip(leaf_scopes, sparse_flags, leaves, strict=True))
                 if scope == "shared" and (is_sparse or i in parameters) and jnp.issubdtype(x.dtype, jnp.floating)
             ]
-        return self._shared[key]
+        return self._indices_by_structure[key]
 
 
 def _without_numpy(arrays: list[Any]) -> list[Any]:
-    """Return the arrays, with None for NumPy arrays, which never count as equal because their owner may change them."""
+    """Return the arrays, with None for each NumPy array: its owner may change it, so it must be read again."""
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 

@@ -1,7 +1,7 @@
 """Steps on the host without XLA: compiled kernels are called on the memory of arrays.
 
 A call of a compiled JAX function takes about 30 us, mostly to convert its operands and results. A loop of commands,
-steps and reads uses few of them as JAX arrays, so a JAX array is made only when it is read.
+steps and reads needs few of these as JAX arrays, so a JAX array is made only when a leaf is read.
 
 Memory that a kernel has read or written does not change afterwards. A kernel reads JAX arrays through NumPy views; as
 long as a view exists, JAX copies the buffer instead of reusing it for a donated array. It also reads commands, which
@@ -45,7 +45,7 @@ class HostLeaves:
         Args:
             items: For each leaf a JAX or NumPy array, or the ``CallResults`` of the call that wrote it.
             addresses: Address of each leaf that kernels read.
-            views: Views that keep the memory of JAX arrays.
+            views: NumPy views that keep the memory of JAX arrays alive.
             sharding: Device on which JAX arrays are made.
         """
         self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
@@ -67,12 +67,12 @@ class HostLeaves:
         return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
     def replace(self, indices: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
-        """Return the leaves with some replaced by arrays that must not change afterwards."""
+        """Return the leaves with some replaced by ``arrays``, which must not change afterwards."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
         return self.replace_items(indices, arrays, [_address(x) for x in arrays])
 
     def replace_items(self, indices: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
-        """Return the leaves with some replaced by items with known addresses."""
+        """Return the leaves with some replaced by ``items`` at the given addresses."""
         leaves = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
         for i, x, address in zip(indices, items, addresses, strict=True):
             leaves.items[i], leaves.addresses[i] = x, address
@@ -80,38 +80,40 @@ class HostLeaves:
 
 
 def _address(x: NDArray) -> int:
-    """Return the address of the data of an array; for a writable array in a third of the time of ``ctypes.data``."""
+    """Return the address of the data of an array, for a writable array three times as fast as ``ctypes.data``."""
     return ctypes.addressof(ctypes.c_char.from_buffer(x)) if x.flags.writeable else x.ctypes.data  # type: ignore[arg-type]
 
 
-class _Offset(NamedTuple):
-    """Location of an array in the memory of a call: the index of a piece, and the offset in it in bytes."""
+class _ArrayPlace(NamedTuple):
+    """Place of an array in the memory of a call."""
 
     piece: int
+    """Index of the piece of memory."""
     offset: int
+    """Offset in the piece, bytes."""
     shape: tuple[int, ...]
     dtype: np.dtype
 
 
 class _Layout:
-    """Pieces of memory that a call writes, and the offsets of its results in them."""
+    """Pieces of memory that a call writes, and the places of its results in them."""
 
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
-        self.offsets: list[_Offset] = []
-        self.sizes: list[int] = []
-        rounded = [
+        self.places: list[_ArrayPlace] = []
+        self.piece_sizes: list[int] = []
+        rounded_sizes = [
             -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
         ]
-        self.shares_memory = sum(rounded) <= MAX_SHARED_BYTES
-        for (_, shape, dtype), size in zip(results, rounded, strict=True):
-            if self.shares_memory and self.sizes:
-                self.offsets.append(_Offset(0, self.sizes[0], shape, dtype))
-                self.sizes[0] += size
+        self.shares_memory = sum(rounded_sizes) <= MAX_SHARED_BYTES
+        for (_, shape, dtype), size in zip(results, rounded_sizes, strict=True):
+            if self.shares_memory and self.piece_sizes:
+                self.places.append(_ArrayPlace(0, self.piece_sizes[0], shape, dtype))
+                self.piece_sizes[0] += size
             else:
-                self.offsets.append(_Offset(len(self.sizes), 0, shape, dtype))
-                self.sizes.append(size)
-        self.offset_by_key = dict(zip((key for key, _, _ in results), self.offsets, strict=True))
-        self.offset_by_result = [(x.piece, x.offset) for x in self.offsets]
+                self.places.append(_ArrayPlace(len(self.piece_sizes), 0, shape, dtype))
+                self.piece_sizes.append(size)
+        self.place_by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
+        self.offset_of_result = [(x.piece, x.offset) for x in self.places]
 
 
 class CallResults:
@@ -121,15 +123,15 @@ class CallResults:
 
     def __init__(self, layout: _Layout):
         self._layout = layout
-        self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.sizes]
+        self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.piece_sizes]
         addresses = [_address(x) for x in self._memory]
         self._paddings = [-address % ALIGNMENT_BYTES for address in addresses]
         aligned_addresses = [address + padding for address, padding in zip(addresses, self._paddings, strict=True)]
-        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.offset_by_result]
+        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.offset_of_result]
 
     def array(self, key: Any) -> NDArray:
-        """Return the array of a key; a copy if several share memory, so that keeping it keeps no other array alive."""
-        piece, offset, shape, dtype = self._layout.offset_by_key[key]
+        """Return the array of a key: a copy if arrays share memory, so that it does not keep the other arrays alive."""
+        piece, offset, shape, dtype = self._layout.place_by_key[key]
         x = np.ndarray(shape, dtype, self._memory[piece], self._paddings[piece] + offset)
         return x.copy() if self._layout.shares_memory else x
 
@@ -138,13 +140,13 @@ class _Launch(NamedTuple):
     """Prepared call of a kernel."""
 
     kernel: Any
-    """The kernel, from ``HostLaunch.on_memory``."""
+    """The kernel, from ``HostLaunch.memory_function``."""
     n_lanes: int
     """Number of drones or members in all worlds."""
     inputs: tuple[int, ...]
-    """Leaves that it reads."""
+    """Indices of the leaves that the kernel reads."""
     outputs: slice
-    """Its results among the results of all kernels."""
+    """Positions of its results among the results of all kernels."""
     address_format: struct.Struct
     """Format in which the addresses of inputs and outputs are packed."""
 
@@ -153,16 +155,16 @@ class HostCall:
     """Function that runs the steps of a plan: one host kernel for each of its programs."""
 
     def __init__(self, kernels: Sequence[Kernels], owned: Sequence[Any], leaves: Sequence[Any], nonfinite: int):
-        """Plan the memory and the calls of some kernels.
+        """Prepare the memory and the calls of some kernels.
 
         Args:
             kernels: Kernels of the programs, for which ``is_host_call_possible`` holds.
-            owned: For each program the leaves whose new values are taken from it; None for all.
+            owned: For each program the indices of the leaves that it updates; None for all leaves that it writes.
             leaves: Leaves of the data, for their shapes and types.
             nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.
         """
         self.was_called = False
-        """True once it has been called."""
+        """True after the first call."""
         self._nonfinite = nonfinite
         self._views_by_leaf: dict[int, tuple[Any, NDArray]] = {}
         self._launches: list[_Launch] = []
@@ -178,11 +180,15 @@ class HostCall:
             address_format = struct.Struct(f"{len(kernel.inputs) + len(results) - first_result}P")
             self._launches.append(
                 _Launch(
-                    kernel.get_launch("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, address_format
+                    kernel.get_launch("cpu").memory_function(),
+                    n_worlds * n_drones,
+                    kernel.inputs,
+                    outputs,
+                    address_format,
                 )
             )
         self._flag_keys = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
-        if self._flag_keys == [("flags", 0)] and results[-1][1][1] == 1:  # the flags are the leaf
+        if self._flag_keys == [("flags", 0)] and results[-1][1][1] == 1:  # flags (n_worlds, 1) need no reduction
             results[-1] = (nonfinite, *results[-1][1:])
             self._flag_keys = []
         self._layout = _Layout(results)

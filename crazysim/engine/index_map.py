@@ -22,7 +22,7 @@ from crazysim.engine.ir.blocks import Block, prune
 from crazysim.engine.lowering.jaxprs import Lowering, TableRows, as_elements
 
 Function = Callable[..., Sequence[Array]]
-"""``fn(index, *tables)`` returns single numbers for an index, int32 (); it reads tables by ``table_row`` only."""
+"""``fn(index, *tables)`` returns single numbers for an index, int32 (). It may read tables only by ``table_row``."""
 
 
 class MapKernels:
@@ -59,7 +59,7 @@ def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[
 map_p = jaxcompat.primitive_by_platform(
     "crazysim_map", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
-"""Call of a kernel: from its tables to its results for all indices."""
+"""Primitive that calls a kernel: it takes the tables and returns the results for all indices."""
 
 
 def map_indices(
@@ -67,12 +67,12 @@ def map_indices(
 ) -> list[Array]:
     """Return the results of a function for the indices 0 to ``n - 1``. (n,) each
 
-    It has no derivative. Under ``vmap`` the kernel is called for one batch at a time.
+    The results have no derivative. Under ``vmap`` the kernel is called for one batch at a time.
 
     Args:
         fn: The function.
         n: Number of indices.
-        tables: The tables that it reads. (n_rows, k) each
+        tables: The tables that the function reads. (n_rows, k) each
         platform: Platform of the kernel, ``"cpu"`` or ``"gpu"``; None for XLA without a kernel.
         compile_now: False to compile the kernel only when JAX compiles a program that uses the results.
 
@@ -80,8 +80,8 @@ def map_indices(
         UnsupportedError: If the engine does not support the function, or its compiler refuses the kernel.
     """
     if platform is None:
-        numbers = jnp.arange(n, dtype=np.int32)
-        return list(jax.vmap(lambda i: fn(i, *tables))(numbers))
+        indices = jnp.arange(n, dtype=np.int32)
+        return list(jax.vmap(lambda i: fn(i, *tables))(indices))
     kernels = MapKernels(lower_map(fn, tables))
     if compile_now:
         kernels.get_launch(platform)

@@ -25,13 +25,13 @@ def optimise(
 
     Args:
         program: The program, from ``lower_stages``.
-        select_rows: Function that returns which of the written leaves to store as rows, each with one number of all
-            drones. None to store none as rows.
+        select_rows: Function from the indices of the written leaves to the indices of the leaves to store as rows. A
+            row holds one number of all drones. None to store no leaf as rows.
         pack: True to pack shared numbers in one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
     if select_rows is not None:
-        pack_selected_rows = functools.partial(pack_rows, select=select_rows)
+        pack_selected_rows = functools.partial(pack_rows, select_rows=select_rows)
         passes.append(functools.update_wrapper(pack_selected_rows, pack_rows))
     return apply_passes(program, passes)
 

@@ -1,6 +1,6 @@
-"""Plans, which state the engine that steps data of one structure, and the reason why no faster engine was chosen.
+"""Plans: the engine that steps data of one structure, the compiled step, and the reason why no faster engine runs.
 
-What an engine cannot run is found here, before the first step. There are three cases:
+Planning finds what an engine cannot run before the first step. There are three cases:
 
 - A documented limit, which ``explain`` names. A stage without a scope splits the step: it runs unfused, between kernels
   of the stages before and after it. On a machine without a compiler, ``lanes`` runs. For data on several devices,
@@ -53,7 +53,7 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 
 SeparateLeaves = frozenset[int] | None
 """Leaves that stay separate arrays when the other written leaves are stored as rows of a few arrays. With an empty set
-every written leaf is stored as rows, except for random keys and ``core.mjx_synced``; None stores none."""
+every written leaf is stored as rows, except for random keys and ``core.mjx_synced``. With None no leaf is."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Plan:
 
 
 class Planner(NamedTuple):
-    """Planner of steps. Its fields are everything that determines a plan, besides the data."""
+    """Planner of steps. Its fields are the inputs of planning other than the data."""
 
     stages: Sequence[Stage]
     """Stages of the step, in order."""
@@ -120,9 +120,10 @@ class Planner(NamedTuple):
         Args:
             data: The data, or its shapes and types.
             zeros: Elements of shared parameters that are zero.
-            trace: Function that traces the compiled step of a plan, as its first call would, so that errors show here.
+            trace: Function that traces the compiled step of a plan, as its first call would, so that planning raises
+                the errors of the trace.
             separate: Leaves that stay separate arrays. If one kernel runs the whole step, all other leaves that it
-                writes are stored as rows. None to store none as rows.
+                writes are stored as rows. None to store no leaf as rows.
 
         Raises:
             ConfigError: If ``fused`` was chosen and has no kernel; with ``strict``, if something is unsupported.
@@ -156,13 +157,13 @@ class Planner(NamedTuple):
     def _plan_programs(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
         """Return a plan that runs programs, and messages on what its engine does not support.
 
-        For data on several devices it may be a plan of ``plain``.
+        If programs cannot step data on several devices, the plan runs ``plain``.
         """
         distribution_limit = self._distribution_limit(data)
         if distribution_limit:
             return self._plan_plain(data, distribution_limit), []
         leaf_scopes = jax.tree.leaves(scopes(data))
-        # ``zeros`` may be older than ``data``: a parameter that was shared then may have one value per drone now.
+        # ``zeros`` may be older than ``data``: a parameter that was shared may have one value per drone in ``data``.
         shared_zeros = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
@@ -186,8 +187,8 @@ class Planner(NamedTuple):
             engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
             if not reason:
                 try:
-                    without_rows = None if select_rows is None else optimise(lowered_programs[0])
-                    runs, engine = [fused.build(x, self.location, without_rows) for x in programs], "fused"
+                    unpacked_program = None if select_rows is None else optimise(lowered_programs[0])
+                    runs, engine = [fused.build(x, self.location, unpacked_program) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
                     reason = str(error)
@@ -245,8 +246,8 @@ class Planner(NamedTuple):
             if programs
             else indices.core.nonfinite not in written_leaves
         )
-        flags = (indices.core.nonfinite,) if has_check else ()
-        written_leaves = (*written_leaves, *flags)
+        flag_leaves = (indices.core.nonfinite,) if has_check else ()
+        written_leaves = (*written_leaves, *flag_leaves)
         drone_program = programs[0] if programs else None
         packed = drone_program.packed if drone_program is not None else ()
         rows = tuple(packed_rows(drone_program)) if drone_program is not None else ()
@@ -254,7 +255,7 @@ class Planner(NamedTuple):
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
             leaves = replace_leaves([None] * n_leaves, inputs, values)
             outputs, flagged = run_programs(leaves, n_steps)
-            return [*outputs, flagged] if flags else list(outputs)
+            return [*outputs, flagged] if flag_leaves else list(outputs)
 
         if programs and self.location.mesh is not None:
             advance = self._shard_over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
@@ -296,7 +297,7 @@ class Planner(NamedTuple):
         report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
     def _no_kernel_message(self, error: UnsupportedError) -> str:
-        """Return a message on what a kernel does not support, with the stage, or with all stages if it is not known."""
+        """Return a message that names what has no kernel, and the stage, or all stages if the stage is not known."""
         if error.stage:
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
@@ -328,7 +329,7 @@ class Planner(NamedTuple):
 
 
 def _jit_steps(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return a step compiled for a number of steps that is an array, and for one that is a Python number."""
+    """Return two compiled steps: one takes the number of steps as an array, the other as a Python number."""
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
@@ -370,7 +371,7 @@ def _join_runs(
 
 
 def _watched_leaves(data: SimData) -> list[Any]:
-    """Return the leaves in which NaN or infinity flags a world: states and controls of drones, other populations."""
+    """Return the leaves in which NaN or infinity flags a world, as ``watched_records`` defines them."""
     return jax.tree.leaves(watched_records(data))
 
 

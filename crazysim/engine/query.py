@@ -1,4 +1,4 @@
-"""Functions of one drone or one world, evaluated for all by one kernel."""
+"""Functions of one drone or one world, evaluated for all drones and worlds by one kernel."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf, replace_leaves
 
 RECORD_NAME = "results"
-"""Name of the results in ``data.plugins`` while the kernel runs."""
+"""Name of the record of results in ``data.plugins`` while the kernel runs."""
 
 Query = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
-"""Scope of a function, and the function. It maps data of one drone to any tree of arrays, or data of one world to a
-tree of arrays with a leading axis for its drones."""
+"""Scope of a function, and the function. A function of one drone returns any tree of arrays. A function of one world
+returns a tree of arrays with a leading axis for the drones."""
 
 
 class QueryResults(PyTree):
-    """Results as rows of numbers."""
+    """Results of all queries, flattened to one axis for each drone."""
 
     rows: dict[str, Array] = leaf("drone", 1)
-    """Results by query and array. (n_worlds, n_drones, k) each"""
+    """Results by name, the number of the query and of its array. (n_worlds, n_drones, k) each"""
 
 
 def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     """Return the results of some functions for every drone. (n_worlds, n_drones, ...) each
 
     Args:
-        queries: The functions. They receive data as stages do, but without records of plugins: a function of one world
-            gets leaves (n_drones, ...).
+        queries: The functions. They receive data of one drone or one world, as stages do, but without records of
+            plugins.
         data: The simulation.
         platform: ``"cpu"`` or ``"gpu"``.
 
     Raises:
-        UnsupportedError: If the engine does not support one of them.
+        UnsupportedError: If the engine does not support one of the functions.
     """
     n_worlds, n_drones = data.states.pos.shape[:2]
     leaves, axes = jax.tree.leaves(data), Axes(data)
     rows: dict[str, Array] = {}
-    shapes, trees, stages = [], [], []
+    shapes, treedefs, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
         template = axes.treedef.unflatten(axes.unbatched_shapes(leaves, scope))
-        outs, treedef = jax.tree.flatten(jax.eval_shape(fn, template))
-        names = [f"{number} {k}" for k in range(len(outs))]
-        drone_shapes = [x.shape[1:] if scope == "world" else x.shape for x in outs]
-        for name, x, shape in zip(names, outs, drone_shapes, strict=True):
+        results, treedef = jax.tree.flatten(jax.eval_shape(fn, template))
+        names = [f"{number} {k}" for k in range(len(results))]
+        drone_shapes = [x.shape[1:] if scope == "world" else x.shape for x in results]
+        for name, x, shape in zip(names, results, drone_shapes, strict=True):
             rows[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
         shapes.append(dict(zip(names, drone_shapes, strict=True)))
-        trees.append(treedef)
+        treedefs.append(treedef)
         stages.append(Stage(_make_writer(fn, names, scope), scope, name=f"query {number}", phase="after"))
     extended_data = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
     extended_leaves, treedef = jax.tree.flatten(extended_data)
@@ -66,23 +66,24 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([extended_leaves[i].ravel() for i in program.packed])] if program.packed else []
     written, _ = adapt_to_data_leaves(program, fused.build(program, Location(platform)))([*extended_leaves, *packed], 0)
-    results = (
-        treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written)).plugins[RECORD_NAME].rows
-    )
+    data_after = treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written))
+    rows = data_after.plugins[RECORD_NAME].rows
     return [
-        tree.unflatten([results[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()])
-        for tree, query_shapes in zip(trees, shapes, strict=True)
+        query_treedef.unflatten(
+            [rows[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()]
+        )
+        for query_treedef, query_shapes in zip(treedefs, shapes, strict=True)
     ]
 
 
 def _make_writer(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Callable[[SimData], SimData]:
-    """Return the stage that writes the results of a function to the data."""
+    """Return the function of a stage that writes the results of ``fn`` to the data."""
 
     def write(data: SimData) -> SimData:
         rows = data.plugins[RECORD_NAME].rows
-        outs = jax.tree.leaves(fn(data.replace(plugins={})))
+        results = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
-        new_arrays = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
+        new_arrays = {name: x.reshape(shape) for name, x in zip(names, results, strict=True)}
         return data.replace(plugins={RECORD_NAME: QueryResults(rows | new_arrays)})
 
     return write

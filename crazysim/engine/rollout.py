@@ -50,7 +50,7 @@ def rollout(
         step: From ``sim.build_step_fn()``.
         data: The simulation at the start.
         policy: ``policy(params, data) -> command``, for all worlds at once.
-        params: The policy's parameters.
+        params: Parameters of the policy.
         n_control_steps: Number of control steps; a multiple of ``every``.
         n_substeps: Physics steps of a control step.
         keep: ``keep(data)`` returns what to record after a control step.
@@ -86,7 +86,7 @@ def rollout(
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
 
 compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
-"""``rollout`` in one compiled call; only the carries of its loops reuse buffers."""
+"""``rollout`` in one compiled call, which does not donate the buffers of its arguments."""
 
 
 def run_rollout(
@@ -101,7 +101,7 @@ def run_rollout(
 ) -> tuple[SimData, Any]:
     """Return the results of ``rollout``, compiled; with ``progress``, run it in pieces and show a progress bar.
 
-    The caller's buffers are not donated.
+    The caller's buffers are not donated. ``settings`` are the other arguments of ``rollout``.
     """
     zeros = step.zeros(data)
     if not progress:

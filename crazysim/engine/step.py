@@ -30,7 +30,7 @@ from crazysim.pytree import check_axes, lazy_record, replace_leaves
 
 
 class FlatData:
-    """``SimData`` as a list of arrays, with the plan that steps it. Successive steps make no record in between."""
+    """``SimData`` as a list of arrays, with the plan that steps it. No record is made between successive steps."""
 
     __slots__ = ("_record", "leaves", "plan")
 
@@ -41,14 +41,14 @@ class FlatData:
         self._record: SimData | None = None
 
     def is_record(self, data: SimData) -> bool:
-        """Return whether a record is the one that ``data`` returned."""
+        """Return whether a record is the record that ``data`` returned."""
         return data is self._record
 
     def data(self) -> SimData:
         """Return the data as a record, always the same one. Its fields are computed when they are read."""
         record = self._record
         if record is None:
-            # Without a reference to this object, so that no cycle keeps arrays in memory.
+            # ``partial`` holds no reference to this object, because the cycle would keep arrays in memory.
             read_leaf = functools.partial(_read_leaf, self.leaves, self.plan)
             record = self._record = lazy_record(self.plan.leaf_indices, read_leaf)
         return record
@@ -82,7 +82,7 @@ class FlatData:
 
 
 def _read_leaf(leaves: Any, plan: Plan, i: int) -> Any:
-    """Return one of the leaves of the data, taken from the rows if it is stored as rows."""
+    """Return leaf ``i`` of the data, unpacked if it is stored as rows."""
     x = leaves[i]
     if x is not None or not plan.rows:
         return x
@@ -102,8 +102,8 @@ class Step:
     If ``n_steps`` is an array, one compilation serves every number of steps. If it is a Python integer, the loop can be
     differentiated in reverse mode.
 
-    Data is stepped on the devices that hold it. Under a trace these are unknown, and the step runs on the devices that
-    it was built for.
+    Data is stepped on the devices that hold it. Under a trace its devices are unknown, and the step runs on the devices
+    that it was built for.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Step:
             engine: One of ``ENGINES``.
             platform: ``"cpu"`` or ``"gpu"``.
             mesh: Devices that the worlds are distributed over; None without a mesh.
-            device: Device that it runs on; None for any of the platform.
+            device: Device that the step runs on; None for any device of the platform.
             strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
 
         Raises:
@@ -186,9 +186,9 @@ class Step:
             data: The simulation.
             zeros: As in ``__call__``.
             n_steps: Any number of steps of the type that will be passed to ``advance``; None for an array.
-            separate: Leaves that remain separate arrays. If one kernel runs the whole step, the other leaves that it
-                writes, except random keys, are stored as rows of few arrays, one for each scope and type, which makes
-                loops over calls faster. None to store none as rows.
+            separate: Leaves that stay separate arrays. If one kernel runs the whole step, the other leaves that it
+                writes, except random keys, are stored as rows of a few arrays, one for each scope and type. This makes
+                loops over calls faster. None to store no leaf as rows.
         """
         return self._flatten(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 
@@ -238,7 +238,7 @@ class Step:
         return self._zeros_cache(data, *jax.tree.flatten(data))
 
     def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
-        """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to inspect, or to compile ahead."""
+        """Return the step lowered for this data, as ``jax.jit(...).lower`` does, to inspect or to compile it."""
         _check_steps(n_steps)
         flat = self.flatten(data, None, n_steps)
         step = flat.plan.static_count_step if isinstance(n_steps, int) else flat.plan.traced_count_step
@@ -269,7 +269,7 @@ class Step:
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _make_false_flag(self, old_flag: Any) -> Any:
-        """Return a false flag on the devices of the previous flag; the flag from the last call if possible."""
+        """Return a false flag on the devices of the previous flag: the previous flag itself if this method made it."""
         if old_flag is self._last_false_flag:
             return old_flag
         traced = isinstance(old_flag, jax.core.Tracer)

@@ -131,8 +131,8 @@ class Stepper:
     def advance(self, n_steps: int) -> None:
         """Advance the data; any number of steps uses the same compilation."""
         self.count_steps(n_steps)
-        compiles, self._compiled_step = self._compiled_step is not self.step, self.step
-        with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCEMENT_DELAY) if compiles else nullcontext():
+        is_first, self._compiled_step = self._compiled_step is not self.step, self.step
+        with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCEMENT_DELAY) if is_first else nullcontext():
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))

@@ -143,7 +143,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
     zeros, steps, flags = np.zeros(64), np.zeros(2, np.int32), np.zeros(2, bool)
     inputs = [zeros.ctypes.data] * len(source.inputs)
     addresses = (ctypes.c_void_p * (len(inputs) + 2))(*inputs, steps.ctypes.data, flags.ctypes.data)
-    assert native.HostLaunch(source).on_memory()(2, 5, addresses, len(inputs)) == 1
+    assert native.HostLaunch(source).memory_function()(2, 5, addresses, len(inputs)) == 1
     assert steps.tolist() == [5, 5]
 
 

@@ -1,9 +1,9 @@
 """Kernels on NVIDIA GPUs: CUDA source compiled by NVRTC, launched by XLA itself.
 
-NVRTC comes with JAX's CUDA packages. Its PTX is part of the compiled step, in a custom call (``PTX_TARGET``) with which
-XLA hands it to the driver, so JAX's compilation cache never returns a kernel for another GPU. Kernels need no other
-package, no compiler on the machine, and no Python at run time. With ``CRAZYSIM_JAX_FALLBACKS=1`` a handler in Python
-(``ffi_handlers``) launches them instead.
+NVRTC comes with JAX's CUDA packages. Its PTX is part of the compiled step, in a custom call (``PTX_TARGET``) by which
+XLA passes it to the driver. JAX's compilation cache therefore never returns a kernel for another GPU. Kernels need no
+other package, no compiler on the machine, and no Python at run time. With ``CRAZYSIM_JAX_FALLBACKS=1`` a handler in
+Python (``ffi_handlers``) launches kernels instead.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ MAX_GRADIENT_MEMORY_BYTES = 2**30
 """Maximum memory for the states that the kernel of a gradient stores, bytes."""
 
 RESIDENT_LANES = 2**16
-"""Number of lanes that run at once on a GPU with 132 multiprocessors, about 500 on each; gradients get memory for this
-number."""
+"""Number of lanes that run at once on a GPU with 132 multiprocessors, about 500 on each. Gradients get memory for this
+number of lanes."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -86,19 +86,19 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
     device = weakest_device(devices)
     small_kernel = kernel if device is None else fit_registers(kernel, device)
     large_kernel = small_kernel if device is None else widen_blocks(small_kernel, device)
-    ptx(small_kernel, architecture(device))  # raises here what it would raise at the first launch
+    ptx(small_kernel, architecture(device))  # raises its errors now instead of at the first launch
 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        kernel = small_kernel if n_lanes < RESIDENT_LANES else large_kernel
-        n_blocks, memory = -(-n_lanes // kernel.lanes), []
-        if kernel.state_bytes:
-            n_blocks, count, memory = _plan_memory(kernel, n_lanes, int(count[0]))
+        sized_kernel = small_kernel if n_lanes < RESIDENT_LANES else large_kernel
+        n_blocks, memory = -(-n_lanes // sized_kernel.lanes), []
+        if sized_kernel.state_bytes:
+            n_blocks, count, memory = _plan_memory(sized_kernel, n_lanes, int(count[0]))
         grid = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1}
-        block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
-        code = ptx(kernel, architecture(device))
+        block = {"block_x": sized_kernel.threads, "block_y": 1, "block_z": 1}
+        code = ptx(sized_kernel, architecture(device))
         target = _launching_handler() if jaxcompat.FALLBACKS else PTX_TARGET
         digest_attribute = {"digest": hashlib.sha256(code.encode()).hexdigest()} if jaxcompat.FALLBACKS else {}
-        run = jax.ffi.ffi_call(target, [*outputs, *memory], input_output_aliases=kernel.aliases())
+        run = jax.ffi.ffi_call(target, [*outputs, *memory], input_output_aliases=sized_kernel.aliases())
         written = list(
             run(
                 np.asarray([n_lanes], np.int32),
@@ -119,7 +119,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
 
 @functools.cache
 def _launching_handler() -> str:
-    """Return the name of the handler that launches kernels where XLA does not."""
+    """Register the handler that launches kernels where XLA does not, and return its name."""
     ffi_handlers.register("crazysim_launch", "CUDA", ffi_handlers.launch_kernel)
     return "crazysim_launch"
 
@@ -127,8 +127,8 @@ def _launching_handler() -> str:
 def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
     """Return the number of blocks of a kernel that stores states, its numbers of steps, and the memory that it needs.
 
-    If the memory would exceed ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, which each process several groups
-    of lanes in turn.
+    The numbers of steps are the number of all steps and the number of steps of an interval. If the memory would exceed
+    ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, and each block processes several groups of lanes in turn.
     """
     interval = steps_per_interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.state_bytes, MAX_GRADIENT_MEMORY_BYTES)
     n_states = interval + max(-(-n_steps // interval), 1)
@@ -140,7 +140,7 @@ def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.nd
 
 
 def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
-    """Return the GPU with the lowest compute capability, whose code runs on all of them; None without a GPU.
+    """Return the GPU with the lowest compute capability, because its code runs on all GPUs; None without a GPU.
 
     Args:
         devices: GPUs to choose from; None for the GPUs of this machine.
@@ -155,7 +155,7 @@ def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | 
 
 
 def architecture(device: jax.Device | None) -> str:
-    """Return the virtual architecture of a GPU; ``DEFAULT_ARCHITECTURE`` where there is none."""
+    """Return the virtual architecture of a GPU; ``DEFAULT_ARCHITECTURE`` without a GPU."""
     return DEFAULT_ARCHITECTURE if device is None else f"compute_{jaxcompat.compute_capability(device)}"
 
 
@@ -169,7 +169,8 @@ def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
     candidates = [kernel, *(kernel.with_blocks(n) for n in block_counts)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         original, *others = pool.map(lambda c: resources(c, device), candidates)
-    # Measured on an H200: docs/concepts/engine.md. Gradients are slower with 168 registers and 248 bytes than with 255.
+    # Measured on an H200: docs/concepts/engine.md. Gradients with 168 registers and 248 spilled bytes are slower than
+    # with 255 registers.
     spill_margin = 16 if original.registers <= 224 or kernel.state_bytes else 256
     suitable = (
         c

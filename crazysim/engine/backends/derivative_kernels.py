@@ -52,19 +52,19 @@ class DerivativeKernels:
         return self.program.leaves[leaf].scope in ("drone", "world")
 
     def tangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
-        """Return the kernel of the steps and the tangents of some leaves; None where there is none.
+        """Return the kernel that computes the steps and the tangents of some leaves; None if there is no such kernel.
 
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and the shapes and types of
-        the tangents after the steps. It returns these tangents.
+        the tangents after the steps. It returns the tangents after the steps.
         """
         compiled = self._compile("jvp", add_tangents, kernel.write, perturbed, platform)
         return None if compiled is None else partial(_launch_tangents, self, *compiled)
 
     def cotangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
-        """Return the kernel that computes the cotangents of some leaves; None where there is none.
+        """Return the kernel that computes the cotangents of some leaves; None if there is no such kernel.
 
-        It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
-        and returns cotangents by leaf. The cotangent of a leaf that all drones share has one row for each batch.
+        It takes all leaves, cotangents of the written floats by leaf, the number of steps, and the number of batches.
+        It returns cotangents by leaf. The cotangent of a leaf that all drones share has one row for each batch.
         """
         compiled = self._compile("gradient", reverse.reverse_program, reverse.write, perturbed, platform)
         return None if compiled is None else partial(_launch_cotangents, self, *compiled)
@@ -77,7 +77,7 @@ class DerivativeKernels:
         perturbed: tuple[int, ...],
         platform: str,
     ) -> tuple[Any, Launch] | None:
-        """Return the transformed program and the function that calls its kernel; None where there is none."""
+        """Return the transformed program and the function that calls its kernel; None if there is no such kernel."""
         key, launch_key = (kind, perturbed), (kind, perturbed, platform)
         try:
             if key not in self._programs:
@@ -101,7 +101,7 @@ class DerivativeKernels:
 
 
 def _kernel_inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
-    """Return the leaves that a kernel reads; random keys as their 32-bit integers."""
+    """Return the leaves that a kernel reads. Random keys are returned as their 32-bit integers."""
     arrays = [values[i] for i in leaves]
     return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in arrays]
 
@@ -116,7 +116,7 @@ def _launch_tangents(
     n_batches: int,
     result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
-    n = len(kernels.program.leaves)
+    n_leaves = len(kernels.program.leaves)
     n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
 
     def broadcast_tangent(i: int, x: Array) -> Array:
@@ -127,12 +127,12 @@ def _launch_tangents(
             n_worlds, 1, *x.shape[1:]
         )
 
-    leaves = [*values, *(broadcast_tangent(i, tangents[i]) if i in tangents else None for i in range(n))]
+    leaves = [*values, *(broadcast_tangent(i, tangents[i]) if i in tangents else None for i in range(n_leaves))]
     inputs = _kernel_inputs(leaves, kernel.needed_leaves(program))
     outputs = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
     results = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
     result_by_leaf = dict(zip(program.written_leaves, results, strict=True))
-    return [result_by_leaf[n + i] if n + i in result_by_leaf else jnp.zeros(x.shape, x.dtype)
+    return [result_by_leaf[n_leaves + i] if n_leaves + i in result_by_leaf else jnp.zeros(x.shape, x.dtype)
             for i, x in zip(kernels.floats, result_shapes, strict=True)]  # fmt: skip
 
 

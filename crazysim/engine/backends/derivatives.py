@@ -35,12 +35,12 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
         kernels: Kernels of the derivatives; None to differentiate ``run_on_lanes``.
     """
 
-    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+    def run_steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         @jax.custom_jvp
         def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
             return run(leaves, count)
 
-        def derivative(primals: Any, tangents: Any) -> Any:
+        def jvp_rule(primals: Any, tangents: Any) -> Any:
             (values, count), (leaf_tangents, _) = primals, tangents
             perturbed = [i for i, t in enumerate(leaf_tangents) if not jaxcompat.is_symbolic_zero(t)]
             if kernels is not None and isinstance(n_steps, int) and perturbed:
@@ -62,17 +62,17 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
 
             if kernels is not None:
                 announce("compiling a derivative of the steps on lanes", "10 to 40 s")
-            count_or_array = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
+            step_count = n_steps if isinstance(n_steps, int) else count  # a traced count must be an argument
 
             def advance_floats(floats: list[Any]) -> Any:
-                return run_on_lanes(replace_leaves(values, perturbed, floats), count_or_array)
+                return run_on_lanes(replace_leaves(values, perturbed, floats), step_count)
 
             return jax.jvp(advance_floats, ([values[i] for i in perturbed],), ([leaf_tangents[i] for i in perturbed],))
 
-        advance.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
+        advance.defjvp(jvp_rule, symbolic_zeros=True)  # to skip the tangents of constant leaves
         return advance(leaves, jnp.asarray(n_steps, jnp.int32))
 
-    return steps
+    return run_steps
 
 
 def _float0_zeros(x: Any) -> np.ndarray:
@@ -83,8 +83,8 @@ def _float0_zeros(x: Any) -> np.ndarray:
 class DerivativeSpec(NamedTuple):
     """Description of a derivative of a program, which the primitives take as a static parameter.
 
-    The operands are the leaves in ``array_leaves``, then the tangents of ``perturbed``, or the cotangents of the floats
-    that are written. Under ``vmap`` arrays of drones or worlds hold ``n_batches`` batches of worlds, one after
+    The operands are the leaves in ``array_leaves``, followed by the tangents of ``perturbed`` or by the cotangents of
+    the written floats. Under ``vmap`` arrays of drones or worlds hold ``n_batches`` batches of worlds, one after
     another. Tangents and cotangents of shared leaves always have a leading axis for the batches. (n_batches, ...)
     """
 
@@ -110,13 +110,13 @@ class DerivativeSpec(NamedTuple):
         return list(args[len(self.array_leaves) :])
 
     def world_axis_flags(self, leaves: Sequence[int]) -> list[bool]:
-        """Return for each leaf whether it has a world axis, which leaves of drones and worlds have."""
+        """Return for each leaf whether it has a world axis, as leaves of drones and worlds do."""
         return list(map(self.kernels.has_world_axis, leaves))
 
     def map_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear_leaves: Sequence[int],
                      result_leaves: Sequence[int]) -> list[Array]:  # fmt: skip
         """Apply a function of the leaves and linear operands of one batch to all batches, and return the results."""
-        leaves_batched, linear_batched = self.world_axis_flags(self.array_leaves), self.world_axis_flags(linear_leaves)
+        leaf_axes, linear_axes = self.world_axis_flags(self.array_leaves), self.world_axis_flags(linear_leaves)
 
         def split_batches(x: Any) -> Any:
             return x.reshape(self.n_batches, -1, *x.shape[1:])
@@ -126,18 +126,22 @@ class DerivativeSpec(NamedTuple):
 
         if self.n_batches == 1:
             linear_operands = [
-                x if o else x[0] for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
+                x if has_axis else x[0] for x, has_axis in zip(self.linear_operands(args), linear_axes, strict=True)
             ]
             outs = run_batch(args, linear_operands)
-            return [x if o else x[None] for x, o in zip(outs, self.world_axis_flags(result_leaves), strict=True)]
-        values = [split_batches(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
+            return [
+                x if has_axis else x[None]
+                for x, has_axis in zip(outs, self.world_axis_flags(result_leaves), strict=True)
+            ]
+        values = [split_batches(x) if has_axis else x for x, has_axis in zip(args, leaf_axes, strict=False)]
         linear_operands = [
-            split_batches(x) if o else x for x, o in zip(self.linear_operands(args), linear_batched, strict=True)
+            split_batches(x) if has_axis else x
+            for x, has_axis in zip(self.linear_operands(args), linear_axes, strict=True)
         ]
-        outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, linear_operands)
+        outs = jax.vmap(run_batch, ([0 if has_axis else None for has_axis in leaf_axes], 0))(values, linear_operands)
         return [
-            x.reshape(-1, *x.shape[2:]) if o else x
-            for x, o in zip(outs, self.world_axis_flags(result_leaves), strict=True)
+            x.reshape(-1, *x.shape[2:]) if has_axis else x
+            for x, has_axis in zip(outs, self.world_axis_flags(result_leaves), strict=True)
         ]
 
 
@@ -151,7 +155,7 @@ def _tangent_shapes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[jax
     return [lanes.leaf_shape(program, i, n_worlds) for i in spec.kernels.floats]
 
 
-def _tangents_on_lanes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
+def _compute_tangents_on_lanes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
 
     def tangents(values: list[Any], leaf_tangents: list[Any]) -> list[Array]:
@@ -161,11 +165,11 @@ def _tangents_on_lanes(*args: Any, spec: DerivativeSpec, **params: Any) -> list[
     return spec.map_batches(tangents, args, spec.perturbed, spec.kernels.floats)
 
 
-def _tangents(platform: str, *args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
+def _compute_tangents(platform: str, *args: Any, spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
     kernel = spec.kernels.tangent_kernel(spec.perturbed, platform)
     if kernel is None:
-        return _tangents_on_lanes(*args, spec=spec)
+        return _compute_tangents_on_lanes(*args, spec=spec)
     in_tangents = dict(zip(spec.perturbed, spec.linear_operands(args), strict=True))
     return kernel(spec.values(args), in_tangents, spec.n_steps, spec.n_batches, _tangent_shapes(*args, spec=spec))
 
@@ -180,17 +184,17 @@ def _cotangent_shapes(*args: Any, spec: DerivativeSpec) -> list[jax.ShapeDtypeSt
     return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves, strict=True)]
 
 
-def _cotangents_on_lanes(*args: Any, spec: DerivativeSpec) -> list[Array]:
+def _compute_cotangents_on_lanes(*args: Any, spec: DerivativeSpec) -> list[Array]:
     def cotangents(values: list[Any], seeds: list[Any]) -> list[Array]:
         return jax.vjp(partial(_advance_floats, spec, values), [values[i] for i in spec.perturbed])[1](seeds)[0]
 
     return spec.map_batches(cotangents, args, spec.kernels.floats, spec.perturbed)
 
 
-def _cotangents(platform: str, *args: Any, spec: DerivativeSpec) -> list[Array]:
+def _compute_cotangents(platform: str, *args: Any, spec: DerivativeSpec) -> list[Array]:
     kernel = spec.kernels.cotangent_kernel(spec.perturbed, platform)
     if kernel is None:
-        return _cotangents_on_lanes(*args, spec=spec)
+        return _compute_cotangents_on_lanes(*args, spec=spec)
     seeds = dict(zip(spec.kernels.floats, spec.linear_operands(args), strict=True))
     cotangents = kernel(spec.values(args), seeds, spec.n_steps, spec.n_batches)
     return [cotangents[i].reshape(x.shape) if i in cotangents else jnp.zeros(x.shape, x.dtype)
@@ -200,13 +204,14 @@ def _cotangents(platform: str, *args: Any, spec: DerivativeSpec) -> list[Array]:
 def _transpose(operands: Sequence[Any], seeds: Sequence[Any], spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
     kernels = spec.kernels
-    if not kernels.program.fused:  # unfused stages may have effects, such as printing, which a primitive cannot have
+    if not kernels.program.fused:  # unfused stages may have side effects, such as printing; a primitive cannot
         kernels.cotangent_kernel(spec.perturbed, kernels.location.platform)  # returns None, and records the reason
-        return _cotangents_on_lanes(*operands, *seeds, spec=spec)
+        return _compute_cotangents_on_lanes(*operands, *seeds, spec=spec)
     return cotangent_p.bind(*operands, *seeds, spec=spec)
 
 
 def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequence[Any]) -> list[Array]:
+    """Return the written floats after the steps, as a function of the perturbed floats."""
     kernels = spec.kernels
     written, _ = kernels.run_on_lanes(replace_leaves(values, spec.perturbed, floats), spec.n_steps)
     return [x for i, x in zip(kernels.program.written_leaves, written, strict=True) if i in kernels.floats]
@@ -215,12 +220,11 @@ def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequenc
 def _batching_rule(
     primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], spec: DerivativeSpec, **params: Any
 ) -> Any:
-    """Return the results of a primitive for ``n`` batches, by one call for more worlds if they share parameters."""
+    """Return the results of a primitive for ``n`` batches: one call for all their worlds if parameters are the same."""
     n_nonlinear = len(spec.array_leaves)
-    with_world_axis = [*spec.world_axis_flags(spec.array_leaves), *(True for _ in args[n_nonlinear:])]
-    if any(
-        b and not o for b, o in zip(batched, with_world_axis, strict=True)
-    ):  # parameters differ: one batch at a time
+    have_world_axis = [*spec.world_axis_flags(spec.array_leaves), *(True for _ in args[n_nonlinear:])]
+    if any(b and not has_axis for b, has_axis in zip(batched, have_world_axis, strict=True)):
+        # Shared parameters differ between the batches, so the primitive runs for one batch at a time.
         broadcast_args = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
         return jax.lax.map(lambda xs: list(primitive.bind(*xs, spec=spec, **params)), broadcast_args)
 
@@ -228,7 +232,9 @@ def _batching_rule(
         x = x if b else jnp.broadcast_to(x, (n, *x.shape))
         return x.reshape(-1, *x.shape[2:])
 
-    operands = [join_batches(x, b) if o else x for x, b, o in zip(args, batched, with_world_axis, strict=True)]
+    operands = [
+        join_batches(x, b) if has_axis else x for x, b, has_axis in zip(args, batched, have_world_axis, strict=True)
+    ]
     outs = primitive.bind(*operands, spec=spec._replace(n_batches=n * spec.n_batches), **params)
     return [x.reshape(n, -1, *x.shape[1:]) for x in outs]
 
@@ -236,21 +242,21 @@ def _batching_rule(
 cotangent_p = jaxcompat.primitive_by_platform(
     "crazysim_cotangents",
     _cotangent_shapes,
-    {"cpu": partial(_cotangents, "cpu"), "cuda": partial(_cotangents, "gpu")},
-    differentiable_fn=_cotangents_on_lanes,
+    {"cpu": partial(_compute_cotangents, "cpu"), "cuda": partial(_compute_cotangents, "gpu")},
+    differentiable_fn=_compute_cotangents_on_lanes,
     batching_rule=_batching_rule,
 )
-"""Cotangents before some steps, from the cotangents of the floats after them."""
+"""Primitive that computes the cotangents before some steps from the cotangents of the floats after the steps."""
 
 tangent_p = jaxcompat.primitive_by_platform(
     "crazysim_tangents",
     _tangent_shapes,
-    {"cpu": partial(_tangents, "cpu"), "cuda": partial(_tangents, "gpu")},
-    differentiable_fn=_tangents_on_lanes,
+    {"cpu": partial(_compute_tangents, "cpu"), "cuda": partial(_compute_tangents, "gpu")},
+    differentiable_fn=_compute_tangents_on_lanes,
     transpose_rule=_transpose,
     batching_rule=_batching_rule,
 )
-"""Tangents of the floats after some steps, from the tangents before them."""
+"""Primitive that computes the tangents of the floats after some steps from the tangents before the steps."""
 
 
 # The steps in a derivative -----------------------------------------------------------------------------------------
@@ -279,4 +285,4 @@ advance_p = jaxcompat.primitive_by_platform(
     differentiable_fn=_advance_on_lanes,
     batching_rule=jaxcompat.make_vmap_rule(_advance),
 )
-"""Steps of a kernel inside a derivative; higher derivatives are derivatives of the program on lanes."""
+"""Primitive that runs the steps of a kernel inside a derivative. It is differentiated as the program on lanes."""

@@ -1,7 +1,7 @@
 """Exchange of numbers between the lanes of a kernel: drones of one world are in one warp, block or set of vectors.
 
-Functions and macros of the source, such as ``of_drone`` (a number of another drone in a register), ``of_place`` (in
-memory) and ``SWEEP`` (a loop over the vectors of a world), are defined in ``targets/``.
+Functions and macros of the source are defined in ``targets/``. ``read_drone`` reads a number of another drone in a
+register, ``read_place`` in memory, and ``EACH_VECTOR`` is a loop over the vectors of a world.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class LineWriter(Protocol):
         ...
 
     def forget_intermediate_results(self) -> None:
-        """Forget intermediate results: the loop in which their variables were defined has been closed."""
+        """Forget intermediate results, after the loop in which their variables were defined was closed."""
         ...
 
 
@@ -127,7 +127,7 @@ class Registers(UnsplitLane):
         for ctype, value in values:
             names.append(writer.new_name())
             writer.write_line(f"const auto {names[-1]} = {ctype}_lanes({value});", depth)
-        return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
+        return [lambda j, x=x: f"read_drone({x}, {j})" for x in names]
 
     @property
     def declarations(self) -> list[str]:
@@ -162,7 +162,7 @@ class SharedMemory(UnsplitLane):
         writer.write_line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {record}{{{numbers}}};", depth)
         writer.write_line("__syncthreads();", depth)
         position = {k: n for n, k in enumerate(order)}
-        return [lambda j, n=position[k]: f"{array}[world + {j}].x{n}" for k in range(len(values))]
+        return [lambda j, n=position[k]: f"{array}[world_start + {j}].x{n}" for k in range(len(values))]
 
     @property
     def declarations(self) -> list[str]:
@@ -195,7 +195,7 @@ class HostMemory(Exchange):
         self.close_loop(writer, depth - 1)
         self.open_loop(writer, depth - 1)
         writer.forget_intermediate_results()
-        return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
+        return [lambda j, x=x: f"read_place(w.{x}, {j})" for x in arrays]
 
     def define_variable(self, writer: LineWriter, name: str, ctype: str, value: str, depth: int) -> str:
         self._fields.append(f"{ctype}v {name}[VECTORS];")
@@ -206,7 +206,7 @@ class HostMemory(Exchange):
         return self.define_variable(writer, name, ctype, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        writer.write_line("SWEEP {", depth)
+        writer.write_line("EACH_VECTOR {", depth)
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
         writer.write_line("}", depth)
@@ -227,8 +227,8 @@ def lanes_of_block(group_size: int) -> tuple[int, int]:
     """Return the number of threads of a block on a GPU, and how many of them are lanes.
 
     A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, sizes up to 256 threads are compared,
-    larger ones only if one world needs them. The block gets the size with the smallest share of threads without a
-    drone, to the nearest percent; of equal ones the smallest.
+    larger sizes only if one world needs them. The block gets the size with the smallest share of threads without a
+    drone, to the nearest percent; of several such sizes the smallest.
 
     Args:
         group_size: Drones of a world that read each other's numbers.

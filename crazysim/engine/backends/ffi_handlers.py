@@ -1,7 +1,7 @@
-"""Handlers of XLA's foreign function interface in Python, and one that launches kernels on a GPU.
+"""Handlers of XLA's foreign function interface in Python, and a handler that launches kernels on a GPU.
 
 XLA calls a handler with a frame of C structures (``xla/ffi/api/c_api.h``, which JAX has in ``jax.ffi.include_dir()``).
-Only members that all releases of the interface so far have in common are read.
+Handlers read only members that all releases of the interface have so far.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def register(name: str, platform: str, run: Callable[[Call], None]) -> None:
     Args:
         name: Name of the target.
         platform: Platform in the spelling of ``jax.ffi``, ``"cpu"`` or ``"CUDA"``.
-        run: Called for each execution.
+        run: Function that is called with the ``Call`` of each execution.
     """
 
     def handle(frame: Any) -> int | None:
@@ -142,7 +142,7 @@ def _handle(frame: Any, run: Callable[[Call], None]) -> None:
 
 _FUNCTIONS: dict[tuple[int, bytes], Any] = {}
 """Loaded kernels by CUDA context and digest."""
-_LOADING = threading.Lock()
+_LOADING_LOCK = threading.Lock()
 
 
 def launch_kernel(call: Call) -> None:
@@ -157,7 +157,7 @@ def launch_kernel(call: Call) -> None:
     check_driver(driver.cuCtxPushCurrent_v2(context))
     try:
         key = context.value or 0, call.attribute("digest")
-        with _LOADING:
+        with _LOADING_LOCK:
             if key not in _FUNCTIONS:
                 module, function = c_void_p(), c_void_p()
                 check_driver(driver.cuModuleLoadData(ctypes.byref(module), call.attribute("kernel_data") + b"\0"))

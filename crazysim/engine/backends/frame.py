@@ -19,20 +19,20 @@ BLOCK_THREADS_DEFINITION = "#define BLOCK_THREADS {}\n"
 
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """Source, with its inputs and outputs."""
+    """Source of a kernel, with its inputs and outputs."""
 
     text: str
     """The source."""
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes; if worlds are checked, a bool per drone follows: True where its world is flagged."""
+    """Leaves that it writes. If worlds are checked, a bool per drone follows: True where its world is flagged."""
     in_place: tuple[int, ...] = ()
     """Leaves of rows that it updates in place: input and output of each must be the same memory."""
     threads: int = BLOCK_SIZE
     """Threads of a block on a GPU."""
     lanes: int = BLOCK_SIZE
-    """Threads of a block that are lanes. If drones read each other's numbers, they make up whole worlds."""
+    """Threads of a block that are lanes. If drones read each other's numbers, these lanes make up whole worlds."""
     group_size: int = 1
     """Drones of a world that read each other's numbers."""
     state_bytes: int = 0
@@ -47,7 +47,7 @@ class Kernel:
         return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
 
     def with_blocks(self, n: int) -> Kernel:
-        """Return the kernel with few enough registers for ``n`` blocks on a multiprocessor of a GPU at once."""
+        """Return the kernel limited to so few registers that a multiprocessor of a GPU runs ``n`` blocks at once."""
         return dataclasses.replace(self, text=self.text.replace(MIN_BLOCKS_PLACEHOLDER, f"{n}"))
 
     def with_threads(self, n: int) -> Kernel:
@@ -59,8 +59,8 @@ class Kernel:
 def steps_per_interval(n_steps: int, state_bytes: int, memory_bytes: int) -> int:
     """Return the number of steps in an interval of the backward pass: all if the state before each step fits in memory.
 
-    Otherwise it is the square root of the number of steps, rounded up. The state before each interval is stored too,
-    and this choice needs the least memory.
+    Otherwise it is the square root of the number of steps, rounded up. This choice needs the least memory, because the
+    state before each interval is stored too.
 
     Args:
         n_steps: Number of steps.
@@ -112,24 +112,25 @@ def make_kernel(
         outputs: Leaves that it writes.
         in_place: Leaves that it updates in place.
         group_size: Drones of a world that read each other's numbers.
-        in_memory: True if the numbers of a world are in memory, only on the host.
+        in_memory: True if the numbers of a world are in memory, which is possible only on the host.
         n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.
     """
     threads, lanes = lanes_of_block(group_size)
-    lines, body = "\n".join(shared_lines), "\n".join(lane_lines)
+    shared, body = "\n".join(shared_lines), "\n".join(lane_lines)
     if target == "cuda":
-        frame = _cuda_function(pointers, lines, body, n_stored is not None)
+        function = _cuda_function(pointers, shared, body, n_stored is not None)
     else:
-        frame = _host_function(pointers, lines, body, in_memory, n_stored is not None)
+        function = _host_function(pointers, shared, body, in_memory, n_stored is not None)
     max_number_bytes = 8 if any("f64*" in pointer for pointer in pointers) else 4
-    defines = f"#define WIDEST {max_number_bytes}\n#define GROUP {group_size}\n" + BLOCK_THREADS_DEFINITION.format(
-        threads
+    defines = (
+        f"#define MAX_NUMBER_BYTES {max_number_bytes}\n#define GROUP {group_size}\n"
+        + BLOCK_THREADS_DEFINITION.format(threads)
     )
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
     prefix = "".join(f"{line}\n" for line in declarations)
     if n_stored is not None:
-        prefix = f"#define N_KEPT {n_stored}\n{_preamble(target + '_kept')}{prefix}"
-    text = defines + _preamble(target) + prefix + frame + _epilogue(target)
+        prefix = f"#define N_STORED {n_stored}\n{_preamble(target + '_stored')}{prefix}"
+    text = defines + _preamble(target) + prefix + function + _epilogue(target)
     return Kernel(text, inputs, outputs, in_place, threads, lanes, group_size, (n_stored or 0) * max_number_bytes)
 
 
@@ -140,12 +141,12 @@ def _n_operations(block: Block) -> int:
 
 
 def _cuda_function(pointers: Sequence[str], shared: str, body: str, stores_states: bool) -> str:
-    """Return the CUDA kernel: each thread computes the numbers that all lanes share once, and the rest for its lane.
+    """Return the CUDA kernel. Each thread computes the numbers that all lanes share, and then the numbers of its lane.
 
     In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if stores_states else [])])
+    arguments = ", ".join([*scalars, *pointers, *(["StoredNumber* __restrict__ stored"] if stores_states else [])])
     interval, loop = "", "const int first = blockIdx.x * BLOCK_LANES;"
     if stores_states:
         loop = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
@@ -153,15 +154,15 @@ def _cuda_function(pointers: Sequence[str], shared: str, body: str, stores_state
     return f"""
 extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {MIN_BLOCKS_PLACEHOLDER}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0]{interval};
-  const int nothing = n_steps >> 31;
-  const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
+  const int opaque_zero = n_steps >> 31;
+  const int thread = threadIdx.x % THREADS, lane_of_block = threadIdx.x / THREADS * LANES + thread;
 {shared}
   {loop} {{
-  const int wanted = first + place;
-  const bool active = thread < LANES && wanted < n_lanes;
-  const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
-  const int own = lane % GROUP;
-  const int world = active ? place / GROUP * GROUP : 0;
+  const int unclamped_lane = first + lane_of_block;
+  const bool is_active = thread < LANES && unclamped_lane < n_lanes;
+  const int lane = unclamped_lane < n_lanes ? unclamped_lane : n_lanes - 1;
+  const int own_drone = lane % GROUP;
+  const int world_start = is_active ? lane_of_block / GROUP * GROUP : 0;
 {body}
   }}
 }}
@@ -169,7 +170,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {MIN_BLOCKS_PLACEHOL
 
 
 def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stores_states: bool) -> str:
-    """Return the function of a range of lanes: shared numbers are computed once, the rest per block of lanes."""
+    """Return the host function for a range of lanes. It computes shared numbers once, then each vector of lanes."""
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
     definitions = []
@@ -180,9 +181,9 @@ def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: b
     if stores_states:  # the number of steps, which XLA passes before the inputs, is followed by the interval
         memory = """
   const int interval = ((int*)in[-1])[1];
-  char* const kept = static_cast<char*>(ALLOCATE(KEPT_BYTES));
-  if (kept == nullptr) return false;"""
-        free_line = "\n  free(kept);"
+  char* const stored = static_cast<char*>(ALLOCATE(STORED_BYTES));
+  if (stored == nullptr) return false;"""
+        free_line = "\n  free(stored);"
     if in_memory:
         memory = """
   World* const memory = static_cast<World*>(ALLOCATE(sizeof(World)));
@@ -193,7 +194,7 @@ def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: b
 static bool advance_range(int64_t from, int64_t to, int64_t n_lanes, int n_steps, void** in, void** out) {{
 {pointer_definitions}{memory}
 {shared}
-  {"EACH_WORLD" if in_memory else "EACH_BLOCK"} {{
+  {"EACH_WORLD" if in_memory else "EACH_SINGLE_VECTOR"} {{
 {body}
   }}{free_line}
   return true;

@@ -85,7 +85,7 @@ def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_wor
 launch_p = jaxcompat.primitive_by_platform(
     "crazysim_kernel", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
-"""Call of a kernel: from the number of steps and its inputs to its outputs."""
+"""Primitive that calls a kernel: it takes the number of steps and the inputs, and returns the outputs."""
 
 
 def unavailable_reason(platform: str) -> str | None:
@@ -109,7 +109,7 @@ def _announce_missing_compiler() -> None:
 
 
 class FusedRun:
-    """A ``Run``, and the kernel that it calls."""
+    """A ``Run`` with the kernels that it calls; None if unfused stages split the step."""
 
     def __init__(self, run: Run, kernels: Kernels | None):
         self._run, self.kernels = run, kernels
@@ -133,7 +133,7 @@ def build(program: Program, location: Location, unpacked_program: Program | None
         KernelError: If the compiler refuses a kernel or takes too long.
     """
     kernels = Kernels(program, location) if program.fused else None
-    run = _run_parts(program, location) if kernels is None else _make_kernel_run(kernels)
+    run = _run_parts(program, location) if kernels is None else partial(_call_kernel, kernels)
     if unpacked_program is not None:
         return FusedRun(
             make_differentiable(_make_batchable(program, run), _run_without_rows(program, unpacked_program, location)),
@@ -149,7 +149,7 @@ DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weak
 
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
-    """Return a line for each kernel of a program: its compiler, or on a GPU the registers that it takes."""
+    """Return a line for each kernel of a program, as ``describe_kernel`` describes it."""
     sources = [kernel.write(part, TARGETS[platform]) for part in _parts(program) if part.fused]
     return [f"kernel: {describe_kernel(source, platform, devices)}" for source in sources]
 
@@ -165,14 +165,14 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
 
     def batching_rule(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         leaves_batched, count_batched = in_batched
-        with_world_axis = [leaf.scope in ("drone", "world") for leaf in program.leaves]
+        have_world_axis = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written_leaves), True)
         if (
             count_batched
             or not program.fused
-            or any(b and not o for b, o in zip(leaves_batched, with_world_axis, strict=True))
+            or any(b and not has_axis for b, has_axis in zip(leaves_batched, have_world_axis, strict=True))
         ):
-            # Shared parameters differ between the batches, so the kernel runs one batch after the other.
+            # Batches cannot be joined, for example because their shared parameters differ: they run one by one.
             broadcast_leaves = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
                     for x, b in zip(leaves, leaves_batched, strict=True)]  # fmt: skip
             counts = count if count_batched else jnp.broadcast_to(count, (size,))
@@ -188,11 +188,11 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
             return x.reshape(size, -1, *x.shape[1:])
 
         rows = [i in program.rows for i in range(len(leaves))]
-        merged = [
-            join_batches(x, b, in_rows) if o and x is not None else x
-            for x, b, o, in_rows in zip(leaves, leaves_batched, with_world_axis, rows, strict=True)
+        merged_leaves = [
+            join_batches(x, b, in_rows) if has_axis and x is not None else x
+            for x, b, has_axis, in_rows in zip(leaves, leaves_batched, have_world_axis, rows, strict=True)
         ]
-        written, flagged = run(merged, count)
+        written, flagged = run(merged_leaves, count)
         return (
             [split_batches(x, rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
             split_batches(flagged, False),
@@ -221,20 +221,17 @@ def _run_without_rows(program: Program, unpacked_program: Program, location: Loc
     return run
 
 
-def _make_kernel_run(kernels: Kernels) -> CountedRun:
-    return partial(_call_kernel, kernels)
-
-
 def _parts(program: Program) -> list[Program]:
-    """Return programs that run one after the other, each of one kernel or of one unfused stage."""
+    """Return the parts of a program that run one after the other: each is one kernel or one unfused stage."""
     return [program] if program.fused else list(program.parts())
 
 
 def _run_parts(program: Program, location: Location) -> CountedRun:
-    """Return the run of a step that unfused stages split: in each phase, one kernel for the stages between them."""
+    """Return a function that runs a step that unfused stages split; the stages between two of these have one kernel."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
-        runs = list(pool.map(lambda part: _make_kernel_run(Kernels(part, location)) if part.fused else None, parts))
+        kernels = list(pool.map(lambda part: Kernels(part, location) if part.fused else None, parts))
+    runs = [None if x is None else partial(_call_kernel, x) for x in kernels]
     runs_by_phase: dict[Phase, list[Any]] = {
         phase: [(part, run) for part, run in zip(parts, runs, strict=True) if part.segments[0].phase == phase]
         for phase in PHASES

@@ -33,7 +33,7 @@ Observer = Callable[[Operation, Sequence[np.ndarray]], None]
 FloatEnvironment = ctypes.c_uint32 * 8
 """``fenv_t`` of x86-64 Linux."""
 MXCSR_INDEX = 7
-"""Index of its word that controls the arithmetic of vector registers."""
+"""Index of the word of ``FloatEnvironment`` that controls the arithmetic of vector registers."""
 FLUSH_BITS = 0x8040
 """Bits that flush subnormal results and operands to zero: Intel 64 manual, volume 1, section 10.2.3."""
 
@@ -47,7 +47,7 @@ def run_block(
         block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
-        observe: Function that is called with every operation and its results; None for none.
+        observe: Function that is called with every operation and its results, or None.
 
     Returns:
         Its outputs, of the lanes' shape.
@@ -55,7 +55,7 @@ def run_block(
     if block not in _PREPARED_BLOCKS:
         indices: dict[Any, int] = {}
         constants: list[Any] = []
-        _PREPARED_BLOCKS[block] = _prepare(block, indices, constants), constants
+        _PREPARED_BLOCKS[block] = _prepare_block(block, indices, constants), constants
     prepared, constants = _PREPARED_BLOCKS[block]
     arrays = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
     with np.errstate(all="ignore"):
@@ -64,7 +64,7 @@ def run_block(
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Broadcast a value to all lanes where needed; ``np.broadcast_to`` takes as long as an operation."""
+    """Broadcast a value to all lanes only if needed, because ``np.broadcast_to`` takes as long as an operation."""
     return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
@@ -102,7 +102,7 @@ class _PreparedBlock(NamedTuple):
                 arrays of the lanes' shape, scalars or tables.
             inputs: Its inputs.
             shape: Shape of the lanes.
-            observe: Function that is called with every operation and its results; None for none.
+            observe: Function that is called with every operation and its results, or None.
         """
         for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
@@ -119,14 +119,14 @@ class _PreparedBlock(NamedTuple):
         return [values[k] for k in self.outputs]
 
 
-_Run = Callable[[Sequence[Any]], list[Any]]
-"""Function that runs a block: from its inputs to its outputs."""
+_BlockRun = Callable[[Sequence[Any]], list[Any]]
+"""Function from the inputs of a block to its outputs."""
 
 _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_PreparedBlock, list[Any]]] = WeakKeyDictionary()
 """Prepared blocks of earlier runs. The list has the constants at their indices, and None for all other values."""
 
 
-def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _PreparedBlock:
+def _prepare_block(block: Block, indices: dict[Any, int], constants: list[Any]) -> _PreparedBlock:
     """Prepare a block, and add its values to ``indices`` and its constants to ``constants``."""
 
     def get_index(x: Any) -> int:
@@ -142,7 +142,7 @@ def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Pr
     calls = []
     for op in block.operations:
         args = [get_index(x) for x in op.args]
-        blocks = [_prepare(inner, indices, constants) for inner in op.blocks]
+        blocks = [_prepare_block(inner, indices, constants) for inner in op.blocks]
         results = [get_index(x) for x in op.results]
         dtype = op.dtype if op.results else np.dtype(bool)
         calls.append(_Call(op, _numpy_function(op), args, results, dtype, blocks))
@@ -150,7 +150,7 @@ def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Pr
 
 
 def _numpy_function(op: Operation) -> Callable[..., Any] | None:
-    """Return the NumPy function of an operation; None for a structured one."""
+    """Return the NumPy function of an operation; None for a structured operation."""
     row = ops.TABLE[op.name]
     if row.structured:
         return None
@@ -162,7 +162,7 @@ def _numpy_function(op: Operation) -> Callable[..., Any] | None:
     return functools.partial(row.numpy, **params) if params else row.numpy
 
 
-def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
+def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_BlockRun]) -> list[Any]:
     """Return the results of a structured operation, which is not one NumPy function of its operands.
 
     Args:
@@ -175,9 +175,9 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
         case "barrier":
             return []
         case "when":
-            mask, *old = args
-            new = runs[0]([]) if mask.any() else old
-            return [np.where(mask, x, y) for x, y in zip(new, old, strict=True)]
+            mask, *old_values = args
+            new_values = runs[0]([]) if mask.any() else old_values
+            return [np.where(mask, new, old) for new, old in zip(new_values, old_values, strict=True)]
         case "loop":
             for _ in range(op.param("length")):
                 args = runs[0](args)
@@ -185,7 +185,7 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
         case "while":
             test, body = runs
             while (mask := test(args)[0]).any():
-                args = [np.where(mask, x, y) for x, y in zip(body(args), args, strict=True)]
+                args = [np.where(mask, new, old) for new, old in zip(body(args), args, strict=True)]
             return args
         case "over_others":
             return _over_others(op, args, shape, runs[0])
@@ -204,8 +204,8 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
     )
 
 
-def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
-    """Run a block for each drone of the world in turn, and combine the results."""
+def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _BlockRun) -> list[np.ndarray]:
+    """Run a block for each pair of drones of a world, and combine the results of each drone."""
     n = op.param("n_members")
     member_number = np.arange(shape[0]) % n
     combining_functions: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
@@ -215,8 +215,8 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     ]
     for j in range(n):
         other_numbers = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
-        new = run([*other_numbers, member_number == j])
-        reduced = [fn(x, y) for fn, x, y in zip(combining_functions, reduced, new, strict=True)]
+        results = run([*other_numbers, member_number == j])
+        reduced = [fn(x, y) for fn, x, y in zip(combining_functions, reduced, results, strict=True)]
     return reduced
 
 
@@ -238,7 +238,7 @@ def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray)
 
 
 def run_block_in_callback(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
-    """Run a block as ``run_block`` does, inside a function that JAX traces or compiles; it has no derivative."""
+    """Run a block as ``run_block`` does, inside a function that JAX traces or compiles, without a derivative."""
     results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
 
     def run_arrays(*inputs: Any) -> list[np.ndarray]:
@@ -255,7 +255,7 @@ def build(program: Program, location: Location) -> Run:
 def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: bool = True) -> tuple[list[Any], Any]:
     """Run steps as ``lanes.run_steps`` does, but in NumPy: immediately, or in a callback if arguments are traced.
 
-    If the program has unfused stages, only its blocks are interpreted, and the rest runs in XLA.
+    If the program has unfused stages, its blocks are interpreted, and the unfused stages run in XLA.
 
     Args:
         program: The program.
@@ -304,15 +304,15 @@ def flush_subnormals() -> Iterator[None]:
     if library is None:
         yield
         return
-    saved = FloatEnvironment()
-    library.fegetenv(saved)
-    flushing = FloatEnvironment(*saved)
-    flushing[MXCSR_INDEX] |= FLUSH_BITS
-    library.fesetenv(flushing)
+    saved_environment = FloatEnvironment()
+    library.fegetenv(saved_environment)
+    flushing_environment = FloatEnvironment(*saved_environment)
+    flushing_environment[MXCSR_INDEX] |= FLUSH_BITS
+    library.fesetenv(flushing_environment)
     try:
         yield
     finally:
-        library.fesetenv(saved)
+        library.fesetenv(saved_environment)
 
 
 @functools.cache

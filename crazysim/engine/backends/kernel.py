@@ -1,7 +1,7 @@
 """One kernel for many steps: the source of a program, from loads to stores.
 
 From the first step to the last, the numbers of one drone stay in variables, which are registers if there are enough.
-In worlds of more coupled drones than fit into a vector, kernels on the host keep them in memory.
+If a world has more coupled drones than fit into a vector, kernels on the host keep these numbers in memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def write(program: Program, target: str) -> Kernel:
         target: ``"cuda"`` or ``"host"``.
     """
     require_source(program)
-    body = Body(program, target)
+    body = KernelBody(program, target)
     hoisted = body.write_loads(MAX_REGISTERS if target == "cuda" else None)
     body.write_loop(hoisted)
     body.write_stores()
@@ -43,7 +43,7 @@ def write(program: Program, target: str) -> Kernel:
     return body.finish_kernel(pointers, inputs, outputs, in_place, [s.block for s in body.step_segments])
 
 
-class Body:
+class KernelBody:
     """The code of a kernel between its braces: loads, stages before the steps, the loop, checks and stores."""
 
     def __init__(self, program: Program, target: str):
@@ -54,7 +54,7 @@ class Body:
         self.stored_slots = _written_slots(program)
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
-        """Expression of each number."""
+        """Expression of each number in the source."""
         self.initial_values: dict[Slot, str] = {}
         """Expression of the initial value of each number that stages write."""
         self._n_shared = 0
@@ -63,8 +63,8 @@ class Body:
         """Write loads and the stages before the steps, and return the names of hoisted values by segment of the loop.
 
         Args:
-            registers: Number of registers of a lane. If the kernel uses more numbers, it reads the numbers that all
-                lanes share at the place of their use. None for no limit.
+            registers: Number of registers of a lane. If the kernel uses more numbers, it reads each number that all
+                lanes share where it is used. None for no limit.
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._collect_slots()
@@ -72,8 +72,8 @@ class Body:
         loaded, rank = _loaded_slots(program), program.ranks
         deferred = set() if exchange.depth else _deferred_slots(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
-        shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
-        for slot in shared:
+        shared_slots = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
+        for slot in shared_slots:
             if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
             elif slot in self.stored_slots or not (is_read_at_use or slot in deferred):
@@ -84,13 +84,13 @@ class Body:
                 )
         self._n_shared = len(writer.lines)
         exchange.open_loop(writer, 1)
-        lane_slots = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
+        lane_slots = [slot for slot in slots if slot not in shared_slots and (slot not in written or slot in loaded)]
         for i in dict.fromkeys(i for i, _ in lane_slots if i not in program.rows):
-            size, drones = program.leaves[i].size, _n_sharing_lanes(program, i)
-            writer.write_line(rows_line(f"p{rank[i]}", _type_name(program, i), size, drones), self._depth)
+            size, n_sharing = program.leaves[i].size, _n_sharing_lanes(program, i)
+            writer.write_line(rows_line(f"p{rank[i]}", _type_name(program, i), size, n_sharing), self._depth)
         for slot in slots:
             ctype, load = _type_name(program, slot[0]), _load_expression(program, slot)
-            if slot in shared:
+            if slot in shared_slots:
                 continue
             if slot in written:
                 initial = load if slot in loaded else f"{ctype}(0)"
@@ -161,7 +161,7 @@ class Body:
         )  # fmt: skip
 
     def _collect_slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
-        """Return the numbers that the stages write, and all that the kernel uses."""
+        """Return the numbers that the stages write, and all numbers that the kernel uses, as ordered sets."""
         program, segments = self.program, self.program.fused_segments
         written = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
         read = dict.fromkeys(slot for s in segments for slot in [*program.drone_slots(s, s.reads), *s.hoisted_reads])
@@ -206,7 +206,7 @@ def _written_slots(program: Program) -> list[Slot]:
 
 
 def _loaded_slots(program: Program) -> set[Slot]:
-    """Return the slots to load: they may be used before a stage is certain to have written them."""
+    """Return the slots to load: the kernel may use them before a stage has written them."""
     loaded: set[Slot] = set()
     written: set[Slot] = set()
 
@@ -215,15 +215,15 @@ def _loaded_slots(program: Program) -> set[Slot]:
 
     def run_segment(segment: Segment) -> None:
         use_slots(program.drone_slots(segment, segment.reads))
-        drones: dict[Slot, int] = {}
+        n_written: dict[Slot, int] = {}
         for (leaf, _), slot in zip(segment.writes, program.drone_slots(segment, segment.writes), strict=True):
             is_one_drone = segment.scope == "world" and program.leaves[leaf].scope == "drone"
-            drones[slot] = drones.get(slot, 0) + (1 if is_one_drone else program.n_drones)
-        written.update(slot for slot, n in drones.items() if n >= program.n_drones)
+            n_written[slot] = n_written.get(slot, 0) + (1 if is_one_drone else program.n_drones)
+        written.update(slot for slot, n in n_written.items() if n >= program.n_drones)
 
     for segment in program.phase_segments("before"):
         run_segment(segment)
-    for segment in program.phase_segments("each"):  # there may be no step
+    for segment in program.phase_segments("each"):  # writes too: with zero steps the initial numbers are stored
         use_slots([*program.drone_slots(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
     if program.check_segment is not None:
         use_slots(program.check_segment.reads)
@@ -236,7 +236,7 @@ def _loaded_slots(program: Program) -> set[Slot]:
 def write_segment(
     writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
 ) -> None:
-    """Write a segment, which assigns to the variables of the numbers that it writes.
+    """Write the operations of a segment, and assign the results to the variables of the numbers that it writes.
 
     Args:
         writer: Writer that the lines are added to.
@@ -252,7 +252,7 @@ def write_segment(
             if program.leaves[leaf].scope == "drone":
                 name = writer.new_name()
                 writer.write_line(
-                    f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth
+                    f"const auto {name} = read_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth
                 )
                 inputs[k] = name
     outs = writer.write_block(segment.block, [*inputs, *constants], depth)
@@ -263,15 +263,15 @@ def write_segment(
         segment.writes, program.drone_slots(segment, segment.writes), new_names, strict=True
     ):
         ctype, name = _type_name(program, leaf), names[slot]
-        if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
-            is_own_drone = f"eq_(own, i32({number // program.leaves[leaf].size}))"
+        if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all drones
+            is_own_drone = f"eq_(own_drone, i32({number // program.leaves[leaf].size}))"
             writer.write_line(f"{name} = select_n_({is_own_drone}, {name}, {ctype}_lanes({new_name}));", depth)
         else:
             writer.write_line(f"{name} = {ctype}_lanes({new_name});", depth)
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
-    """Return the numbers that only stages slower than the step use, or only the check after the loop.
+    """Return the numbers that no stage uses at each step, but either slower stages or the check after the loop.
 
     Unless a stage writes them, they are loaded where they are used, and take no register in between.
     """
@@ -304,7 +304,7 @@ def _load_expression(program: Program, slot: Slot) -> str:
 
 
 def rows_line(pointer: str, ctype: str, size: int, n_sharing: int = 1) -> str:
-    """Return the line that finds the rows of an input, one for each lane; it comes before the loads.
+    """Return the source line that locates the row of each lane in an input. It precedes the loads.
 
     Args:
         pointer: The input.
@@ -327,10 +327,10 @@ def write_results(writer: Writer, pointer: str, ctype: str, n_sharing: int, valu
         depth: Depth of the lines.
     """
     size = len(values)
-    writer.write_line(f"RESULT({ctype}, {size}, {pointer})", depth)
+    writer.write_line(f"DECLARE_RESULT({ctype}, {size}, {pointer})", depth)
     for k, x in enumerate(values):
         writer.write_line(f"STORE({size}, {n_sharing}, {pointer}, {k}, {ctype}_lanes({x}))", depth)
-    writer.write_line(f"PUT({size}, {n_sharing}, {pointer})", depth)
+    writer.write_line(f"STORE_RESULT({size}, {n_sharing}, {pointer})", depth)
 
 
 def _n_sharing_lanes(program: Program, leaf: int) -> int:

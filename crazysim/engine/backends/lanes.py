@@ -27,13 +27,13 @@ from crazysim.engine.passes.schedule import add_barriers
 from crazysim.jaxcompat import is_key
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
-"""Function that runs a block: from the block, its inputs and the shape of a vector of lanes to its outputs."""
+"""Function that runs a block: it takes the block, its inputs and the shape of the lanes, and returns the outputs."""
 
 
 class LeafValues:
     """Values of the leaves of a program, each as an array, as one vector of lanes per scalar, or as both.
 
-    A form that is missing is made from the other one when it is read, and removed when the other one is written.
+    If a leaf has only one of these forms, the other form is made when it is read. Writing one form removes the other.
     """
 
     def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run_block, library: Any = jnp):
@@ -80,14 +80,14 @@ class LeafValues:
         """Return a leaf as an array, in the form in which the program takes and returns it."""
         if leaf not in self.arrays:
             description = self.program.leaves[leaf]
-            items = [self.vectors[leaf, k] for k in range(description.size)]
-            self.arrays[leaf] = self.library.stack(items) if description.row_leaves else self._stack(leaf, items)
+            vectors = [self.vectors[leaf, k] for k in range(description.size)]
+            self.arrays[leaf] = self.library.stack(vectors) if description.row_leaves else self._stack(leaf, vectors)
         return self.arrays[leaf]
 
-    def _stack(self, leaf: int, items: list[Any]) -> Any:
+    def _stack(self, leaf: int, vectors: list[Any]) -> Any:
         description, is_random_key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
         shape = (*description.shape[2:], 2) if is_random_key else description.shape[2:]
-        array = self.library.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
+        array = self.library.stack(vectors, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
         array = jax.random.wrap_key_data(array) if is_random_key and self.library is jnp else array
         return array[:, :1] if description.scope == "world" else array
 
@@ -123,7 +123,7 @@ def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
 
 
 def leaf_shape(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
-    """Return the shape and type of a leaf that a program writes, for all worlds; random keys as integers."""
+    """Return the shape and type of a leaf that a program writes, for all worlds. Random keys are integers here."""
     description = program.leaves[leaf]
     shape = (n_worlds, *description.shape[1:])
     if leaf in program.rows:
@@ -168,7 +168,7 @@ def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) 
 def _run_worlds(segment: Segment, values: LeafValues) -> None:
     """Run a segment with scope ``world``, with one lane per world.
 
-    In a leaf of drones, its slots number the scalars of all drones of a world, drone after drone.
+    The slots of the segment in a leaf of drones count the scalars of all drones of a world, drone after drone.
     """
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
@@ -190,8 +190,7 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
         else:
             written[leaf, k] = dict.fromkeys(range(values.n_drones), value)
     for slot, values_by_drone in written.items():
-        old = values.get(slot)
-        old = library.broadcast_to(old, values.shape).reshape(shape)
+        old = library.broadcast_to(values.get(slot), values.shape).reshape(shape)
         columns = [values_by_drone.get(d, old[:, d]) for d in range(values.n_drones)]
         values.set(slot, library.stack(columns, axis=-1).reshape(values.shape))
 
@@ -224,8 +223,8 @@ def run_steps(
     constants = prepare_steps(program, initial_values)
     segments = program.phase_segments("each")
     carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written_leaves})
-    fused = [s for s in segments if isinstance(s, Segment)]
-    written_slots = {slot for s in fused for slot in program.drone_slots(s, s.writes)}
+    fused_segments = [s for s in segments if isinstance(s, Segment)]
+    written_slots = {slot for s in fused_segments for slot in program.drone_slots(s, s.writes)}
     carried_slots = sorted(slot for slot in written_slots if slot[0] not in carried_leaves)
 
     def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
@@ -243,7 +242,7 @@ def run_steps(
 
     carry = ([jnp.broadcast_to(initial_values.get(slot), initial_values.shape) for slot in carried_slots],
              [initial_values.array(leaf) for leaf in carried_leaves])  # fmt: skip
-    for segment in fused:  # leaves that are only read are split into vectors once, outside the loop
+    for segment in fused_segments:  # leaves that are only read are split into vectors once, outside the loop
         for slot in program.drone_slots(segment, segment.reads):
             initial_values.get(slot)
     if isinstance(n_steps, int):
@@ -261,9 +260,9 @@ def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
 
     Only the carry before each iteration is stored. The backward pass recomputes all other values, which is faster than
     reading them from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is stored, where k is
-    the square root of n. The memory of a gradient then grows with that root, at the price of one more forward pass.
+    the square root of n. The memory of a gradient then grows with k, at the price of one more forward pass.
     """
-    iterate = jax.checkpoint(iterate, prevent_cse=False)  # within a scan it is not needed
+    iterate = jax.checkpoint(iterate, prevent_cse=False)  # a scan prevents it already
 
     def scan(carry: Any, n: int) -> Any:
         return jax.lax.scan(lambda c, _: (iterate(c), None), carry, length=n)[0]
@@ -280,7 +279,7 @@ def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
     """Return True for worlds that were flagged, hold a watched value that is not finite, or took too many steps.
 
     Returns:
-        (n_worlds, 1), False for all without a check
+        (n_worlds, 1), False for all worlds if the program has no check
     """
     check = program.check_segment
     if check is None:

@@ -36,8 +36,8 @@ from crazysim.startup import __version__
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler; the options of the variable CXXFLAGS follow them. Products and sums may be contracted, and
-no option assumes that there is no NaN. Integers wrap around, as in XLA; NVRTC has no option for it, so sources add
-integers as unsigned ones."""
+no option assumes that there is no NaN. Integers wrap around, as in XLA. NVRTC has no such option, so the source
+converts integers to unsigned integers before it adds them."""
 
 ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
 """Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
@@ -90,13 +90,13 @@ class HostLaunch:
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
         if self._state_bytes:
-            state_bytes = self._state_bytes * (VECTOR_BYTES // 4)  # of the lanes of a vector
+            state_bytes = self._state_bytes * (VECTOR_BYTES // 4)  # states of all lanes of a vector
             interval = steps_per_interval(int(count[0]), state_bytes, GRADIENT_MEMORY_BYTES)
             count = np.append(count, np.int32(interval))
         run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
-    def on_memory(self) -> Callable[[int, int, Any, int], int]:
+    def memory_function(self) -> Callable[[int, int, Any, int], int]:
         """Return the kernel as a function on memory, which does not use XLA and returns when the kernel is done.
 
         It takes the numbers of lanes and of steps, the addresses of inputs and outputs as pointers in ``bytes``, and
@@ -110,7 +110,7 @@ class HostLaunch:
 
 @functools.cache
 def compiler() -> str | None:
-    """Return the C++ compiler: CXX if it is set, else g++, clang++ or zig; None without any."""
+    """Return the C++ compiler: CXX if it is set, else g++, clang++ or zig; None if there is no compiler."""
     words = _split_variable("CXX")
     if not words:
         return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None) or _zig()
@@ -129,11 +129,11 @@ def _zig() -> str | None:
     )
 
 
-def compiler_command(options: bool = True) -> list[str]:
+def compiler_command(with_options: bool = True) -> list[str]:
     """Return the compiler's command without the names of files.
 
     Args:
-        options: False to leave out CXXFLAGS.
+        with_options: True to include CXXFLAGS.
     """
     program = compiler()
     if program is None:
@@ -141,7 +141,7 @@ def compiler_command(options: bool = True) -> list[str]:
     return [
         *shlex.split(program),
         *COMPILER_FLAGS,
-        *_split_variable("CXXFLAGS" if options else ""),
+        *_split_variable("CXXFLAGS" if with_options else ""),
         "-I",
         jaxcompat.ffi_include_folder(),
     ]
@@ -203,9 +203,11 @@ def toolchain(words: tuple[str, ...]) -> str:
     versions of JAX and of this package.
     """
     # With -###, a compiler prints its version and the options that replace -march=native.
-    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as work:
+    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as work_folder:
         # Clang prints the working directory, too.
-        steps = _run_compiler([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
+        steps = _run_compiler(
+            [*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work_folder), time_limit(), cwd=os.sep
+        )
     libc = " ".join(platform.libc_ver())
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
 
@@ -218,9 +220,8 @@ def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
         if library is not None:
             return library
     content, problem = _compile(words, source), None
-    for folder in dict.fromkeys(
-        (cache_folder, kernel_cache.temporary_folder())
-    ):  # code in the first may not be executable
+    # The cache may be on a file system without permission to execute code.
+    for folder in dict.fromkeys((cache_folder, kernel_cache.temporary_folder())):
         try:
             library = _load_library(kernel_cache.store(folder, key, content, ".so"))
         except OSError as error:
@@ -253,35 +254,35 @@ def _compile(words: Sequence[str], source: str) -> bytes:
             f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
         )
     with tempfile.TemporaryDirectory(dir=kernel_cache.temporary_folder(), ignore_cleanup_errors=True) as name:
-        work, library = Path(name), Path(name) / "kernel.so"
+        work_folder, library = Path(name), Path(name) / "kernel.so"
         try:
-            (work / "kernel.cpp").write_text(source)
-            process = _run_compiler([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
+            (work_folder / "kernel.cpp").write_text(source)
+            process = _run_compiler([*words, str(work_folder / "kernel.cpp"), "-o", str(library)], work_folder, seconds)
             if process.returncode:
-                _check_settings(work)
+                _check_settings(work_folder)
                 raise KernelError(f"{words[0]} refused the kernel: {process.stderr.strip()[:2000]}")
             return library.read_bytes()
         except OSError as error:
             raise KernelError(f"{words[0]} left no library: {error}") from error
 
 
-def _check_settings(work: Path) -> None:
+def _check_settings(work_folder: Path) -> None:
     """Raise an error if the compiler cannot compile an empty file because of CXX or CXXFLAGS.
 
     Args:
-        work: Folder for its files.
+        work_folder: Folder for the compiler's files.
     """
-    (work / "empty.cpp").write_text("")
+    (work_folder / "empty.cpp").write_text("")
 
-    def compile_empty_file(options: bool) -> str:
-        words = [*compiler_command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
-        process = _run_compiler(words, work, time_limit())
+    def compile_empty_file(with_options: bool) -> str:
+        words = [*compiler_command(with_options), str(work_folder / "empty.cpp"), "-o", str(work_folder / "empty.so")]
+        process = _run_compiler(words, work_folder, time_limit())
         return (process.stderr.strip()[:500] or f"exit status {process.returncode}") if process.returncode else ""
 
-    message = compile_empty_file(options=True)
+    message = compile_empty_file(with_options=True)
     if not message:
         return
-    variable = "CXX" if compile_empty_file(options=False) else "CXXFLAGS"
+    variable = "CXX" if compile_empty_file(with_options=False) else "CXXFLAGS"
     if os.environ.get(variable):
         raise ConfigError(
             f"expected a C++ compiler and options that it accepts, got {variable}={os.environ[variable]!r}: {message}. "
@@ -296,7 +297,7 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     A kernel whose compiler was killed raises ``RuntimeError``, so that no other engine compiles in its place.
 
     Args:
-        n: Number of threads; None for the default.
+        n: Number of threads; None for the default of ``ThreadPoolExecutor``.
     """
     try:
         with ThreadPoolExecutor(n) as executor:
@@ -319,13 +320,13 @@ _COMPILER_PIPES: set[IO[str]] = set()
 
 
 def _run_compiler(
-    words: Sequence[str], work: Path, seconds: float, cwd: str | None = None
+    words: Sequence[str], work_folder: Path, seconds: float, cwd: str | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Run the compiler. It is killed with all its children when its time is up or this process ends.
 
     Args:
         words: Command of the compiler.
-        work: Folder of its temporary files.
+        work_folder: Folder of its temporary files.
         seconds: Time that it may take, s.
         cwd: Working directory; None for the directory of this process.
     """
@@ -335,7 +336,8 @@ def _run_compiler(
         try:
             process = subprocess.Popen(
                 ["/bin/sh", "-c", KILLING_SCRIPT, "sh", *words], stdin=read_end, stdout=pipe, stderr=pipe, text=True,
-                start_new_session=True, cwd=cwd, env=os.environ | dict.fromkeys(TEMPORARY_FOLDER_VARIABLES, str(work)),
+                start_new_session=True, cwd=cwd,
+                env=os.environ | dict.fromkeys(TEMPORARY_FOLDER_VARIABLES, str(work_folder)),
             )  # fmt: skip
         except OSError as error:
             raise KernelError(f"{words[0]} cannot be run: {error}") from error

@@ -49,7 +49,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
     run_jaxprs = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
     written = {phase: _changed_leaves(jaxpr) for phase, jaxpr in jaxprs.items()}
 
-    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+    def run_steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         leaves = run_jaxprs["before"](*leaves)
         loop_leaves = written["each"]
 
@@ -69,7 +69,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
 
     scratch = {i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x}
     written_leaves = sorted({i for leaves_of_phase in written.values() for i in leaves_of_phase} - scratch)
-    return steps, written_leaves
+    return run_steps, written_leaves
 
 
 def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
@@ -81,8 +81,8 @@ def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
 class Reset:
     """``reset(data, default_data, mask=None) -> data``, pure and compiled.
 
-    A compiled call copies the arrays that it returns unchanged. For use inside another compiled function, ``plain``
-    is not compiled itself.
+    The compiled call copies the arrays that it returns unchanged. ``plain`` is the same function without compilation,
+    for use inside another compiled function.
     """
 
     def __init__(self, pipeline: Pipeline):

@@ -26,7 +26,7 @@ def compile_kernel(kernel: Kernel, location: Location) -> Launch:
 
 
 def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | None) -> str:
-    """Return the compiler of a kernel, or on a GPU the registers that it takes."""
+    """Return the compiler of a kernel, or for a GPU its threads, registers and spilled bytes."""
     if platform != "gpu":
         return f"compiled by {native.compiler()}"
     device = cuda.weakest_device(devices)

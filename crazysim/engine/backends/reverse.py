@@ -1,8 +1,8 @@
-"""Reverse mode of many steps in one kernel, which turns cotangents after the steps into cotangents before them.
+"""Reverse mode of many steps in one kernel, which turns cotangents after the steps into cotangents before the steps.
 
 The kernel recomputes the steps, stores the state before each step, and goes back from the last step to the first. If
-there are more steps than ``interval``, it first stores only the state before each interval, and recomputes the steps of
-an interval when it goes back through it. Every drone has its own cotangent of every number; the caller sums the
+there are more steps than ``interval``, it first stores only the state before each interval. It recomputes the steps of
+an interval before it goes back through them. Every drone has its own cotangent of every number; the caller sums the
 cotangents of leaves that drones share.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from crazysim.engine.backends import kernel
 from crazysim.engine.backends.exchange import MAX_DRONES_IN_VECTOR
 from crazysim.engine.backends.frame import Kernel
-from crazysim.engine.backends.kernel import Body
+from crazysim.engine.backends.kernel import KernelBody
 from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
@@ -32,13 +32,13 @@ class ReverseProgram:
     program: Program
     """The program without check, with further leaves for the cotangents of every drone."""
     n_leaves: int
-    """Number of its leaves without cotangents."""
+    """Number of leaves of the program before the leaves of cotangents."""
     perturbed: tuple[int, ...]
     """Leaves whose cotangents are computed."""
     backward_segments: dict[Segment, Segment]
     """Segments of the backward pass, by the forward segment."""
     backward_hoisted_segments: dict[Segment, Segment]
-    """The same for hoisted blocks."""
+    """Segments of the backward pass through hoisted blocks, by the forward segment."""
     carry: tuple[Slot, ...]
     """State of the loop over the steps: numbers that a step uses and that steps change."""
     restored: frozenset[Slot]
@@ -67,7 +67,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         perturbed: Leaves whose cotangents are computed; only floats have cotangents.
 
     Raises:
-        UnsupportedError: If a part of it has no derivative in a kernel.
+        UnsupportedError: If a part of the program has no derivative in a kernel.
     """
     program, perturbed = prepare_derivative(program, perturbed)
     n = len(program.leaves)
@@ -77,12 +77,12 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_type(s.hoisted))
         for s in step_segments
     ]
-    extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
+    extended_program = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
     changed, constants = changed_slots(program, perturbed)
     backward_segments = {}
     for s in program.fused_segments:
-        constant_leaf = 2 * n + step_segments.index(s) if s in step_segments else -1
-        backward_segments[s] = _reverse_segment(extended, n, s, changed, constants.get(s, ()), constant_leaf)
+        hoisted_leaf = 2 * n + step_segments.index(s) if s in step_segments else -1
+        backward_segments[s] = _reverse_segment(extended_program, n, s, changed, constants.get(s, ()), hoisted_leaf)
     backward_hoisted_segments = {
         s: _reverse_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
     }
@@ -94,10 +94,10 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     restored = {
         slot
         for s in (*(backward_segments[s] for s in step_segments), *step_segments[:-1])
-        for slot in _used_slots(extended, s)
+        for slot in _used_slots(extended_program, s)
     }
     return ReverseProgram(
-        extended,
+        extended_program,
         n,
         perturbed,
         backward_segments,
@@ -119,12 +119,12 @@ def _float_type(block: Block) -> np.dtype:
 
 
 def _reverse_segment(
-    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], constant_leaf: int
+    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], hoisted_leaf: int
 ) -> Segment:
-    """Return the segment that replaces the cotangents after a segment by the cotangents before it.
+    """Return the segment that replaces the cotangents after a segment by the cotangents before the segment.
 
     In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
-    cotangents of the numbers that are written over the drones, and adds its results to the copy of the first drone.
+    cotangents of the written numbers over the drones, and adds its results to the cotangents of the first drone.
     """
     n_drones, is_world_segment = program.n_drones, s.scope == "world"
     reads = program.drone_slots(s, s.reads)
@@ -138,7 +138,7 @@ def _reverse_segment(
     def cotangent_slots(slot: Slot) -> list[Slot]:
         """Return the slots of the cotangents of a number.
 
-        In a segment of worlds, a number that drones share has one for each drone. Every other number has one.
+        In a segment of worlds, a number that drones share has one cotangent for each drone. Other numbers have one.
         """
         i, k = slot
         if not is_world_segment or program.leaves[i].scope == "drone":
@@ -164,9 +164,8 @@ def _reverse_segment(
     primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
     seeds = [sum_copies(s.writes[k], s.block.outputs[k].dtype) for k in float_outputs]
     parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
-    for (
-        k
-    ) in float_outputs:  # a segment overwrites these numbers, so the outputs do not depend on their old values directly
+    # The segment overwrites these numbers, so the numbers after it depend on the old ones only through its inputs.
+    for k in float_outputs:
         zero = constant(0, s.block.outputs[k].dtype)
         ct_outputs.update(dict.fromkeys(cotangent_slots(s.writes[k]), zero))
     for k, part in zip(input_indices, parts, strict=False):
@@ -174,7 +173,7 @@ def _reverse_segment(
         old_ct = ct_outputs[ct_slot] if ct_slot in ct_outputs else read_cotangent(ct_slot, dtype)
         ct_outputs[ct_slot] = builder.add("add", (old_ct, part), dtype)
     for k, part in zip(constants, parts[len(input_indices) :], strict=True):
-        ct_slot, dtype = (constant_leaf, k), s.block.inputs[len(reads) + k].dtype
+        ct_slot, dtype = (hoisted_leaf, k), s.block.inputs[len(reads) + k].dtype
         ct_outputs[ct_slot] = builder.add("add", (read_cotangent(ct_slot, dtype), part), dtype)
     first_inputs, constant_inputs = primal[: len(reads)], primal[len(reads) : n_inputs]
     block = Block(
@@ -183,7 +182,7 @@ def _reverse_segment(
     return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *ct_inputs), tuple(ct_outputs))
 
 
-def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], constant_leaf: int) -> Segment:
+def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], hoisted_leaf: int) -> Segment:
     """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
     input_indices = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
@@ -195,7 +194,7 @@ def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence
     for k, x in enumerate(s.hoisted.outputs):
         if x.dtype.kind == "f" and k in constants:
             seeds.append(builder.input(x.dtype))
-            ct_slots.append((constant_leaf, k))
+            ct_slots.append((hoisted_leaf, k))
         elif x.dtype.kind == "f":
             seeds.append(constant(0, x.dtype))
     old_cts = [builder.input(s.hoisted.inputs[k].dtype) for k in input_indices]
@@ -229,10 +228,10 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         )
     program_to_check = dataclasses.replace(program, segments=(*program.segments, *reverse.backward_segments.values()))
     kernel.require_source(program_to_check)
-    body = Body(program, target)
-    writer, rank = body.writer, program.ranks
-    constants = body.write_loads()
-    names = body.names
+    kernel_body = KernelBody(program, target)
+    writer, rank = kernel_body.writer, program.ranks
+    constants = kernel_body.write_loads()
+    names = kernel_body.names
 
     def slot_type(slot: Slot) -> str:
         if slot[0] >= 2 * n:
@@ -257,88 +256,89 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
     types = [type_name(program.leaves[i].number_type) for i, _ in carry]
 
     def write_states(state: str, slots: Collection[Slot], depth: int) -> None:
-        for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
+        for k, (slot, ctype) in enumerate(zip(carry, types, strict=True)):
             if slot in slots:
-                writer.write_line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
+                writer.write_line(f"STORE_STATE({ctype}, {state}, {k}, {names[slot]})", depth)
 
     last_segments, step_segments, first_segments = (
         program.phase_segments(phase) for phase in ("after", "each", "before")
     )
     writer.write_line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
-    writer.write_line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
-    writer.write_line("const bool back = turn >= n_intervals - 1;", 2)
-    writer.write_line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
-    writer.write_line(
-        "const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2
-    )
-    writer.write_line("if (turn < n_intervals) {", 2)
+    writer.write_line("for (int visit = 0; visit < 2 * n_intervals - 1; ++visit) {", 1)  # forward, then back
+    writer.write_line("const bool is_backward = visit >= n_intervals - 1;", 2)
+    writer.write_line("const int part = is_backward ? 2 * (n_intervals - 1) - visit : visit;", 2)
+    writer.write_line("const int n_left = n_steps - part * interval;", 2)
+    writer.write_line("const int n_part_steps = n_left < interval ? n_left : interval;", 2)
+    writer.write_line("if (visit < n_intervals) {", 2)
     write_states("interval + part", carry, 3)
     writer.write_line("}", 2)
-    writer.write_line("for (int step = 0; step < n_here; ++step) {", 2)
+    writer.write_line("for (int step = 0; step < n_part_steps; ++step) {", 2)
     write_states("step", reverse.restored, 3)
     if not last_segments:  # without stages after the steps, the result of the last step is not needed
-        writer.write_line("if (back && step == n_here - 1) break;", 3)
+        writer.write_line("if (is_backward && step == n_part_steps - 1) break;", 3)
     for segment, segment_constants in zip(step_segments, constants, strict=True):
         kernel.write_segment(writer, program, segment, names, segment_constants, 3)
     writer.write_line("}", 2)
-    writer.write_line("if (!back) continue;", 2)
+    writer.write_line("if (!is_backward) continue;", 2)
     if last_segments:
         writer.write_line("if (part == n_intervals - 1) {", 2)
-        _write_backward(body, reverse, last_segments, [()] * len(last_segments), dict(names), 3)
+        _write_backward(kernel_body, reverse, last_segments, [()] * len(last_segments), dict(names), 3)
         writer.write_line("}", 2)
-    writer.write_line("for (int step = n_here - 1; step >= 0; --step) {", 2)
+    writer.write_line("for (int step = n_part_steps - 1; step >= 0; --step) {", 2)
     names_before = dict(names)
-    for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
+    for k, (slot, ctype) in enumerate(zip(carry, types, strict=True)):
         if slot not in reverse.restored:
             continue
         names_before[slot] = writer.new_name("b")
-        writer.write_line(f"const auto {names_before[slot]} = KEPT({t}, step, {k});", 3)
-    _write_backward(body, reverse, step_segments, constants, names_before, 3)
+        writer.write_line(f"const auto {names_before[slot]} = LOAD_STATE({ctype}, step, {k});", 3)
+    _write_backward(kernel_body, reverse, step_segments, constants, names_before, 3)
     writer.write_line("}", 2)
-    writer.write_line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
-    for k, (slot, t) in enumerate(zip(carry, types, strict=True)):
-        writer.write_line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
+    writer.write_line("const int previous_state = interval + (part > 0 ? part - 1 : 0);", 2)
+    for k, (slot, ctype) in enumerate(zip(carry, types, strict=True)):
+        writer.write_line(f"{names[slot]} = LOAD_STATE({ctype}, previous_state, {k});", 2)
     writer.write_line("}", 1)
     for s in step_segments:
         if s in reverse.backward_hoisted_segments:
             kernel.write_segment(writer, program, reverse.backward_hoisted_segments[s], names, (), 1)
     if first_segments:
-        _write_backward(body, reverse, first_segments, [()] * len(first_segments), names | body.initial_values, 1)
+        _write_backward(
+            kernel_body, reverse, first_segments, [()] * len(first_segments), names | kernel_body.initial_values, 1
+        )
     pointers = [f"const {type_name(program.leaves[i].number_type)}* __restrict__ "
                 f"p{rank[i]}"
                 for i in kernel.needed_leaves(program)]  # fmt: skip
     pointers += [f"const {type_name(program.leaves[i].number_type)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
     for i in reverse.perturbed:
-        number, pointer = type_name(program.leaves[i].number_type), f"d{rank[i]}"
-        pointers.append(f"{number}* __restrict__ {pointer}")
+        ctype, pointer = type_name(program.leaves[i].number_type), f"d{rank[i]}"
+        pointers.append(f"{ctype}* __restrict__ {pointer}")
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
-        kernel.write_results(writer, pointer, number, 1, values, 1)
+        kernel.write_results(writer, pointer, ctype, 1, values, 1)
     blocks = [
         *(s.block for s in step_segments for _ in range(2)),
         *(reverse.backward_segments[s].block for s in step_segments),
     ]
-    return body.finish_kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
+    return kernel_body.finish_kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
 
 
 def _write_backward(
-    body: Body,
+    kernel_body: KernelBody,
     reverse: ReverseProgram,
     segments: Sequence[Segment],
     constants: Sequence[Sequence[str]],
     names: dict[Slot, str],
     depth: int,
 ) -> None:
-    """Write the backward pass through the segments of a phase, after recomputing them up to the last.
+    """Write the backward pass through the segments of a phase, after recomputing all segments but the last.
 
     Args:
-        body: Kernel that the lines are added to.
+        kernel_body: Kernel that the lines are added to.
         reverse: The transposed derivatives.
         segments: The segments.
         constants: Expressions of their hoisted numbers.
         names: Expressions of the numbers before the first segment; changed in place.
         depth: Depth of the lines.
     """
-    program, writer = reverse.program, body.writer
+    program, writer = reverse.program, kernel_body.writer
     names_by_segment = []
     for s, segment_constants in zip(segments, constants, strict=True):
         names_by_segment.append(dict(names))

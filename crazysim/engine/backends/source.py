@@ -1,7 +1,7 @@
 """C++ and CUDA source of a block.
 
-A value is a variable that is assigned once, an operation an operator or a call of an inline function. Types and
-functions are defined by a preamble for each target (``targets/``); the source of a block is the same for both.
+A value becomes a variable that is assigned once. An operation becomes an operator or a call of an inline function. A
+preamble for each target (``targets/``) defines types and functions; the source of a block is the same for both targets.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TYPE_NAMES = {np.dtype(name): short for name, short in
 
 
 def require_block_source(block: Block) -> None:
-    """Check that all operations and types of a block can be written as source.
+    """Raise an error unless all operations and types of a block can be written as source.
 
     Raises:
         UnsupportedError: If an operation or type has no source; the error names the stage.
@@ -43,11 +43,11 @@ INDENT = "  "
 """Indentation of one depth."""
 
 EntryGroup = tuple[Element, Element, int]
-"""Group of four neighbouring entries that a target reads at once: the table, the index, and the number of the group."""
+"""Group of four neighbouring table entries that a target reads at once: table, index, and number of the group."""
 
 
 class Writer(LineWriter):
-    """Lines of source of blocks."""
+    """Writer of the source of blocks, line by line."""
 
     def __init__(self, exchange: Exchange | None = None) -> None:
         """Create a writer without lines.
@@ -84,10 +84,10 @@ class Writer(LineWriter):
         self.entry_groups = dict.fromkeys(_entry_groups(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
-                self._over_others(op, depth, _live_values(block, position))
+                self._write_over_others(op, depth, _live_values(block, position))
                 self.shared.clear()  # values for later code are stored for each lane
             else:
-                self._operation(op, depth)
+                self._write_operation(op, depth)
                 self.shared.update(shared_results(op, self.shared))
         self.sin_cos_names, self.entry_groups = outer_state
         return [self.element(x) for x in block.outputs]
@@ -99,31 +99,31 @@ class Writer(LineWriter):
         """Return an element as an expression."""
         return self.names[x] if isinstance(x, Value) else literal(x)
 
-    def _operation(self, op: Operation, depth: int) -> None:
+    def _write_operation(self, op: Operation, depth: int) -> None:
         args = [self.element(a) for a in op.args]
         match op.name:
             case "barrier":
                 pass
             case "when":
-                self._when(op, args, depth)
+                self._write_when(op, args, depth)
             case "loop":
-                self._loop(op, args, depth)
+                self._write_loop(op, args, depth)
             case "while":
-                self._while(op, args, depth)
+                self._write_while(op, args, depth)
             case "threefry2x32":
                 name = self._name_results(op)
                 self.write_line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
                 self.write_line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
             case "table":
-                self._table(op)
+                self._write_table(op)
             case "lookup":
-                self._lookup(op, args, depth)
+                self._write_lookup(op, args, depth)
             case "any_lane":
                 name = self.names[op.results[0]] = self.new_name()
                 self.write_line(f"const auto {name} = any_lane({args[0]});", depth)
             case "sin" | "cos":
-                self._sin_cos(op, args[0], depth)
-            case "custom_jvp":  # its derivative is a kernel of its own
+                self._write_sin_cos(op, args[0], depth)
+            case "custom_jvp":  # a separate kernel computes its derivative
                 outs = self.write_block(op.blocks[0], args, depth)
                 name = self._name_results(op)
                 for k, out in enumerate(outs):
@@ -142,14 +142,14 @@ class Writer(LineWriter):
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
         return name
 
-    def _table(self, op: Operation) -> None:
+    def _write_table(self, op: Operation) -> None:
         """Write a table of constants, which stands before the kernel."""
         name = self.names[op.results[0]] = self.new_name("t")
-        numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
+        numbers = ", ".join(_table_entry(x) for x in op.param("numbers").array)
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
-    def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
-        """Write a read of an entry, with the others of its group of four if at least two of them are read too."""
+    def _write_lookup(self, op: Operation, args: list[str], depth: int) -> None:
+        """Write the read of a table entry; if the block reads three of a group of four, one read serves the group."""
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new_name()
@@ -160,7 +160,7 @@ class Writer(LineWriter):
             self.write_line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
         self.names[op.results[0]] = f"{self.entry_groups[key]}.x[{offset % 4}]"
 
-    def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
+    def _write_sin_cos(self, op: Operation, x: str, depth: int) -> None:
         """Write sine and cosine together, as they share most of their work."""
         if x not in self.sin_cos_names:
             pair = self.sin_cos_names[x] = self.new_name()
@@ -169,7 +169,7 @@ class Writer(LineWriter):
             self.write_line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
         self.names[op.results[0]] = f"{self.sin_cos_names[x]}_{0 if op.name == 'sin' else 1}"
 
-    def _when(self, op: Operation, args: list[str], depth: int) -> None:
+    def _write_when(self, op: Operation, args: list[str], depth: int) -> None:
         mask, *old_values = args
         name = self._define_carry(op, old_values, [False] * len(old_values), depth)
         self.write_line(f"if (any({mask})) {{", depth)
@@ -177,7 +177,7 @@ class Writer(LineWriter):
             self.write_line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {value});", depth + 1)
         self.write_line("}", depth)
 
-    def _loop(self, op: Operation, args: list[str], depth: int) -> None:
+    def _write_loop(self, op: Operation, args: list[str], depth: int) -> None:
         (body,) = op.blocks
         shared = self._shared_carry(op)
         name = self._define_carry(op, args, shared, depth)
@@ -187,39 +187,40 @@ class Writer(LineWriter):
         self._assign_carry(op, name, outs, shared, None, depth + 1)
         self.write_line("}", depth)
 
-    def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
+    def _write_over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
         """Write a loop over the drones of the world, which reads their published numbers."""
         (body,) = op.blocks
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
-        neutral = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
-        name = self._define_carry(op, [literal(x) for x in neutral], [False] * len(neutral), depth)
+        reductions = op.param("reduce")
+        initial = [literal(ops.neutral_number(r, x.dtype)) for r, x in zip(reductions, op.results, strict=True)]
+        name = self._define_carry(op, initial, [False] * len(initial), depth)
         best_numbers: dict[int, str] = {}
-        for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
-            if combine in ops.INDEX_REDUCTIONS:
-                best_numbers[k], start = self.new_name(), literal(ops.neutral_number(combine[3:], x.dtype))
-                self.write_line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({start});", depth)
+        for k, (reduction, x) in enumerate(zip(reductions, body.outputs, strict=True)):
+            if reduction in ops.INDEX_REDUCTIONS:
+                best_numbers[k], worst = self.new_name(), literal(ops.neutral_number(reduction[3:], x.dtype))
+                self.write_line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({worst});", depth)
         counter = self.new_name("j")
         self.write_line(f"UNROLL for (int {counter} = 0; {counter} < GROUP; ++{counter}) {{", depth)
         inputs = [self.new_name() for _ in body.inputs]
         for variable, read in zip(inputs, reads, strict=False):
             self.write_line(f"const auto {variable} = {read(counter)};", depth + 1)
-        self.write_line(f"const auto {inputs[-1]} = eq_(own, i32({counter}));", depth + 1)
+        self.write_line(f"const auto {inputs[-1]} = eq_(own_drone, i32({counter}));", depth + 1)
         outs = self.write_block(body, inputs, depth + 1)
-        for k, (combine, value) in enumerate(zip(op.param("reduce"), outs, strict=True)):
+        for k, (reduction, value) in enumerate(zip(reductions, outs, strict=True)):
             if k in best_numbers:
                 is_better = self.new_name()
-                test = f"{ops.INDEX_REDUCTIONS[combine]}_({value}, {best_numbers[k]})"
+                test = f"{ops.INDEX_REDUCTIONS[reduction]}_({value}, {best_numbers[k]})"
                 self.write_line(f"const auto {is_better} = or_({test}, ne_({value}, {value}));", depth + 1)
                 self.write_line(
                     f"{name}_{k} = select_n_({is_better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1
                 )
                 self.write_line(f"{best_numbers[k]} = select_n_({is_better}, {best_numbers[k]}, {value});", depth + 1)
             else:
-                self.write_line(f"{name}_{k} = {combine}_({name}_{k}, {value});", depth + 1)
+                self.write_line(f"{name}_{k} = {reduction}_({name}_{k}, {value});", depth + 1)
         self.write_line("}", depth)
 
-    def _while(self, op: Operation, args: list[str], depth: int) -> None:
+    def _write_while(self, op: Operation, args: list[str], depth: int) -> None:
         test, body = op.blocks
         shared = self._shared_carry(op)
         name = self._define_carry(op, args, shared, depth)
@@ -232,14 +233,14 @@ class Writer(LineWriter):
         self.write_line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
-        """Return for each number that a loop carries whether all lanes share it, and mark shared ones in its blocks."""
+        """Return whether all lanes share each number that a loop carries, and mark shared inputs of its blocks."""
         shared = shared_carry(op, self.shared)
         for block in op.blocks:
             self.shared.update(x for x, is_shared_number in zip(block.inputs, shared, strict=True) if is_shared_number)
         return shared
 
     def _define_carry(self, op: Operation, initial: Sequence[str], shared: Sequence[bool], depth: int) -> str:
-        """Write a variable with its initial number for each result of an operation that updates them."""
+        """Write a variable with its initial number for each result of an operation; return the prefix of the names."""
         name = self._name_results(op)
         for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared, strict=True)):
             ctype = type_name(x.dtype)
@@ -252,7 +253,7 @@ class Writer(LineWriter):
     def _assign_carry(
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
-        """Assign all results of an iteration after computing all of them, as one may be the old value of another."""
+        """Write the assignments of an iteration, after all new values: a new value may be another's old value."""
         new_names = [self.new_name() for _ in outs]
         for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
             text = result if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {result})"
@@ -292,9 +293,9 @@ def expression(op: Operation, args: Sequence[str]) -> str:
 
 
 def _limiting_function(op: Operation, comparisons: Mapping[Value, Operation]) -> str | None:
-    """Return the name of the function that can replace a selection which limits a number; None for other selections.
+    """Return the name of the function that can replace a selection that limits a number; None for other operations.
 
-    An example is ``x < low ? low : x``, for which a target may have an instruction.
+    A target may have an instruction for it. An example is ``x < low ? low : x``, which becomes ``at_least``.
 
     Args:
         op: The selection.
@@ -320,7 +321,7 @@ def type_name(dtype: DTypeLike) -> str:
     return TYPE_NAMES[dtype]
 
 
-def _entry(x: np.generic) -> str:
+def _table_entry(x: np.generic) -> str:
     """Return a finite constant as a plain literal, for the initialiser of a table."""
     return f"{float(x).hex()}{'f' * (x.dtype == np.float32)}" if x.dtype.kind == "f" else f"{int(x)}"
 

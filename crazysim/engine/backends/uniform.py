@@ -13,7 +13,7 @@ def is_shared(x: Element, shared: Set[Value]) -> bool:
 
 
 def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
-    """Return the results of an operation that all lanes share, given the earlier values that they share."""
+    """Return the results of an operation that all lanes share, given the earlier values that all lanes share."""
     match op.name:
         case "any_lane":
             return list(op.results)
@@ -49,7 +49,7 @@ def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
 
 
 def _shared_in_body(block: Block, inputs_are_shared: list[bool], shared: Set[Value]) -> set[Value]:
-    """Return the values that lanes share at the end of a block, if they share some of its inputs."""
+    """Return the values that all lanes share at the end of a block, given which of its inputs they share."""
     shared_inside = {
         *shared,
         *(x for x, is_shared_input in zip(block.inputs, inputs_are_shared, strict=True) if is_shared_input),

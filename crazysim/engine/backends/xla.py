@@ -60,7 +60,7 @@ def _last_uses(block: Block) -> dict[Value, int]:
 
 
 def _add_barrier(env: Env, block: Block, position: int, last_uses: dict[Value, int]) -> None:
-    """Put a barrier on all values that are used later; else XLA's CPU backend recomputes them for every result."""
+    """Put a barrier on all values that are used later. Without it XLA's CPU backend recomputes them for each result."""
     results = [x for op in block.operations[:position] for x in op.results]
     live = [x for x in results if last_uses.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
@@ -80,16 +80,12 @@ def _broadcast(args: Sequence[Any]) -> list[Array]:
     return [x if isinstance(x, jax.Array) and x.shape == shape else jnp.full(shape, jnp.asarray(x)) for x in args]
 
 
-def _broadcast_to_lanes(x: Any, shape: tuple[int, ...]) -> Array:
-    return jnp.broadcast_to(x, shape)
-
-
 def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     (body,) = op.blocks
-    carry = [_broadcast_to_lanes(x, shape) for x in args]
+    carry = [jnp.broadcast_to(x, shape) for x in args]
 
     def iterate(carry: list[Any], _: Any) -> tuple[list[Any], None]:
-        return [_broadcast_to_lanes(x, shape) for x in run_block(body, carry, shape, env)], None
+        return [jnp.broadcast_to(x, shape) for x in run_block(body, carry, shape, env)], None
 
     return lax.scan(iterate, carry, length=op.param("length"))[0]
 
@@ -99,28 +95,30 @@ def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> 
     test, body = op.blocks
 
     def is_continuing(carry: list[Any]) -> Array:
-        return _broadcast_to_lanes(run_block(test, carry, shape, env)[0], shape)
+        return jnp.broadcast_to(run_block(test, carry, shape, env)[0], shape)
 
     def iterate(carry: list[Any]) -> list[Any]:
         mask = is_continuing(carry)
-        new = run_block(body, carry, shape, env)
-        return [jnp.where(mask, _broadcast_to_lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
+        new_values = run_block(body, carry, shape, env)
+        return [jnp.where(mask, jnp.broadcast_to(new, shape), old) for new, old in zip(new_values, carry, strict=True)]
 
     return lax.while_loop(
-        lambda carry: jnp.any(is_continuing(carry)), iterate, [_broadcast_to_lanes(x, shape) for x in args]
+        lambda carry: jnp.any(is_continuing(carry)), iterate, [jnp.broadcast_to(x, shape) for x in args]
     )
 
 
 def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     """Compute a block only if some lane needs it."""
     (body,) = op.blocks
-    mask, old = args[0], [_broadcast_to_lanes(x, shape) for x in args[1:]]
+    mask, old_values = args[0], [jnp.broadcast_to(x, shape) for x in args[1:]]
 
-    def run_body(mask: Array, old: list[Array]) -> list[Array]:
-        new = run_block(body, [], shape, env)
-        return [jnp.where(mask, _broadcast_to_lanes(x, shape), o) for x, o in zip(new, old, strict=True)]
+    def run_body(mask: Array, old_values: list[Array]) -> list[Array]:
+        new_values = run_block(body, [], shape, env)
+        return [
+            jnp.where(mask, jnp.broadcast_to(new, shape), old) for new, old in zip(new_values, old_values, strict=True)
+        ]
 
-    return lax.cond(jnp.any(mask), run_body, lambda _, old: old, mask, old)
+    return lax.cond(jnp.any(mask), run_body, lambda _, values: values, mask, old_values)
 
 
 def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
@@ -135,7 +133,7 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
     def _(primals: Any, tangents: Any) -> Any:
         outs = call(*primals)
         out_tangents = run_block(derivative(), [*primals, *tangents], shape)
-        return outs, [_broadcast_to_lanes(t, np.shape(o)) for t, o in zip(out_tangents, outs, strict=True)]
+        return outs, [jnp.broadcast_to(t, np.shape(o)) for t, o in zip(out_tangents, outs, strict=True)]
 
     return call(*(jnp.asarray(x) for x in args))
 
@@ -145,7 +143,7 @@ MAX_UNROLLED = 8
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Combine the results of a block for each drone of the world."""
+    """Run a block for each pair of drones of a world, and combine the results of each drone."""
     (block,), n = op.blocks, op.param("n_members")
     n_worlds = shape[0] // n
     used = [v for v in block.used_values() if v in env]
@@ -162,7 +160,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
                 run_block(block, [*other_numbers, drone_number == j], (n_worlds, n), shared_values | own_values)
             )
         combining_functions = [COMBINING_FUNCTIONS[name] for name in op.param("reduce")]
-        reduced = [functools.reduce(fn, [_broadcast_to_lanes(x, (n_worlds, n)) for x in results])
+        reduced = [functools.reduce(fn, [jnp.broadcast_to(x, (n_worlds, n)) for x in results])
                    for fn, results in zip(combining_functions, zip(*results_by_drone, strict=True), strict=True)
                    ]  # fmt: skip
         return [jnp.reshape(x, shape) for x in reduced]
@@ -173,16 +171,16 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
         own_values = dict(zip(lane_values, column, strict=True))
         outs = run_block(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), shared_values | own_values)
         return [
-            REDUCING_FUNCTIONS[name](_broadcast_to_lanes(x, (n_worlds, n)), axis=1)
+            REDUCING_FUNCTIONS[name](jnp.broadcast_to(x, (n_worlds, n)), axis=1)
             for name, x in zip(op.param("reduce"), outs, strict=True)
         ]
 
-    numbers = jnp.arange(n)
+    drone_indices = jnp.arange(n)
     if n_worlds * n * n <= MAX_PAIRS:
-        reduced = jax.vmap(reduce_for_drone)((numbers, columns))
+        reduced = jax.vmap(reduce_for_drone)((drone_indices, columns))
     else:
         batch_size = max(1, MAX_PAIRS // (n_worlds * n))
-        reduced = lax.map(jax.checkpoint(reduce_for_drone), (numbers, columns), batch_size=batch_size)
+        reduced = lax.map(jax.checkpoint(reduce_for_drone), (drone_indices, columns), batch_size=batch_size)
     return [x.T.reshape(shape) for x in reduced]
 
 

@@ -1,8 +1,8 @@
 """Algebraic simplification of operations with constant operands.
 
-Only identities that hold for every number are used, such as ``x * 1``, ``x / 1``, ``x - 0`` and, as in XLA, ``x + 0``,
-although it loses the sign of a negative zero. ``x * 0`` of floats is not simplified, because it is NaN where x is
-infinite.
+Only identities that hold for every number are used, such as ``x * 1``, ``x / 1`` and ``x - 0``. ``x + 0`` is simplified
+too, as in XLA, although this loses the sign of a negative zero. ``x * 0`` of floats is not simplified, because the
+product is NaN if x is infinite.
 
 Zeros of shared parameters are an exception (``known_zero``): terms that they multiply are removed, such as terms of a
 diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the result is the sum of the other
@@ -37,7 +37,7 @@ ZEROS: dict[np.dtype, type] = {np.dtype(np.float32): KnownZero32, np.dtype(np.fl
 
 
 def known_zero(dtype: DTypeLike) -> np.generic | None:
-    """Return the element that stands for a zero of a shared parameter; None if the type is not float32 or float64."""
+    """Return the element for a zero of a shared parameter; None if the type is not float32 or float64."""
     zero_type = ZEROS.get(np.dtype(dtype))
     return None if zero_type is None else zero_type(0)
 

@@ -32,7 +32,7 @@ class Value:
 
 
 class TableEntries:
-    """Entries of a table that are known before the program runs. Two with the same type and bits are equal."""
+    """Entries of a table that are known before the program runs. Tables with the same type and bits are equal."""
 
     def __init__(self, array: np.ndarray):
         self.array = array
@@ -60,9 +60,9 @@ class Operation(NamedTuple):
     params: tuple[tuple[str, Any], ...] = ()
     """Static parameters, as pairs of name and value."""
     blocks: tuple[Block, ...] = ()
-    """Blocks that it runs. Their operations may use the values that are defined before this one."""
+    """Blocks that it runs. Their operations may use the values that are defined before this operation."""
     stage: str = ""
-    """Stage of the pipeline that it comes from."""
+    """Stage of the pipeline that the operation was lowered from."""
 
     def param(self, name: str) -> Any:
         """Return a static parameter."""
@@ -110,11 +110,11 @@ class Builder:
     """Builder of a block, operation by operation."""
 
     def __init__(self, outer: Builder | None = None, stage: str = ""):
-        """Create the builder of an empty block, inside another block if one is given.
+        """Create the builder of an empty block.
 
         Args:
-            outer: Builder of the block around it.
-            stage: Stage that the operations come from.
+            outer: Builder of the enclosing block; None for an outermost block.
+            stage: Name of the stage of the operations; an inner block has the stage of ``outer``.
         """
         self.outer = outer
         self.stage = outer.stage if outer is not None else stage
@@ -129,7 +129,7 @@ class Builder:
         return value
 
     def add(self, name: str, args: Sequence[Element], dtype: DTypeLike, params: tuple = ()) -> Element:
-        """Return the result of an operation: a new value, one that is known already, or a constant."""
+        """Return the result of an operation: a new value, the value of an equal earlier operation, or a constant."""
         args, dtype = tuple(args), np.dtype(dtype)
         simplified = simplify(name, args, dtype, params)
         if simplified is not None:
@@ -201,7 +201,7 @@ def prune(block: Block, keep_inputs: bool = True) -> Block:
 
     Args:
         block: The block.
-        keep_inputs: False to remove unused inputs too.
+        keep_inputs: True to keep unused inputs.
     """
     block = _prune(block, set())
     if keep_inputs:
@@ -228,13 +228,13 @@ def _prune(block: Block, used: set[Value]) -> Block:
 
 
 def _drop_results(op: Operation, used_values: Collection[Value]) -> Operation:
-    """Return a ``when`` without the results that are not needed."""
-    (mask, *old), (block,) = op.args, op.blocks
+    """Return a ``when`` operation without the results that are not used."""
+    (mask, *old_values), (block,) = op.args, op.blocks
     used_indices = [k for k, x in enumerate(op.results) if x in used_values]
     if len(used_indices) == len(op.results):
         return op
     inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in used_indices]))
-    args, results = (mask, *(old[k] for k in used_indices)), tuple([op.results[k] for k in used_indices])
+    args, results = (mask, *(old_values[k] for k in used_indices)), tuple([op.results[k] for k in used_indices])
     return op._replace(args=args, results=results, blocks=(inner,))
 
 
@@ -271,12 +271,12 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
         if op.name == "barrier":
             builder.barrier()
         elif len(op.results) == 1 and not op.blocks:
-            (old,) = op.results
+            (result,) = op.results
             # Operations were simplified when they were built; more is possible only if a value became a constant.
             if any([isinstance(x, np.generic) for x in args]):
-                values[old] = builder.add(op.name, args, old.dtype, op.params)
+                values[result] = builder.add(op.name, args, result.dtype, op.params)
             else:
-                (values[old],) = builder.add_many(op.name, args, (old.dtype,), op.params)
+                (values[result],) = builder.add_many(op.name, args, (result.dtype,), op.params)
         else:
             blocks = tuple([_inline_block(builder, inner, values) for inner in op.blocks])
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)

@@ -10,13 +10,13 @@ from pathlib import Path
 from crazysim.storage import write_file
 
 DUMP_VARIABLE = "CRAZYSIM_DUMP"
-"""Environment variable that names the folder; nothing is written where it is not set."""
+"""Environment variable that names the folder. If it is not set, nothing is written."""
 
 _file_numbers = itertools.count()
 
 
 def is_enabled() -> bool:
-    """Return True if a folder is set. Callers then make the texts, which takes time."""
+    """Return True if a folder is set. Callers check it first, because to make the texts takes time."""
     return bool(os.environ.get(DUMP_VARIABLE))
 
 

@@ -36,7 +36,7 @@ def list_operation(program: Program, operation: Operation) -> str:
         names = _Names()
         list(_list_segment(program, segment, names))
         if any(op is operation for op in segment.block.walk()):
-            return f"{_line(operation, names)} of stage {operation.stage!r}"
+            return f"{_operation_line(operation, names)} of stage {operation.stage!r}"
     raise ValueError("expected an operation of the program, got one of another program")
 
 
@@ -49,9 +49,8 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     if segment.scope == "world" and leaf.scope == "drone":
         number, k = divmod(k, leaf.size)
         drone = f" of drone {number}"
-    for member in (
-        program.packed if leaf.name == PACKED_LEAF_NAME else leaf.row_leaves
-    ):  # the field that the number belongs to
+    members = program.packed if leaf.name == PACKED_LEAF_NAME else leaf.row_leaves
+    for member in members:  # the number is an element of one of the leaves that are packed in this leaf
         if k < program.leaves[member].size:
             return f"{program.leaves[member].name}[{k}]{drone}"
         k -= program.leaves[member].size
@@ -66,12 +65,12 @@ def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator
     if segment.hoisted.outputs:
         yield f"{INDENT}hoisted, once before the first step:"
         for x, slot in zip(segment.hoisted.inputs, segment.hoisted_reads, strict=True):
-            yield f"{INDENT * 2}{names.new_name(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+            yield f"{INDENT * 2}{names.new_name(x)}: {_type_text(x)} = {slot_name(program, segment, slot)}"
         yield from _list_operations(segment.hoisted, names, 2)
         for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
             yield f"{INDENT * 2}{names.new_name(x)} = {names.name(y)}"
     for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
-        yield f"{INDENT}{names.new_name(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+        yield f"{INDENT}{names.new_name(x)}: {_type_text(x)} = {slot_name(program, segment, slot)}"
     yield from _list_operations(segment.block, names, 1)
     if segment is program.check_segment:
         yield f"{INDENT}flagged = {names.name(segment.block.outputs[0])}"
@@ -80,7 +79,7 @@ def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator
         yield f"{INDENT}{slot_name(program, segment, slot)} = {names.name(x)}"
 
 
-def _type(x: Value) -> str:
+def _type_text(x: Value) -> str:
     return f"{x.dtype}[{x.size}]" if x.size else f"{x.dtype}"
 
 
@@ -94,10 +93,10 @@ class _Names:
         return self._names.setdefault(x, f"%{len(self._names)}")
 
     def name(self, x: Element) -> str:
-        return self._names.get(x, "%?") if isinstance(x, Value) else _constant(x)
+        return self._names.get(x, "%?") if isinstance(x, Value) else _constant_text(x)
 
 
-def _constant(x: np.generic) -> str:
+def _constant_text(x: np.generic) -> str:
     return f"{x.item()!r}" if x.dtype.kind != "b" else str(bool(x)).lower()
 
 
@@ -111,15 +110,15 @@ def _list_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
             stage = op.stage
             yield f"{INDENT * depth}# {stage}"
         inner = [line for b in op.blocks for line in _list_inner(b, names, depth + 1)]
-        yield f"{INDENT * depth}{_line(op, names)}" + (" {" if inner else "")
+        yield f"{INDENT * depth}{_operation_line(op, names)}" + (" {" if inner else "")
         yield from inner
         if inner:
             yield f"{INDENT * depth}}}"
 
 
-def _line(op: Operation, names: _Names) -> str:
+def _operation_line(op: Operation, names: _Names) -> str:
     params = [f"{k}={v}" for k, v in op.params if not callable(v)]
-    results = ", ".join(f"{names.new_name(x)}: {_type(x)}" for x in op.results)
+    results = ", ".join(f"{names.new_name(x)}: {_type_text(x)}" for x in op.results)
     return f"{results} = {op.name}({', '.join([*map(names.name, op.args), *params])})"
 
 

@@ -13,15 +13,15 @@ from numpy.typing import DTypeLike
 
 
 def divide(a: Any, b: Any) -> Any:
-    """Divide; integers round towards zero, x / 0 has all bits set, and the smallest integer / -1 is unchanged."""
+    """Divide. Integers round towards zero, x / 0 has all bits set, and the smallest integer / -1 is that integer."""
     if a.dtype.kind == "f":
         return np.divide(a, b)
     if a.dtype.kind == "u":
         return np.where(b == 0, np.iinfo(a.dtype).max, a // np.where(b == 0, b.dtype.type(1), b))
-    unsafe = (b == 0) | (b == -1)
-    safe = np.where(unsafe, b.dtype.type(1), b)
-    floor = a // safe
-    quotient = floor + ((a % safe != 0) & ((a < 0) != (safe < 0)))
+    is_special = (b == 0) | (b == -1)
+    divisor = np.where(is_special, b.dtype.type(1), b)
+    floor = a // divisor
+    quotient = floor + ((a % divisor != 0) & ((a < 0) != (divisor < 0)))
     return np.where(b == 0, a.dtype.type(-1), np.where(b == -1, np.negative(a), quotient))
 
 
@@ -29,19 +29,20 @@ def remainder(a: Any, b: Any) -> Any:
     """Return the remainder with the sign of the dividend; for integers, the remainder of x / 0 is x."""
     if a.dtype.kind == "f":
         return np.fmod(a, b)
-    unsafe = (b == 0) if b.dtype.kind == "u" else (b == 0) | (b == -1)
-    return np.where(b == 0, a, np.where(unsafe, a.dtype.type(0), np.fmod(a, np.where(unsafe, b.dtype.type(1), b))))
+    is_special = (b == 0) if b.dtype.kind == "u" else (b == 0) | (b == -1)
+    divisor = np.where(is_special, b.dtype.type(1), b)
+    return np.where(b == 0, a, np.where(is_special, a.dtype.type(0), np.fmod(a, divisor)))
 
 
 def sign(x: Any) -> Any:
-    """Return the sign; for zeros and NaN, return the operand."""
+    """Return -1, 0 or 1 with the sign of a number; zeros and NaN are returned unchanged."""
     return np.where(x > 0, x.dtype.type(1), np.where(x < 0, x.dtype.type(-1 if x.dtype.kind != "u" else 0), x))
 
 
 def round_away(x: Any) -> Any:
     """Round to the nearest integer, halves away from zero."""
-    whole = np.trunc(x)
-    return np.copysign(np.where(np.abs(x - whole) >= 0.5, np.abs(whole) + 1, np.abs(whole)), x)
+    truncated = np.trunc(x)
+    return np.copysign(np.where(np.abs(x - truncated) >= 0.5, np.abs(truncated) + 1, np.abs(truncated)), x)
 
 
 def total_shift(shift: Callable[[Any, Any], Any], fill: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
@@ -84,9 +85,9 @@ def convert(x: Any, dtype: DTypeLike) -> Any:
         limits = np.iinfo(dtype)
         low, high = float(limits.min), float(limits.max) + 1  # both are exact, powers of two or 0
         is_in_range = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
-        whole = np.where(is_in_range, x, 0).astype(dtype)
+        truncated = np.where(is_in_range, x, 0).astype(dtype)
         saturated = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
-        return np.where(is_in_range, whole, saturated)
+        return np.where(is_in_range, truncated, saturated)
     return x != 0 if dtype.kind == "b" else x.astype(dtype)
 
 
@@ -108,10 +109,10 @@ def integer_pow(x: Any, y: int) -> Any:
 
 def log_gamma(x: Any) -> Any:
     """Return the logarithm of the absolute value of the gamma function; at -inf, XLA returns inf, SciPy -inf."""
-    return np.where(np.isinf(x), np.abs(x), special("gammaln")(x))
+    return np.where(np.isinf(x), np.abs(x), scipy_function("gammaln")(x))
 
 
-def special(name: str) -> Callable[..., Any]:
+def scipy_function(name: str) -> Callable[..., Any]:
     """Return a function of ``scipy.special``, which is imported at its first call. JAX depends on SciPy."""
 
     def call(*args: Any) -> Any:
@@ -124,4 +125,4 @@ def special(name: str) -> Callable[..., Any]:
 
 def digamma(x: Any) -> Any:
     """Return the derivative of the logarithm of the gamma function; XLA returns NaN at its poles."""
-    return np.where((x <= 0) & (x == np.floor(x)), x.dtype.type(np.nan), special("digamma")(x))
+    return np.where((x <= 0) & (x == np.floor(x)), x.dtype.type(np.nan), scipy_function("digamma")(x))

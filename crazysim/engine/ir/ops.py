@@ -1,13 +1,13 @@
-"""The table of operations: meaning and name of each one in every target.
+"""The table of operations: meaning and name of each operation in every target.
 
 Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in NumPy (for
-constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target refuses programs
-with operations that it has no form for.
+constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target refuses a program
+with an operation for which it has no form.
 
-Integers and conversions follow XLA, which defines what C leaves undefined: the quotient of a division by zero is -1
-(all bits set), its remainder the dividend; a shift by the size of the type or more gives 0, or all sign bits; a float
-is rounded towards zero and saturates at the limits of the integer type, and NaN becomes 0. ``max``, ``min`` and
-``clamp`` return NaN if an operand is NaN; the sign of a zero that they return is not defined.
+Integers and conversions follow XLA, which defines what C leaves undefined. The quotient of a division by zero is -1
+(all bits set), and the remainder is the dividend. A shift by the size of the type or more gives 0, or all sign bits. A
+float that is converted to an integer is rounded towards zero and saturates at the limits of the type; NaN becomes 0.
+``max``, ``min`` and ``clamp`` return NaN if an operand is NaN; the sign of a zero that they return is not defined.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import numpy_forms as forms
 
 DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
-"""Types of numbers. Half precision is missing: in a fusion, XLA keeps more digits, so engines could not agree."""
+"""Types of numbers. Half precision is missing, because XLA keeps more digits inside a fusion than other engines."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OperationForm:
-    """One operation."""
+    """Row of the table: one operation."""
 
     name: str
     """Name in programs, and of JAX's primitive if there is one."""
@@ -48,7 +48,7 @@ class OperationForm:
     """Expression in C++ and CUDA, or expressions by kind. {0}, {1}, ... and {all} stand for the operands, {type} for
     the type of the result, and the name of a static parameter for its value. The functions are in ``targets/``."""
     casadi: str | Callable[..., Any] | None = None
-    """Name in ``casadi``, or a function of that module and the operands; None where it has no form."""
+    """Name in ``casadi``, or a function of that module and the operands; None if CasADi has no form."""
     casadi_kinds: str = "fib"
     """Kinds for which CasADi's form is correct. It computes in float64, which does not wrap around as uint32 does."""
     cost: float = 1
@@ -108,11 +108,11 @@ def _rows() -> list[OperationForm]:
     """Return the rows of the table, grouped by kind of operation."""
     any_number, integer = "fiu", "iu"
 
-    def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **more: Any) -> OperationForm:
-        return OperationForm(name=name, operands="T", numpy=numpy, cost=cost, casadi=casadi, **more)
+    def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **fields: Any) -> OperationForm:
+        return OperationForm(name=name, operands="T", numpy=numpy, cost=cost, casadi=casadi, **fields)
 
-    def binary(name: str, numpy: Any, kinds: str, cost: float = 1, **more: Any) -> OperationForm:
-        return OperationForm(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **more)
+    def binary(name: str, numpy: Any, kinds: str, cost: float = 1, **fields: Any) -> OperationForm:
+        return OperationForm(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **fields)
 
     def comparison(name: str, numpy: Any, casadi: Any, kinds: str = any_number) -> OperationForm:
         # The cost is counted with the selection that uses the result.
@@ -173,9 +173,9 @@ def _rows() -> list[OperationForm]:
         unary("acosh", np.arccosh, 16, "acosh"),
         unary("atanh", np.arctanh, 16, "atanh"),
         binary("pow", forms.power, "f", 16, casadi="power"),
-        unary("erf", forms.special("erf"), 16, "erf"),
-        unary("erfc", forms.special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
-        unary("erf_inv", forms.special("erfinv"), 16, _casadi_erf_inv),
+        unary("erf", forms.scipy_function("erf"), 16, "erf"),
+        unary("erfc", forms.scipy_function("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
+        unary("erf_inv", forms.scipy_function("erfinv"), 16, _casadi_erf_inv),
         unary("lgamma", forms.log_gamma, 32),
         unary("digamma", forms.digamma, 32),
     ]
@@ -230,33 +230,33 @@ TABLE: Mapping[str, OperationForm] = {row.name: row for row in _rows()}
 
 ``barrier`` separates stages: values that are used after it are computed once, before it. ``when(mask, *old)`` returns
 the outputs of its block where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block
-``length`` times; ``while(*carry)`` runs its second block as long as its first returns true. ``custom_jvp(*args,
+``length`` times; ``while(*carry)`` runs its second block as long as its first block returns true. ``custom_jvp(*args,
 derivative=)`` runs its block, and has a custom derivative. ``over_others(*published, reduce=, n_members=)`` runs its
 block for each drone of the world: the inputs of the block are the numbers that this drone published, and whether it is
-the reading drone itself; ``reduce`` names the operation that combines each output. It never occurs in an inner block.
-``threefry2x32`` is the cipher of JAX's random numbers. ``opaque_copy(x, part=)`` is x as a new value in each part, so
-that the numbers that depend on it are recomputed; compilers on the host may still merge them.
-``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is its entry at the sum of an
-int32 index (a multiple of four if ``aligned``) and a constant offset, which must be in bounds.
+the reading drone itself; ``reduce`` names the operation that combines each output. ``over_others`` never occurs in an
+inner block. ``threefry2x32`` is the cipher of JAX's random numbers. ``opaque_copy(x, part=)`` is x as a new value in
+each part, so that the numbers that depend on it are recomputed; compilers on the host may still merge these values.
+``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is the entry of a table at the
+sum of an int32 index (a multiple of four if ``aligned``) and a constant offset; the sum must be in bounds.
 ``any_lane`` is true where its operand is true; a target may also return true in all lanes of a vector if it is true in
 any of them.
 
 Comparisons and changes of sign cost nothing: comparisons are counted with the selections that use them, and a change of
-sign is part of another operation. A function costs as much as a hardware approximation and a step that refines it, or
-as the shortest polynomial that is exact to float32. A random number takes twenty rounds of add, rotate and xor. An
-operation that runs a block costs as much as the block.
+sign is part of another operation. The cost of a function is the cost of a hardware approximation and a step that
+refines it, or of the shortest polynomial that is exact to float32. A random number takes twenty rounds of add, rotate
+and xor. An operation that runs a block costs as much as the block.
 """
 
 REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
 """Operations that combine the results of ``over_others``."""
 
 INDEX_REDUCTIONS: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
-"""Reductions to the index of the first drone with the smallest or largest number, and the comparison by which a number
-replaces the best so far. Only derivatives in kernels use them."""
+"""Comparison by which a number replaces the best number so far, for each reduction to the index of the first drone with
+the smallest or largest number. Only derivatives in kernels use these reductions."""
 
 
 def neutral_number(name: str, dtype: np.dtype) -> np.generic:
-    """Return the initial number of a reduction; for bools ``or`` and ``and`` replace max and min."""
+    """Return the initial number of a reduction. For bools, ``or`` and ``and`` take the place of max and min."""
     if name in ("add", "or", "and", *INDEX_REDUCTIONS):
         return dtype.type(name == "and")
     limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)

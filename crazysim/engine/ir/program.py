@@ -24,7 +24,7 @@ Slot = tuple[int, int]
 drone (or world)."""
 
 TABLE_INDEX = -1
-"""Element index of a slot that stands for a whole leaf, read as a table. Only shared leaves are tables."""
+"""Element index in the slot of a whole leaf that is read as a table. Only shared leaves are tables."""
 
 PACKED_LEAF_NAME = "packed"
 """Name of the leaf that holds the packed shared leaves."""
@@ -58,7 +58,7 @@ class Leaf:
 
     @functools.cached_property
     def number_type(self) -> np.dtype:
-        """Type of its numbers."""
+        """Type of the numbers: the dtype, or uint32 for random keys."""
         return np.dtype(np.uint32 if is_key(self) else self.dtype)
 
 
@@ -148,19 +148,19 @@ class Program:
     segments: tuple[Segment | UnfusedStage, ...]
     """Segments in order, phase by phase."""
     check_segment: Segment | None = None
-    """Segment that flags a drone whose watched numbers are not finite, after the last step."""
+    """Segment that runs after the last step and flags drones whose watched numbers are not finite."""
     scratch: frozenset[int] = frozenset()
     """Leaves that only pass numbers from one stage to another; their values are lost after a call."""
     packed: tuple[int, ...] = ()
     """Shared leaves that are concatenated in one additional leaf."""
     population: str = "drone"
-    """Population whose members are computed side by side. Here they are called drones and have the scope ``drone``."""
+    """Population whose members are the lanes. A program calls them drones, and their scope ``drone``."""
     views: frozenset[int] = frozenset()
-    """Leaves of other populations, viewed as leaves of the world (``relative``)."""
+    """Leaves of other populations, which the program reads as leaves of the world (``lowering.relative``)."""
 
     @functools.cached_property
     def fused(self) -> bool:
-        """True where one kernel can run all of it."""
+        """True if one kernel can run the whole program."""
         return not self.unfused_stages
 
     @functools.cached_property
@@ -185,7 +185,7 @@ class Program:
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Rank of each used leaf among the used leaves. Kernels name leaves by it, so equal steps have equal source."""
+        """Rank of each leaf among the used leaves. Kernels name leaves by rank, so equal steps have equal source."""
         checked = [leaf for leaf, _ in self.check_segment.reads] if self.check_segment is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read_leaves, *s.written_leaves))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}
@@ -203,7 +203,7 @@ class Program:
 
     @functools.cached_property
     def group_size(self) -> int:
-        """Number of drones that read each other's numbers: all of a world if a segment needs that, otherwise 1."""
+        """Number of drones that read each other's numbers: all drones of a world if a segment couples them, else 1."""
         return self.n_drones if any(s.couples_drones for s in self.fused_segments) else 1
 
     def phase_segments(self, phase: Phase) -> list[Any]:
@@ -211,7 +211,7 @@ class Program:
         return [segment for segment in self.segments if segment.phase == phase]
 
     def drone_slots(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
-        """Return the slots of a segment as slots of one drone; a segment of worlds has slots for each of its drones."""
+        """Return slots of a segment as slots of one drone. A segment of worlds has separate slots for each drone."""
         if segment.scope == "drone":
             return list(slots)
         return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]
@@ -233,6 +233,6 @@ class Program:
 
         All segments of a part have the same phase.
         """
-        runs = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
-        for _, segments in runs:
+        groups = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
+        for _, segments in groups:
             yield dataclasses.replace(self, segments=tuple(segments), check_segment=None, scratch=frozenset())

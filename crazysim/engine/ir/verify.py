@@ -17,12 +17,12 @@ class VerificationError(AssertionError):
 def verify(program: Program) -> Program:
     """Return a program unchanged, or raise an error that says what is wrong with it.
 
-    Values are defined once, before they are used; operands and results have the types of the table of operations;
-    inputs and outputs have the types of their slots; no slot is read or written twice; hoisted blocks read no number
-    that steps change.
+    Values are defined once, before they are used. Operands and results have the types of the table of operations, and
+    inputs and outputs the types of their slots. No slot is read or written twice. Hoisted blocks read no number that
+    steps change.
 
     Raises:
-        VerificationError: If it is not well formed.
+        VerificationError: If the program is not well formed.
     """
     phases = [PHASES.index(s.phase) for s in program.segments]
     _require(phases == sorted(phases), "segments are not in the order of their phases")
@@ -151,5 +151,7 @@ def _verify_types(op: Operation) -> None:
             _require(not op.blocks and row.accepts(dtypes), description)
             shared = next((x for x, letter in zip(dtypes, row.operands, strict=True) if letter == "T"), None)
             expected = {"T": shared, "b": np.dtype(bool), "u": np.dtype(np.uint32)}
-            fits = [letter == "*" or x == expected[letter] for x, letter in zip(results, row.results, strict=False)]
-            _require(len(results) == len(row.results) and all(fits), description)
+            are_expected = [
+                letter == "*" or x == expected[letter] for x, letter in zip(results, row.results, strict=False)
+            ]
+            _require(len(results) == len(row.results) and all(are_expected), description)

@@ -20,7 +20,7 @@ class Group(NamedTuple):
     stages: tuple[Stage, ...]
     """The stages, in order."""
     owned_leaves: frozenset[int] | None
-    """Leaves whose new values are taken from this group; None for all."""
+    """Leaves whose new values are taken from this group; None for all leaves that it writes."""
 
 
 class _Access(NamedTuple):
@@ -40,7 +40,7 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     """Return the groups of populations that do not depend on each other. The group of the drones comes first.
 
     Two stages depend on each other if they act on the same population, or if one reads or writes a leaf that the other
-    writes. Stages that only use leaves of worlds, such as the clock, are repeated in every group that reads their
+    writes. Stages that only use leaves of worlds, called clocks here, are repeated in every group that reads their
     results.
 
     Args:
@@ -56,14 +56,12 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     n_members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
     components = _find_components([k for k in range(len(stages)) if k not in clocks], accesses)
     components = [(indices, frozenset().union(*(accesses[k].populations for k in indices))) for indices in components]
-    components.sort(key=lambda part: "drone" not in part[1])
+    components.sort(key=lambda component: "drone" not in component[1])
     if not components or "drone" not in components[0][1]:
         components.insert(0, (set(), frozenset({"drone"})))
     components = [(_add_clocks(indices, clocks, accesses), populations) for indices, populations in components]
-    components[0] = (
-        components[0][0] | clocks,
-        components[0][1],
-    )  # the drones run all clocks, as without other populations
+    (drone_stages, drone_populations), *other_components = components
+    components = [(drone_stages | clocks, drone_populations), *other_components]  # the drones run all clocks
     groups, owned_leaves = [], frozenset()
     for indices, populations in components:
         written = frozenset().union(*(accesses[k].written_leaves for k in indices))
@@ -83,29 +81,29 @@ def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
     """Return the stages that use neither a leaf of a population nor a leaf that a stage outside the set writes."""
     clocks = {k for k, a in enumerate(accesses) if not any(has_members(axes.scopes[i]) for i in a.used_leaves)}
     while True:
-        others = frozenset().union(*(a.written_leaves for k, a in enumerate(accesses) if k not in clocks))
-        depending = {k for k in clocks if accesses[k].used_leaves & others}
-        if not depending:
+        other_leaves = frozenset().union(*(a.written_leaves for k, a in enumerate(accesses) if k not in clocks))
+        dependent_stages = {k for k in clocks if accesses[k].used_leaves & other_leaves}
+        if not dependent_stages:
             return clocks
-        clocks -= depending
+        clocks -= dependent_stages
 
 
 def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list[set[int]]:
     """Return sets of stages that depend on each other, directly or through other stages."""
-    parts: list[set[int]] = []
+    components: list[set[int]] = []
     for k in stages:
-        component, other_parts = {k}, []
-        for part in parts:
-            if any(_are_dependent(accesses[k], accesses[j]) for j in part):
-                component |= part
+        joined_component, other_components = {k}, []
+        for component in components:
+            if any(_are_dependent(accesses[k], accesses[j]) for j in component):
+                joined_component |= component
             else:
-                other_parts.append(part)
-        parts = [*other_parts, component]
-    return parts
+                other_components.append(component)
+        components = [*other_components, joined_component]
+    return components
 
 
 def _are_dependent(a: _Access, b: _Access) -> bool:
-    # A stage without a population counts as a stage of the drones.
+    # A stage without a population is treated as a stage of the drones.
     populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
     return bool(populations or a.written_leaves & b.used_leaves or b.written_leaves & a.used_leaves)
 
@@ -114,8 +112,8 @@ def _add_clocks(stages: Collection[int], clocks: Collection[int], accesses: Sequ
     """Return stages with the clocks whose results they read."""
     result = set(stages)
     while True:
-        read = frozenset().union(*(accesses[k].read_leaves for k in result))
-        added = {k for k in clocks if accesses[k].written_leaves & read} - result
-        if not added:
+        read_leaves = frozenset().union(*(accesses[k].read_leaves for k in result))
+        new_clocks = {k for k in clocks if accesses[k].written_leaves & read_leaves} - result
+        if not new_clocks:
             return result
-        result |= added
+        result |= new_clocks

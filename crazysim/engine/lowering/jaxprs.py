@@ -2,7 +2,7 @@
 
 JAX traces a function that is written for one drone, and its jaxpr is lowered equation by equation. An array becomes a
 NumPy object array of elements (``ir``). A rule defines a primitive on elements. There are four kinds of rules, and most
-primitives need no rule of their own:
+primitives share a rule with others:
 
 - element-wise: the same operation for every element;
 - movement: nothing is computed, so the primitive is run once, on the elements themselves or on their indices;
@@ -29,13 +29,13 @@ ElementArray = np.ndarray
 """An array of elements, of type object. A random key is a pair of elements."""
 
 Rule = Callable[["Lowering", Any, list[ElementArray]], Sequence[ElementArray]]
-"""Function from the lowering, an equation and its operands to its results."""
+"""Function that takes the lowering, an equation and its operands, and returns the results of the equation."""
 RULES: dict[str, Rule] = {}
 """Rules by the name of the primitive."""
 
 MAX_UNROLL = 64
-"""Longest scan with inputs or outputs per iteration, longest sort, and largest range of a run-time index, that is
-unrolled."""
+"""Maximum number of iterations or elements that are unrolled. This is the maximum length of a scan with inputs or
+outputs per iteration and of a sort, and the maximum range of a run-time index."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
@@ -84,7 +84,7 @@ class Lowering:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
-            UnsupportedError: If it has a primitive without a rule, or a use of one that its rule does not support.
+            UnsupportedError: If a primitive has no rule, or its rule does not support the parameters.
         """
         env: dict[Any, ElementArray] = {}
 
@@ -114,12 +114,13 @@ class Lowering:
         """Return the results of an operation on every element; operands are broadcast."""
         shapes = {x.shape for x in args}
         shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
-        rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
-        if not rows[-1].size:
+        flat_args = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
+        if not flat_args[-1].size:
             return np.empty(shape, object)
-        first_operands = [row[0] for row in rows]
-        if isinstance(first_operands[-1], tuple):  # keys: both halves alike
-            halves = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
+        first_operands = [x[0] for x in flat_args]
+        if isinstance(first_operands[-1], tuple):  # a selection of random keys selects both halves
+            columns = list(zip(*flat_args, strict=True))
+            halves = [[self.scalar(op, mask, *(key[i] for key in keys)) for i in (0, 1)] for mask, *keys in columns]
             return as_elements([(a, b) for a, b in halves], shape)
         dtypes = [x.dtype for x in first_operands]
         if op in ops.BOOLEAN_FORM and dtypes[0].kind == "b":
@@ -129,10 +130,11 @@ class Lowering:
         error = ops.unsupported_error(op, dtypes, dtype)
         if error is not None:
             raise error
-        return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
+        columns = zip(*flat_args, strict=True)
+        return as_elements([self.builder.add(op, column, dtype, params) for column in columns], shape)
 
     def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
-        """Return the result of an operation on single elements; its default type is the type of the last operand."""
+        """Return the result of an operation on single elements, by default of the type of the last operand."""
         return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
     def make_inner(self) -> Lowering:
@@ -140,7 +142,7 @@ class Lowering:
         return Lowering(Builder(self.builder), self.entries, self.n_members)
 
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
-        """Return the entry of a table at ``base + offset``; ``aligned`` says that the base is a multiple of four."""
+        """Return the entry of a table at ``base + offset``. The base is a multiple of four if ``aligned`` is True."""
         number = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
         self.entries[number] = TableEntry(table, base, offset, aligned)
         return number
@@ -221,7 +223,7 @@ def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
         avals: Shapes and types of the arguments.
 
     Raises:
-        UnsupportedError: If it has a primitive without a rule, or a use of one that its rule does not support.
+        UnsupportedError: If a primitive has no rule, or its rule does not support the parameters.
     """
     lowering = Lowering()
     args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]

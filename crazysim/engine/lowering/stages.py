@@ -22,8 +22,8 @@ from crazysim.jaxcompat import equations, is_key
 from crazysim.pytree import leaf_flags
 
 MAX_UNROLLED_DRONES = 8
-"""Maximum number of drones per world for which stages of scope ``world`` that use leaves of drones are lowered, and of
-members of other populations that a stage uses; blocks grow as its square."""
+"""Maximum number of drones per world for which a stage of scope ``world`` that uses leaves of drones is lowered. It is
+also the maximum number of members of other populations that a stage uses. Blocks grow as the square of the number."""
 
 
 def lower_stages(
@@ -45,8 +45,8 @@ def lower_stages(
             the leaf.
         watched: Function that selects the leaves to check for NaN and infinity after the last step, from a tree of
             leaf indices with the structure of the data. None for no check. There is no check either if a stage writes
-            the flag itself.
-        population: Population whose members are computed side by side; below they are called drones.
+            ``core.nonfinite`` itself.
+        population: Population whose members are the lanes. The members are called drones below.
         tracer: Cache of traced stages; None for a new one.
     """
     tracer = tracer or Tracer()
@@ -57,12 +57,12 @@ def lower_stages(
     segments = []
     for phase in PHASES:
         phase_stages = [stage for stage in stages if stage.phase == phase]
-        lowered = [
+        phase_segments = [
             _lower_stage(axes.stage(x), phase, axes, leaves, known_zeros, n_drones, tracer) for x in phase_stages
         ]
-        segments += (
-            _move_before_steps(lowered, phase_stages, axes.leaf_indices.core.steps) if phase == "each" else lowered
-        )
+        if phase == "each":
+            phase_segments = _move_before_steps(phase_segments, phase_stages, axes.leaf_indices.core.steps)
+        segments += phase_segments
     program_leaves = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
@@ -88,15 +88,15 @@ def _move_before_steps(
 ) -> list[Segment | UnfusedStage]:
     """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
 
-    An episode cannot begin during a call as long as at most one stage writes the leaf of step counts.
-    Numbers that only the moved segments write are then constant during the steps, and can be hoisted.
+    If at most one stage writes the leaf of step counts, no episode can begin during a call. Numbers that only the moved
+    segments write are then constant during the steps, and can be hoisted.
     """
     if sum(step_count_leaf in s.written_leaves for s in segments) > 1:
         return list(segments)
-    runs_first = [
+    acts_at_first_step = [
         stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)
     ]
-    n_moved = (*runs_first, False).index(False)
+    n_moved = (*acts_at_first_step, False).index(False)
     moved = [dataclasses.replace(s, phase="before") for s in segments[:n_moved] if isinstance(s, Segment)]
     return [*moved, *segments[n_moved:]]
 
@@ -150,23 +150,31 @@ def _make_segment(
     n_members: int,
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
-    before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves}
-    tables = {_add_table(lowering, before[i]): (i, TABLE_INDEX) for i in shared if i in before and before[i].size > 1}
-    lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
-    args = [before[i] for i in traced.input_leaves]
+    elements_before = {
+        i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves
+    }
+    tables = {
+        _add_table(lowering, elements_before[i]): (i, TABLE_INDEX)
+        for i in shared
+        if i in elements_before and elements_before[i].size > 1
+    }
+    lowering.shared.update(x for i in shared for x in scalars(elements_before[i]) if isinstance(x, Value))
+    args = [elements_before[i] for i in traced.input_leaves]
     if traced.when is None:
-        after = lowering.lower(traced.fn, args)
+        elements_after = lowering.lower(traced.fn, args)
     else:
         mask = lowering.lower(traced.when, args)[0][()]
         for i in traced.written_leaves:
-            if i not in before:
-                before[i] = inputs(lowering.builder, traced.avals[i])
-        after = _lower_guarded(lowering, mask, traced, args, [before[i] for i in traced.written_leaves])
+            if i not in elements_before:
+                elements_before[i] = inputs(lowering.builder, traced.avals[i])
+        elements_after = _lower_guarded(
+            lowering, mask, traced, args, [elements_before[i] for i in traced.written_leaves]
+        )
     writes: dict[Slot, Element] = {}
-    for i, new in zip(traced.written_leaves, after, strict=True):
-        old = scalars(before[i]) if i in before else [None] * len(scalars(new))
+    for i, new in zip(traced.written_leaves, elements_after, strict=True):
+        old = scalars(elements_before[i]) if i in elements_before else [None] * len(scalars(new))
         writes.update({(i, k): b for k, (a, b) in enumerate(zip(old, scalars(new), strict=True)) if a is not b})
-    slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))} | tables
+    slots = {x: (i, k) for i, elements in elements_before.items() for k, x in enumerate(scalars(elements))} | tables
     block = prune(lowering.builder.finish(tuple(writes.values())), keep_inputs=False)
     return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
 
@@ -181,35 +189,39 @@ def _add_table(lowering: Lowering, elements: ElementArray) -> Value:
 
 
 def _lower_guarded(
-    lowering: Lowering, mask: Element, traced: TracedStage, args: list[ElementArray], old: list[ElementArray]
+    lowering: Lowering, mask: Element, traced: TracedStage, args: list[ElementArray], old_arrays: list[ElementArray]
 ) -> list[ElementArray]:
     """Return the written leaves after a stage that acts where a mask is true.
 
-    A stage that reduces over other drones is computed at every step, and its results are selected by the mask, because
-    drones need each other's values even if their stages act at different steps.
+    A stage that reduces over other drones is computed at every step, and the mask selects its results. Drones need each
+    other's values even if their stages act at different steps.
     """
     reads_other_drones = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
     inner = lowering if reads_other_drones else lowering.make_inner()
-    new = inner.lower(traced.fn, args)
-    pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
+    new_arrays = inner.lower(traced.fn, args)
+    pairs = [
+        (old, new)
+        for old_array, new_array in zip(old_arrays, new_arrays, strict=True)
+        for old, new in zip(scalars(old_array), scalars(new_array), strict=True)
+    ]
     if reads_other_drones:
-        results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
-        return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
-    changed = [(a, b) for a, b in pairs if a is not b]
-    block = inner.builder.finish([b for _, b in changed])
-    old_elements = [a for a, _ in changed]
+        results = iter([old if old is new else lowering.scalar("select_n", mask, old, new) for old, new in pairs])
+        return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old_arrays]
+    changed = [(old, new) for old, new in pairs if old is not new]
+    block = inner.builder.finish([new for _, new in changed])
+    old_elements = [old for old, _ in changed]
     results = iter(
         lowering.builder.add_many("when", (mask, *old_elements), [a.dtype for a in old_elements], (), (block,))
     )
-    flat = iter([a if a is b else next(results) for a, b in pairs])
-    return [_replace_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
+    elements = iter([old if old is new else next(results) for old, new in pairs])
+    return [_replace_scalars(x, [next(elements) for _ in scalars(x)]) for x in old_arrays]
 
 
 def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> ElementArray:
-    """Return the scalars as elements with the shape of the template; a key consists of two integers."""
-    row = iter(items)
-    pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in template.reshape(-1)]
-    return as_elements(pairs, template.shape)
+    """Return scalars as an array with the shape of the template; two scalars become a key where it has one."""
+    scalar = iter(items)
+    elements = [(next(scalar), next(scalar)) if isinstance(x, tuple) else next(scalar) for x in template.reshape(-1)]
+    return as_elements(elements, template.shape)
 
 
 def _make_finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:

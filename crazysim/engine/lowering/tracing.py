@@ -16,7 +16,7 @@ class TracedStage:
     """A stage as jaxprs on flat lists of leaves: its function, and its condition if it has one."""
 
     def __init__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]):
-        """Trace a stage for the one drone, the one world or the batch that it is declared for.
+        """Trace a stage for data of its scope: one drone, one world, or the batch.
 
         Args:
             stage: The stage.
@@ -29,9 +29,9 @@ class TracedStage:
         """Leaves that it writes: the outputs of ``fn``."""
 
         def apply(values: list[Any]) -> list[Any]:
-            after = stage.fn(axes.treedef.unflatten(values))
-            self.written_leaves = axes.written_leaves(values, after, stage)
-            leaves_after = jax.tree.leaves(after)
+            data_after = stage.fn(axes.treedef.unflatten(values))
+            self.written_leaves = axes.written_leaves(values, data_after, stage)
+            leaves_after = jax.tree.leaves(data_after)
             return [leaves_after[i] for i in self.written_leaves]
 
         def condition(values: list[Any]) -> list[Any]:
@@ -40,7 +40,7 @@ class TracedStage:
 
         fn = jax.make_jaxpr(apply)(self.avals)
         when = jax.make_jaxpr(condition)(self.avals) if stage.when is not None else None
-        if when is not None and not when.jaxpr.outvars:  # it acts at every step
+        if when is not None and not when.jaxpr.outvars:  # the stage acts at every step
             when = None
         used = _used_inputs(fn) | (_used_inputs(when) if when is not None else set())
         self.input_leaves = sorted(used)
@@ -48,7 +48,7 @@ class TracedStage:
         self.fn = jaxcompat.select_inputs(fn, self.input_leaves)
         self.when = jaxcompat.select_inputs(when, self.input_leaves) if when is not None else None
         self.segments: dict[Any, Any] = {}
-        """Segments that it was lowered to; the key has everything else that lowering depends on."""
+        """Segments that the stage was lowered to. The keys hold everything else that lowering depends on."""
 
     def dump(self, name: str) -> None:
         """Write the jaxprs into the folder that ``CRAZYSIM_DUMP`` names, if it is set."""
@@ -60,7 +60,7 @@ class Tracer:
     """Cache of traced stages. A stage is traced once for leaves of the same shapes and types."""
 
     def __init__(self) -> None:
-        self._traced: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
+        self._traced: dict[Any, tuple[Stage, TracedStage]] = {}  # with the stage, so that ids in keys stay valid
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
         """Return ``TracedStage(stage, axes, leaves)``, from the cache if possible."""

@@ -1,1 +1,1 @@
-"""Passes: functions from a program to an equivalent one that takes less time."""
+"""Passes: functions from a program to an equivalent program that takes less time."""

@@ -16,8 +16,8 @@ from crazysim.jaxcompat import is_key
 def pack_shared(program: Program) -> Program:
     """Read the numbers that all drones share from one additional leaf, which concatenates the shared leaves.
 
-    A call of a compiled step takes longer the more arrays it has. Leaves that unfused stages read, that stages write,
-    that are read as tables, or whose type is not that of the first leaf, stay separate.
+    A call of a compiled step takes longer the more arrays it has. Leaves stay separate if an unfused stage reads them,
+    if a stage writes them, if they are read as tables, or if their type differs from the type of the first leaf.
     """
     leaves = program.leaves
     separate_leaves = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables
@@ -40,17 +40,17 @@ def pack_shared(program: Program) -> Program:
     return dataclasses.replace(moved_program, leaves=(*leaves, packed_leaf), packed=tuple(shared))
 
 
-def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
+def pack_rows(program: Program, select_rows: Callable[[list[int]], list[int]]) -> Program:
     """Store leaves of drones and worlds as rows of additional leaves, one for each scope and type.
 
     A row holds one number of all drones, in the order of a kernel's lanes.
 
     Args:
         program: The program.
-        select: Function from the written leaves to the leaves that become rows; random keys are never moved.
+        select_rows: Function from the written leaves to the leaves that become rows; random keys are never moved.
     """
     leaves = list(program.leaves)
-    row_leaves = [i for i in sorted(select(program.written_leaves)) if not is_key(leaves[i])]
+    row_leaves = [i for i in sorted(select_rows(program.written_leaves)) if not is_key(leaves[i])]
     # If a world has one drone, leaves of the world can be stored with the leaves of drones.
     row_types = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in row_leaves}
     positions: dict[int, tuple[int, int, int]] = {}
@@ -76,7 +76,7 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
 
 
 class PackedRows(NamedTuple):
-    """A leaf of rows, and the leaves whose numbers are its rows; arrays have the shapes of the program's leaves."""
+    """A leaf of rows. Its rows are the numbers of other leaves. Arrays have the shapes of the program's leaves."""
 
     program: Program
     """The program, after ``pack_rows``."""

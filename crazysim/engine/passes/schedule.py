@@ -27,7 +27,8 @@ from crazysim.engine.ir.program import Program, Segment, Slot, UnfusedStage
 def fuse(program: Program) -> Program:
     """Join neighbouring segments with the same phase and scope.
 
-    A number that one stage writes and the next reads then becomes a value, and common subexpressions are computed once.
+    A number that one stage writes and the next stage reads is then passed on as a value. Common subexpressions are
+    computed once.
     """
     segments: list[Segment | UnfusedStage] = []
     groups = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
@@ -62,8 +63,8 @@ def _join_segments(segments: list[Segment]) -> Segment:
 def join_ticks(program: Program) -> Program:
     """Join neighbouring stages that run at the same ticks.
 
-    A number that one stage writes and the next reads is then passed on without selecting between its old and its new
-    value, and a constant remains a constant.
+    A number that one stage writes and the next stage reads is then passed on without selecting between its old and its
+    new value. A constant remains a constant.
     """
     segments = [
         dataclasses.replace(s, block=_join_block_ticks(s.block)) if isinstance(s, Segment) else s
@@ -86,14 +87,14 @@ def _join_block_ticks(block: Block) -> Block:
 def _join_two_ticks(first: Operation, second: Operation) -> Operation:
     """Merge two ``when`` operations with the same condition."""
     builder = Builder(stage=first.stage)
-    new = inline(builder, first.blocks[0], {})
+    new_values = inline(builder, first.blocks[0], {})
     builder.barrier()
     builder.stage = second.stage
-    new += inline(builder, second.blocks[0], dict(zip(first.results, new, strict=True)))
-    before = dict(zip(first.results, first.args[1:], strict=True))
-    old = [before.get(x, x) if isinstance(x, Value) else x for x in second.args[1:]]
-    args, results = (*first.args, *old), (*first.results, *second.results)
-    return first._replace(args=args, results=results, blocks=(prune(builder.finish(new)),))
+    new_values += inline(builder, second.blocks[0], dict(zip(first.results, new_values, strict=True)))
+    old_by_result = dict(zip(first.results, first.args[1:], strict=True))
+    old_values = [old_by_result.get(x, x) if isinstance(x, Value) else x for x in second.args[1:]]
+    args, results = (*first.args, *old_values), (*first.results, *second.results)
+    return first._replace(args=args, results=results, blocks=(prune(builder.finish(new_values)),))
 
 
 BARRIER_INTERVAL = 40

@@ -24,7 +24,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 
 TOLERANCE = 1e-5
-"""Largest difference that counts as rounding, relative to the largest component of a drone's vector."""
+"""Largest difference that may be due to rounding, relative to the largest component of a drone's vector."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +38,12 @@ class Difference:
     index: tuple[int, ...]
     """Index of the element that differs most."""
     values: tuple[Any, Any]
-    """That element, from the first engine and from the second."""
+    """Values of that element, by the first engine and by the second engine."""
     engines: tuple[str, str]
     """Names of the engines."""
     operation: str = ""
-    """First operation of the stage whose result differs from that of the interpreter; empty if there is none, if
-    neither engine compiles programs, or if the stage is not fused."""
+    """First operation of the stage whose result differs from the interpreter's result. Empty if there is no such
+    operation, if neither engine compiles programs, or if the stage is not fused."""
 
     def __str__(self) -> str:
         (a, b), (x, y) = self.engines, self.values
@@ -61,14 +61,14 @@ def first_difference(
     """Return the first difference between two engines in one step, or None.
 
     Both engines run each stage on the data that the first engine computed so far, so a difference is due to that stage
-    alone. To find the operation, an engine that runs programs then runs the stage again and returns every value.
+    alone. To find the operation, an engine that compiles programs then runs the stage again and returns every value.
 
     Args:
         pipeline: Stages of a step.
         data: Data to begin from.
         engines: Two of ``ENGINES``.
-        tolerance: Largest difference that counts as rounding, relative to the largest component of a vector. NaN is
-            equal to NaN.
+        tolerance: Largest difference that is ignored, relative to the largest component of a vector. NaN is equal to
+            NaN.
     """
     from crazysim.engine.step import Step
 
@@ -76,7 +76,7 @@ def first_difference(
     for name, stage in pipeline.items():
         results = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
         for i, (x, y) in enumerate(zip(*map(jax.tree.leaves, results), strict=True)):
-            index = _largest_difference(x, y, tolerance)
+            index = _find_largest_difference(x, y, tolerance)
             if index is not None:
                 values = (np.asarray(x)[index], np.asarray(y)[index])
                 operation = _find_operation(pipeline[name], name, data, engines, tolerance)
@@ -85,7 +85,7 @@ def first_difference(
     return None
 
 
-def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
+def _find_largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
     """Return the index at which arrays differ most, or None if no difference exceeds the tolerance."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         x, y = jax.random.key_data(x), jax.random.key_data(y)
@@ -93,20 +93,20 @@ def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | N
     if x.dtype.kind != "f":
         difference = np.asarray(x != y, float)
     else:
-        finite = np.where(np.isfinite(x), np.abs(x), 0)
-        size = finite.max(axis=-1, keepdims=True) if x.ndim > 2 else finite
+        magnitude = np.where(np.isfinite(x), np.abs(x), 0)
+        scale = magnitude.max(axis=-1, keepdims=True) if x.ndim > 2 else magnitude
         with np.errstate(all="ignore"):
-            relative_error = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
-        is_equal = (x == y) | (np.isnan(x) & np.isnan(y))
-        difference = np.where(is_equal, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
-        difference = np.where(difference, np.where(np.isfinite(relative_error), relative_error, np.inf), 0.0)
+            relative_error = np.abs(x.astype(np.float64) - y) / np.maximum(scale, np.finfo(x.dtype).tiny)
+        relative_error = np.where(np.isnan(relative_error), np.inf, relative_error)
+        is_equal = (x == y) | (np.isnan(x) & np.isnan(y)) | (relative_error <= tolerance)
+        difference = np.where(is_equal, 0.0, relative_error)
     if not difference.any():
         return None
     return tuple(int(k) for k in np.unravel_index(int(difference.argmax()), difference.shape))
 
 
 def _find_operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
-    """Return the first operation of a stage whose result is not that of the interpreter; empty if there is none."""
+    """Return the first operation of a stage whose result differs from the interpreter's; empty if there is none."""
     program = fuse(lower_stages(as_stages({name: stage}), data))
     builders: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
     for engine in engines:
@@ -137,7 +137,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     (segment,) = exposed_program.fused_segments
     for op, (leaf, _) in zip(operations, segment.writes, strict=True):
         expected, actual = (np.asarray(result[leaf]) for result in results)
-        index = _largest_difference(expected, actual, tolerance)
+        index = _find_largest_difference(expected, actual, tolerance)
         if index is not None:
             numbers = f"{expected[index]} by 'interpret' and {actual[index]} by the engine"
             return f"{listing.list_operation(program, op)} ({numbers}, index {list(index)})"
@@ -147,7 +147,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
 def expose_values(program: Program) -> tuple[Program, list[Operation]]:
     """Return a program of one segment with a new leaf for every result in it, and the operations of these results.
 
-    Results inside blocks of operations are left out, because their block may not run.
+    Results inside the blocks of operations are left out, because a block may not run.
     """
     (segment,) = program.fused_segments
     operations = [op for op in segment.block.operations for _ in op.results]

@@ -14,7 +14,7 @@ from crazysim.engine.step import Step
 
 
 def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | None = None) -> str:
-    """Return a few lines about a step: its engine, the stages that are fused, and why the others are not.
+    """Return a few lines about a step: its engine, the stages that are fused, and why other stages are not.
 
     Args:
         step: The step.

@@ -1,7 +1,7 @@
 """CasADi expressions of a block: every value is an expression of single numbers.
 
-CasADi computes in float64, whatever types the program has. Integers are whole numbers in float64; of the arithmetic,
-only unsigned sums and differences wrap around. Numbers are assumed not to be NaN, so tests for NaN are false.
+CasADi computes in float64, whatever types the program has. Integers are whole numbers in float64. In arithmetic, only
+unsigned sums and differences wrap around. Numbers are assumed not to be NaN, so tests for NaN are false.
 """
 
 from __future__ import annotations
@@ -44,17 +44,15 @@ def step_expressions(segment: Segment, get_number: Callable[[Slot], Expression])
 
 
 def require_casadi(block: Block) -> None:
-    """Check that CasADi has a form for all operations of a block."""
-    refused = [(op.stage, reason) for op in block.walk() if (reason := _refusal(op)) is not None]
+    """Raise ``UnsupportedError`` unless CasADi has a form for all operations of a block."""
+    refused = [(op.stage, reason) for op in block.walk() if (reason := _refusal_reason(op)) is not None]
     if refused:
-        random_draws = [
-            (stage, reason) for stage, reason in refused if reason == RANDOM_REASON
-        ]  # the most informative reason
-        stage, reason = (random_draws or refused)[0]
+        random_draws = [(stage, reason) for stage, reason in refused if reason == RANDOM_REASON]
+        stage, reason = (random_draws or refused)[0]  # random numbers are the most informative reason
         raise UnsupportedError(reason, stage=stage)
 
 
-def _refusal(op: Operation) -> str | None:
+def _refusal_reason(op: Operation) -> str | None:
     match op.name:
         case "threefry2x32":
             return RANDOM_REASON
@@ -125,7 +123,7 @@ class _Interpreter:
         is_name = isinstance(form, str)
         result = getattr(self.casadi, form)(*args) if is_name else form(self.casadi, *args, **dict(op.params))
         if op.name == "div" and op.dtype.kind in "iu":
-            return [self._towards_zero(result)]
+            return [self._round_towards_zero(result)]
         return [self._wrap(result) if op.dtype.kind == "u" and op.name in ("add", "sub") else result]
 
     def _convert(self, op: Operation, x: Expression) -> Expression:
@@ -136,15 +134,15 @@ class _Interpreter:
             return x
         limits = np.iinfo(new_type)
         if old_type.kind == "f":
-            return self.casadi.fmin(self.casadi.fmax(self._towards_zero(x), limits.min), limits.max)
-        fits = np.iinfo(old_type).min >= limits.min and np.iinfo(old_type).max <= limits.max
-        return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * new_type.itemsize))
+            return self.casadi.fmin(self.casadi.fmax(self._round_towards_zero(x), limits.min), limits.max)
+        is_in_range = np.iinfo(old_type).min >= limits.min and np.iinfo(old_type).max <= limits.max
+        return x if is_in_range else self._wrap(x, float(limits.min), 2.0 ** (8 * new_type.itemsize))
 
     def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
         """Wrap a whole number around to the range from ``low`` to ``low + length - 1``, as integer types do."""
         return x - length * self.casadi.floor((x - low) / length)
 
-    def _towards_zero(self, x: Expression) -> Expression:
+    def _round_towards_zero(self, x: Expression) -> Expression:
         return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))
 
     def _guarded_sqrt(self, x: Expression) -> Expression:

@@ -1,5 +1,5 @@
-// A lane is a thread. Drones of a world that read each other's numbers are in one warp, or from 33 on in one block.
-// Of the threads of a warp or block, as many are lanes as make whole groups.
+// A lane is a thread. Drones of a world that read each other's numbers form a group. A group of up to 32 drones is in
+// one warp, a larger group in one block. The lanes of a warp or block are whole groups; the remaining threads are idle.
 #if GROUP <= 32
 #define THREADS 32
 #define LANES (32 / GROUP * GROUP)
@@ -22,40 +22,41 @@
 #endif
 #include "scalar.h"
 
-// A number as another one to the compiler: what is computed from it is computed again.
-#define OPAQUE_COPY(x) opaque_copy_(x, nothing)
-FN f32 opaque_copy_(f32 x, int nothing) { return bits_f32(bits_u32(x) | u32(nothing)); }
-FN f64 opaque_copy_(f64 x, int nothing) { return __longlong_as_double(__double_as_longlong(x) | (long long)nothing); }
+// A copy that the compiler takes for a different number, so that it repeats computations instead of keeping results.
+#define OPAQUE_COPY(x) opaque_copy_(x, opaque_zero)
+FN f32 opaque_copy_(f32 x, int opaque_zero) { return bits_f32(bits_u32(x) | u32(opaque_zero)); }
+FN f64 opaque_copy_(f64 x, int opaque_zero) { return __longlong_as_double(__double_as_longlong(x) | (long long)opaque_zero); }
 
 FN b1 any(b1 x) { return x; }
-FN b1 any_lane(b1 x) { return x; }  // threads go their own ways
+FN b1 any_lane(b1 x) { return x; }  // threads may take different branches
 FN f32 f32_lanes(f32 x) { return x; }
 FN f64 f64_lanes(f64 x) { return x; }
 FN i32 i32_lanes(i32 x) { return x; }
 FN u32 u32_lanes(u32 x) { return x; }
 FN b1 b1_lanes(b1 x) { return x; }
 
-// A number of the drone with number d of the same world.
-template <class T> FN T of_drone(T x, int d) { return GROUP == 1 ? x : __shfl_sync(0xffffffffu, x, threadIdx.x % 32 / GROUP * GROUP + d); }
-FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
+// A number of drone d of the same world.
+template <class T> FN T read_drone(T x, int d) { return GROUP == 1 ? x : __shfl_sync(0xffffffffu, x, threadIdx.x % 32 / GROUP * GROUP + d); }
+FN b1 read_drone(b1 x, int d) { return read_drone(i32(x), d) != 0; }
 
-// A read of what all lanes share, where it is used. The compiler moves it out of the loop of steps, but out of no branch;
-// a load that it knows it would move out of both, and keep in a register.
+// Read a number that all lanes share, where it is used. The compiler moves this assembly out of the loop over steps, but
+// not out of branches. It would move an ordinary load out of both, and keep the number in a register.
 #define SHARED(p, k) read(p + k)
 #define READ(T, type, to) FN T read(const T* p) { T x; asm("ld.global.nc." type " %0, [%1];" : to(x) : "l"(p)); return x; }
 READ(f32, "f32", "=f") READ(f64, "f64", "=d") READ(i32, "s32", "=r") READ(u32, "u32", "=r")
 FN b1 read(const b1* p) { return *p; }
 
 #define ROWS(T, SIZE, DRONES, p)
-#define RESULT(T, SIZE, p)
-#define PUT(SIZE, DRONES, p)
+#define DECLARE_RESULT(T, SIZE, p)
+#define STORE_RESULT(SIZE, DRONES, p)
 #define LOAD(SIZE, DRONES, p, k) p[lane / DRONES * SIZE + k]
-#define STORE(SIZE, DRONES, p, k, value) if (active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;
+#define STORE(SIZE, DRONES, p, k, value) if (is_active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;
 #define LANE lane
 // A row of numbers, one for each lane.
 #define LOAD_ROW(p, k) p[size_t(k) * n_lanes + lane]
-#define STORE_ROW(p, k, value) if (active) p[size_t(k) * n_lanes + lane] = value;
-// Tables: constants, and the entry of one at index + k; where that is a multiple of four, also that and the next three.
+#define STORE_ROW(p, k, value) if (is_active) p[size_t(k) * n_lanes + lane] = value;
+// Tables of constants. lookup returns the entry at index + k; lookup_four returns that entry and the next three, and
+// index + k must be a multiple of four.
 #define TABLE static __device__ const __align__(16)
 struct four { f32 x[4]; };
 template <class T> FN T lookup(const T* p, i32 index, i32 k) { return (p + index)[k]; }

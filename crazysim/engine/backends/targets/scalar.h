@@ -1,4 +1,4 @@
-// What the operations of a program mean for single numbers, on the GPU and on the host.
+// The operations of a program for single numbers, on the GPU and on the host.
 // FN marks a function that both a GPU and a host compiler inline.
 
 typedef float f32;
@@ -41,7 +41,7 @@ FN b1 is_finite_(f64 x) { return fabs(x) < f64_infinity(); }
 
 FN void sin_cos(f64 x, f64& s, f64& c) { s = sin(x); c = cos(x); }
 
-// Reduction by pi/2 in three parts (Cody and Waite), from 8192 rad on in float64, then the polynomials of
+// Reduction by pi/2 in three parts (Cody and Waite), in float64 for angles from 8192 rad on. Then the polynomials of
 // S. L. Moshier's Cephes library.
 FN void sin_cos(f32 x, f32& s, f32& c) {
   i32 quarter;
@@ -70,7 +70,7 @@ FN void sin_cos(f32 x, f32& s, f32& c) {
   c = (quarter + 1) & 2 ? -cosine : cosine;
 }
 
-// M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2010); one Newton step more for float64.
+// M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2010); followed by Newton steps in float64.
 FN f32 erf_inv_(f32 x) {
   f32 w = -log1pf(-x * x), p;
   if (w < 5.0f) {
@@ -89,14 +89,14 @@ FN f32 erf_inv_(f32 x) {
 FN f64 erf_inv_(f64 x) {
   const f64 size = fabs(x);
   f64 y = fabs(f64(erf_inv_(f32(x))));
-  if (size < 1.0 && !(y < 6.0)) y = 5.0;  // so near to one that float32 takes it for one
+  if (size < 1.0 && !(y < 6.0)) y = 5.0;  // float32 rounds x to one
   for (int k = 0; k < 4 && size < 1.0; ++k) y -= ((1.0 - size) - erfc(y)) * 0.88622692545275801365 * exp(y * y);
   return x < 0 ? -y : x > 0 ? y : x;
 }
 
-// NIST Digital Library of Mathematical Functions, https://dlmf.nist.gov/5: 5.5.4 reflects, 5.5.2 steps up, and beyond
-// 10 the asymptotic series 5.11.2 is exact to float64. Its coefficients are B(2k) / 2k with the Bernoulli numbers B;
-// Wikipedia, "Digamma function", has the first seven written out.
+// NIST Digital Library of Mathematical Functions, https://dlmf.nist.gov/5: reflection (5.5.4), recurrence (5.5.2), and
+// from 10 on the asymptotic series 5.11.2, which is exact to float64. Its coefficients are B(2k) / 2k with the Bernoulli
+// numbers B; Wikipedia, "Digamma function", lists the first seven.
 FN f64 digamma_(f64 x) {
   f64 y = 0.0;
   if (x <= 0.0) {
@@ -111,7 +111,7 @@ FN f64 digamma_(f64 x) {
 }
 FN f32 digamma_(f32 x) { return f32(digamma_(f64(x))); }
 
-#define ARITHMETIC(T, S) /* S is T without a sign: sums of integers with one must not overflow in C */ \
+#define ARITHMETIC(T, S) /* S is T, or the unsigned type of signed integers, which must not overflow in C */ \
   FN T add_(T a, T b) { return T(S(a) + S(b)); } FN T sub_(T a, T b) { return T(S(a) - S(b)); } \
   FN T mul_(T a, T b) { return T(S(a) * S(b)); }
 ARITHMETIC(f32, f32) ARITHMETIC(f64, f64) ARITHMETIC(i32, u32) ARITHMETIC(u32, u32)
@@ -119,7 +119,7 @@ ARITHMETIC(f32, f32) ARITHMETIC(f64, f64) ARITHMETIC(i32, u32) ARITHMETIC(u32, u
   FN b1 lt_(T a, T b) { return a < b; } FN b1 le_(T a, T b) { return a <= b; } FN b1 gt_(T a, T b) { return a > b; } \
   FN b1 ge_(T a, T b) { return a >= b; } FN b1 eq_(T a, T b) { return a == b; } FN b1 ne_(T a, T b) { return a != b; } \
   FN T select_n_(b1 which, T no, T yes) { return which ? yes : no; }
-#define LIMITS(T) /* NaN comes through */ \
+#define LIMITS(T) /* NaN is propagated */ \
   FN T at_least(T x, T low) { return x < low ? low : x; } FN T at_most(T x, T high) { return x > high ? high : x; } \
   FN T max_(T a, T b) { return (a > b || a != a) ? a : b; } FN T min_(T a, T b) { return (a < b || a != a) ? a : b; }
 #ifdef F32_LIMITS
@@ -173,7 +173,7 @@ FN u32 shift_right_arithmetic_(u32 a, u32 b) { return u32(shift_right_arithmetic
 CONVERT(f32) CONVERT(f64) CONVERT(i32) CONVERT(u32) CONVERT(b1)
 #define TO_INTEGER(T) FN i32 to_i32(T x) { return i32(x); } FN u32 to_u32(T x) { return u32(x); }
 TO_INTEGER(i32) TO_INTEGER(u32) TO_INTEGER(b1)
-// From floating point: the nearest there is, and zero for NaN, as XLA has it.
+// Floats become the nearest representable integer, and NaN becomes zero, as in XLA.
 FN i32 to_i32(f64 x) { return x != x ? 0 : x >= 2147483647.0 ? 2147483647 : x <= -2147483648.0 ? -2147483647 - 1 : i32(x); }
 FN u32 to_u32(f64 x) { return x != x ? 0u : x >= 4294967295.0 ? 0xffffffffu : x <= 0.0 ? 0u : u32(x); }
 FN i32 to_i32(f32 x) { return x != x ? 0 : x >= 2147483648.0f ? 2147483647 : x <= -2147483648.0f ? -2147483647 - 1 : i32(x); }
