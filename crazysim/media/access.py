@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from crazysim.errors import RenderError
 
 WILDCARD_ADDRESSES = ("0.0.0.0", "::")
-"""Addresses that stand for listening on all networks."""
+"""Addresses at which a server listens on all networks."""
 LOOPBACK_ADDRESSES = ("127.0.0.1", "localhost", "::1")
 """Addresses that other machines cannot reach."""
 
@@ -26,9 +26,9 @@ log = logging.getLogger(__name__)
 class Access:
     """Address of a live page, and the check of its requests.
 
-    A page of another site can send requests to this machine. They carry the name of that site as ``Origin`` or, if the
-    name is made to resolve to this machine (DNS rebinding), as ``Host``. Both are refused, as are requests without the
-    token.
+    A page of another site can send requests to this machine. Such a request has the name of that site in ``Origin``, or
+    in ``Host`` if the name was made to resolve to this machine (DNS rebinding). It is refused in both cases. Requests
+    without the token are refused too.
     """
 
     def __init__(self, host: str, port: int):

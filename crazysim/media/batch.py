@@ -30,9 +30,9 @@ def render_worlds(
 ) -> NDArray:
     """Return an image of each of several worlds. (n, height, width, 3), uint8
 
-    On a GPU, where ``warp-lang`` is installed, MuJoCo Warp ray-traces a camera of the scene in all worlds at once.
+    On a GPU, if ``warp-lang`` is installed, MuJoCo Warp ray-traces a camera of the scene in all worlds at once.
     Otherwise MuJoCo's renderer draws one world after the other. A call with the same camera, size and number of worlds
-    as the last needs no preparation.
+    as the last call needs no preparation.
 
     Args:
         sim: Simulation.
@@ -41,8 +41,8 @@ def render_worlds(
         cam_config: Settings of the free camera.
         width: Width of each image, pixels.
         height: Height of each image, pixels.
-        renderer: ``"warp"``, without overlays and free camera, ``"plain"``, or ``"auto"`` for the faster one that can
-            draw everything.
+        renderer: ``"warp"``, which draws neither overlays nor the free camera; ``"plain"``; or ``"auto"`` for the
+            faster renderer that can draw everything.
 
     Raises:
         ImportError: If ``renderer="warp"`` and MuJoCo Warp is not installed.

@@ -71,9 +71,8 @@ class Film:
         """
         self.path, self.view = Path(path), View() if view is None else view
         check_writable(self.path, tuple(ENCODERS))
-        self._absolute_path = (
-            self.path.absolute()
-        )  # the working directory may change; ffmpeg would take -y.mp4 for an option
+        # The working directory may change, and ffmpeg would take the relative path -y.mp4 for an option.
+        self._absolute_path = self.path.absolute()
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
@@ -109,7 +108,7 @@ class Film:
         """Add all frames of a recorded flight, and return their number.
 
         Args:
-            sim: Simulation like the one that was recorded; its data are restored afterwards.
+            sim: Simulation like the recorded one; its data is restored afterwards.
             flight: Flight.
 
         Raises:
@@ -188,23 +187,10 @@ class Film:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
             raise ImportError(not_installed("films need", "imageio-ffmpeg", "demo")) from error
-        input_options = [
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "rgb24",
-            "-s",
-            f"{width}x{height}",
-            "-r",
-            f"{self.fps:g}",
-            "-i",
-            "-",
-        ]
-        encoder_options = [
-            *ENCODERS[self.path.suffix.lower()],
-            "-g",
-            f"{math.ceil(self.fps)}",
-        ]  # a key frame every second
+        input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}"]
+        input_options += ["-i", "-"]
+        key_frame_options = ["-g", f"{math.ceil(self.fps)}"]  # a key frame every second
+        encoder_options = [*ENCODERS[self.path.suffix.lower()], *key_frame_options]
         output = str(unfinished_path(self._absolute_path))
         format_options = ["-f", self.path.suffix[1:].lower()]
         return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder_options, *format_options, "-y", output]

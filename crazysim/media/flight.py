@@ -88,7 +88,7 @@ class Flight:
         """Write the flight to a compressed ``.npz`` file.
 
         Raises:
-            ConfigError: If the name has another suffix, or the file cannot be written, in which case no file is left.
+            ConfigError: If the name has another suffix, or the file cannot be written. No file is left then.
         """
         path = Path(path)
         if path.suffix != ".npz":
@@ -104,7 +104,7 @@ class Flight:
 
         Raises:
             ConfigError: If the file does not exist, or is of another format.
-            DamagedFileError: If it is damaged or not a recorded flight.
+            DamagedFileError: If the file is damaged or not a recorded flight.
         """
         path = Path(path)
         with wrap_read_errors(path, "a recorded flight", "Save it again, or use another copy."):
@@ -133,9 +133,9 @@ def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
 
 def _read_shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
     """Return the geoms in the arrays of a file."""
-    n = arrays["shape_n"]
-    vertices = np.split(arrays["shape_vertices"], np.cumsum(n[:, 0])[:-1]) if len(n) else []
-    faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(n[:, 1])[:-1]) if len(n) else []
+    counts = arrays["shape_n"]
+    vertices = np.split(arrays["shape_vertices"], np.cumsum(counts[:, 0])[:-1]) if len(counts) else []
+    faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(counts[:, 1])[:-1]) if len(counts) else []
     return [
         VisualGeom(
             kind=GEOM_KINDS[kind],
@@ -161,7 +161,7 @@ def pack_scene(scene: dict[str, Any]) -> bytes:
 
 
 def pack_sample(sample: dict[str, Any]) -> bytes:
-    """Return a sample as a chunk of a journal: float64, ordered as ``SAMPLE_FIELDS``, with sizes from the scene."""
+    """Return a sample as a chunk of a journal: the numbers of ``SAMPLE_FIELDS`` in order, float64."""
     return np.concatenate([np.ravel(sample[name]) for name in SAMPLE_FIELDS]).astype("<f8").tobytes()
 
 

@@ -1,4 +1,4 @@
-"""Recording of a simulation, and replay of a recorded flight in one."""
+"""Recording of a simulation, and replay of a recorded flight in a simulation."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Recorder:
             recorder.add()
         recorder.flight().save("flight.npz")
 
-    With a path, each sample is appended to that file as it is added, and none is kept in memory. If the process
+    With a path, each sample is appended to that file as it is added, and no sample stays in memory. If the process
     crashes, ``Flight.load`` returns the flight up to the last sample.
     """
 
@@ -168,7 +168,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     and records of plugins are unchanged. To continue a simulation, keep ``data = sim.data`` and restore it.
 
     Args:
-        sim: Simulation with the drones, worlds and bodies of the one that was recorded.
+        sim: Simulation with the drones, worlds and bodies of the recorded simulation.
         flight: Flight.
         time: Time of the flight, s.
     """
@@ -206,16 +206,15 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     data = data.replace(states=states, core=core, objects=objects)
     if "setpoint" in updated:
         command, (_, *feedforward_leaves) = updated["setpoint"], staged_leaves(data)
-        feedforward = [
-            x.at[worlds].set(default_feedforward(command)[worlds]) for x in feedforward_leaves
-        ]  # other worlds keep theirs
+        # Other worlds keep their feedforward.
+        feedforward = [x.at[worlds].set(default_feedforward(command)[worlds]) for x in feedforward_leaves]
         data = stage_command(data, command, *feedforward)
     sim.data = data
     body_pos, body_quat = _body_poses(sim, worlds)
     if not (
         np.allclose(body_pos, poses["body_pos"], atol=1e-6) and np.allclose(body_quat, poses["body_quat"], atol=1e-6)
     ):
-        ids = np.ix_(worlds, _body_ids(sim))  # some are moved through mjx_data
+        ids = np.ix_(worlds, _body_ids(sim))  # some bodies were moved through mjx_data
         sim.mjx_data = sim.mjx_data.replace(
             mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(poses["body_pos"]),
             mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(poses["body_quat"], 1, axis=-1)),
@@ -224,7 +223,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
 
 @jax.jit
 def _replace_in_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
-    """Return arrays with new values in some worlds. Where their last axis is shorter, its first entries are set."""
+    """Return arrays with new values in some worlds. Where their last axis is shorter, the rest stays."""
     return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
 

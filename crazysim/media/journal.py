@@ -1,9 +1,9 @@
 """Journals: files to which chunks are appended one by one, and which stay readable after a crash.
 
-A file consists of the line ``crazysim journal 1`` and chunks: kind (4 bytes), length of the content (8 bytes, little
-endian), CRC-32 of kind and content (4 bytes, little endian), content. Each chunk is handed to the operating system in
-one write, so that nothing that was appended is lost if the process ends, even by SIGKILL. If a chunk is cut off, by a
-full disk or a loss of power, readers warn and stop before it.
+A file consists of the line ``crazysim journal 1`` and chunks. A chunk consists of its kind (4 bytes), the length of the
+content (8 bytes, little endian), the CRC-32 of kind and content (4 bytes, little endian), and the content. Each chunk
+is passed to the operating system in one write, so appended chunks are not lost if the process ends, even by SIGKILL. If
+a chunk is cut off, by a full disk or a loss of power, readers warn and stop before it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Journal(Closeable):
             replace: True to replace an existing file.
 
         Raises:
-            ConfigError: If it exists and is not to be replaced, or cannot be created.
+            ConfigError: If the file exists and ``replace`` is False, or if it cannot be created.
         """
         self.path = Path(path)
         existing_file_flag = os.O_TRUNC if replace else os.O_EXCL
@@ -71,7 +71,7 @@ class Journal(Closeable):
             content: Content.
 
         Raises:
-            OSError: If it cannot be written, for example because the disk is full.
+            OSError: If the chunk cannot be written, for example because the disk is full.
         """
         if len(kind) != 4:
             raise ConfigError(f"expected a kind of 4 bytes, got {kind!r}")
@@ -95,7 +95,7 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
 
     Raises:
         ValueError: If the file is not a journal.
-        OSError: If it cannot be read.
+        OSError: If the file cannot be read.
     """
     with open(path, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:

@@ -20,15 +20,14 @@ layout has moved below it."""
 MARGIN = 1.0
 """Width of the margin around obstacles and paths, m."""
 MIN_WIDTH, MAX_WIDTH = 6.0, 24.0
-"""Smallest and largest width of a map, m. Where a map is too small for the area, it moves along with the first
-drone."""
+"""Smallest and largest width of a map, m. If the area is larger than the map, the map follows the first drone."""
 MIN_PIXELS = 8
 """Smallest width and height of a map, pixels."""
 SAMPLES = 2
 """Number of samples along each side of a pixel."""
 EYE_HEIGHT = 1e4
-"""Height from which rays are cast, m. They deviate from the vertical by at most 3 mm for each metre of height, unless a
-view is higher than wide."""
+"""Height from which rays are cast, m. Rays deviate from the vertical by at most 3 mm for each metre of height, unless a
+map is higher than wide."""
 PATH_SECONDS = 1e6
 """Largest duration of a path, s."""
 MAX_COORDINATE = 1e5
@@ -39,9 +38,9 @@ class Grid(NamedTuple):
     """Samples of a part of the horizontal plane, in columns along x and rows against y."""
 
     start: NDArray
-    """Numbers of the first column and the first row; those at the origin of the world have the number 0. (2,)"""
+    """Indices of the first column and the first row. Column 0 and row 0 are at the origin of the world. (2,)"""
     size: NDArray
-    """Numbers of columns and rows. (2,)"""
+    """Number of columns and number of rows. (2,)"""
     scale: float
     """Distance between samples, m."""
 
@@ -89,8 +88,8 @@ class TopView:
         dot_radius = SAMPLES * max(height / 40, 2.0)
         for drone, color in enumerate(choose_drone_colors(sim.n_drones, rgba)):
             pixels, rgb = grid.locate(path[:, drone]), 255 * color[:3]
-            ahead = data.xmat[drones[drone]].reshape(3, 3)[:2, 0] * [1, -1]
-            nose = pixels[-1] + 3 * dot_radius * ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+            heading = data.xmat[drones[drone]].reshape(3, 3)[:2, 0] * [1, -1]
+            nose = pixels[-1] + 3 * dot_radius * heading / max(float(np.linalg.norm(heading)), 1e-6)
             _draw_line(canvas, pixels, 0.4 * dot_radius, rgb)
             _draw_line(canvas, np.stack([pixels[-1], nose]), 0.4 * dot_radius, OUTLINE_COLOR)
             _draw_line(canvas, pixels[-1:], 1.4 * dot_radius, OUTLINE_COLOR)
@@ -100,7 +99,7 @@ class TopView:
     def _find_obstacles(
         self, model: mujoco.MjModel, data: mujoco.MjData, k: int, is_obstacle: NDArray, grid: Grid
     ) -> NDArray:
-        """Return which samples show obstacles. (size[1], size[0])
+        """Return True for samples that show obstacles. (size[1], size[0])
 
         Rays are cast over an area of twice the size. The result is reused until the map leaves the area or an obstacle
         moves.
@@ -125,7 +124,15 @@ def _geom_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[NDArray, N
 
 
 def _choose_grid(low: NDArray, high: NDArray, pos: NDArray, width: int, height: int) -> Grid:
-    """Return the grid of a map of ``width`` x ``height`` pixels that shows an area, or its part around a point. (2,)"""
+    """Return the grid of a map of an area, or of the part of the area around ``pos`` if the area is too large.
+
+    Args:
+        low: Smallest coordinates of the area, m. (2,)
+        high: Largest coordinates of the area, m. (2,)
+        pos: Point that the map shows, m. (2,)
+        width: Width of the map, pixels.
+        height: Height of the map, pixels.
+    """
     size = SAMPLES * np.array([width, height])
     scale = float(np.clip(((high - low) / size).max(), MIN_WIDTH / size[0], MAX_WIDTH / size[0]))
     middle, slack = (low + high) / 2, np.maximum((high - low - scale * size) / 2, 0.0)
@@ -134,7 +141,7 @@ def _choose_grid(low: NDArray, high: NDArray, pos: NDArray, width: int, height: 
 
 
 def _cast_rays(model: mujoco.MjModel, data: mujoco.MjData, is_obstacle: NDArray, grid: Grid) -> NDArray:
-    """Return where rays from above meet obstacles. (size[1], size[0])"""
+    """Return True for samples at which rays from above meet obstacles. (size[1], size[0])"""
     n_rays, pos = int(grid.size.prod()), data.geom_xpos.copy()
     x, y = (grid.scale * (np.arange(n) + 0.5 - n / 2) for n in grid.size)
     rays = np.stack(np.broadcast_arrays(x, -y[:, None], -EYE_HEIGHT), axis=-1).ravel()
@@ -147,15 +154,22 @@ def _cast_rays(model: mujoco.MjModel, data: mujoco.MjData, is_obstacle: NDArray,
 
 
 def _draw_line(canvas: NDArray, points: NDArray, radius: float, rgb: ArrayLike) -> None:
-    """Draw a line through points, columns and rows (n, 2), with round ends; a disc for a single point."""
+    """Draw a line with round ends through points; a single point is a disc.
+
+    Args:
+        canvas: Image, changed in place. (height, width, 3)
+        points: Columns and rows. (n, 2)
+        radius: Half the width of the line, samples.
+        rgb: Colour, 0 to 255.
+    """
     points = np.clip(points[np.isfinite(points).all(-1)], -np.max(canvas.shape), 2 * np.max(canvas.shape))
     if not len(points):
         return
     length = np.append(0.0, np.linalg.norm(np.diff(points, axis=0), axis=-1).cumsum())
     steps = np.linspace(0.0, length[-1], int(2 * length[-1]) + 1)
-    dense = np.stack([np.interp(steps, length, x) for x in points.T], axis=-1)
+    line_points = np.stack([np.interp(steps, length, x) for x in points.T], axis=-1)
     offsets = np.arange(-int(radius), int(radius) + 1)
     disc = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    samples = np.floor(dense[:, None]).astype(int) + disc[np.linalg.norm(disc, axis=-1) <= radius]
+    samples = np.floor(line_points[:, None]).astype(int) + disc[np.linalg.norm(disc, axis=-1) <= radius]
     columns, rows = samples[((samples >= 0) & (samples < canvas.shape[1::-1])).all(-1)].T
     canvas[rows, columns] = rgb

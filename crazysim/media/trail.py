@@ -18,7 +18,7 @@ MIN_ALPHA = 0.15
 
 
 def choose_drone_colors(n_drones: int, rgba: ArrayLike | None) -> NDArray:
-    """Return a colour for each drone: the given one, or one of ``COLORS`` if it is None. (n_drones, 4)"""
+    """Return a colour for each drone: ``rgba``, or the colours ``COLORS`` if it is None. (n_drones, 4)"""
     if rgba is None:
         return COLORS[np.arange(n_drones) % len(COLORS)]
     return np.broadcast_to(as_rgba(rgba, n_drones), (n_drones, 4))
@@ -46,7 +46,7 @@ class Trail:
         return len(self._samples)
 
     def add(self, time: ArrayLike, pos: ArrayLike) -> None:
-        """Add a sample; a second one at the same time replaces the first.
+        """Add a sample. A second sample at the same time replaces the first.
 
         Args:
             time: Time of each world, s. (n_worlds,)
@@ -66,8 +66,8 @@ class Trail:
         while all(self._has_expired(self._samples[0][0], times)):
             self._samples.popleft()
 
-    def _has_expired(self, point_time: NDArray, time: NDArray) -> NDArray:
-        return (point_time < time - self.seconds - 1e-6) | (point_time > time)
+    def _has_expired(self, sample_time: NDArray, time: NDArray) -> NDArray:
+        return (sample_time < time - self.seconds - 1e-6) | (sample_time > time)
 
     def path(self, world: int) -> NDArray:
         """Return the positions of the drones of a world, oldest first, m. (n, n_drones, 3)

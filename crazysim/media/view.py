@@ -48,30 +48,30 @@ class View:
     cam_config: Mapping[str, Any] | Callable[[float], Mapping[str, Any]] | None = None
     """Settings of the free camera, or a function from time, s, to settings for a moving camera."""
     follow: int | None = None
-    """Index of the drone that the free camera looks at; None for none."""
+    """Index of the drone that the free camera looks at, or None."""
     hold: Callable[[Sim, int], ArrayLike] | None = None
-    """Function that returns points of a world, ``hold(sim, world)``, world frame, m (n, 3): the free camera holds them
-    and all drones in view, from a distance that fits; None for none."""
+    """Function that returns points of a world, ``hold(sim, world)``, world frame, m (n, 3), or None. The free camera
+    holds these points and all drones in view, from a distance that fits."""
     lag: float = setting(default=0.3, low=0.0)
     """Time constant with which the camera follows the bodies of ``follow`` or ``hold``, s."""
     trail: float = setting(default=0.0, low=0.0)
-    """Duration of the drones' trails, s; 0 for none."""
+    """Duration of the drones' trails, s; 0 for no trails."""
     setpoints: bool = False
     """True to draw the positions of state commands, as spheres."""
     rgba: ArrayLike | None = color(per_item=True)
     """Colour of trails, setpoints and drones on maps, one or one per drone; None for default colours."""
     text: str | None = None
-    """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for none."""
+    """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for no text."""
     draw: Callable[[Sim, int], None] | None = None
-    """Function that draws further overlays of a world, ``draw(sim, world)``; None for none."""
+    """Function that draws further overlays of a world, ``draw(sim, world)``, or None."""
     inset: Callable[[Sim, int], NDArray | None] | None = None
-    """Function that returns a small picture of a world, ``inset(sim, world)``, uint8, (height, width, 3), which is
-    drawn enlarged at the bottom right of that world; None for none."""
+    """Function that returns a small picture of a world, ``inset(sim, world)``, uint8, (height, width, 3), or None. The
+    picture is drawn enlarged at the bottom right of that world."""
     top_view: bool = False
     """True to draw a map from above at the bottom left of each world that has obstacles, with the drones' paths since
     the last reset."""
     columns: int | None = None
-    """Worlds per row; None for about as many as there are rows."""
+    """Worlds per row; None for a grid with about as many columns as rows."""
     border: int = setting(default=2, low=0)
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
@@ -170,7 +170,7 @@ class View:
         )
 
     def _read_worlds(self, sim: Sim) -> tuple[NDArray, NDArray]:
-        """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""
+        """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds; add them to the trails."""
         worlds = world_indices(sim, self.worlds)
         if self.follow is not None and self.follow not in range(sim.n_drones):
             raise ConfigError(f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}")
@@ -215,7 +215,7 @@ class View:
         return config
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
-        """Return where the camera of the k-th world aims, with first-order lag; after a reset it jumps."""
+        """Return the aim of the camera of the k-th world: ``aim`` with first-order lag, or without lag after a reset."""
         last_time, value = self._aim.get(k, (np.inf, aim))
         weight = 1.0 if time < last_time or self.lag == 0 else 1 - np.exp(-(time - last_time) / self.lag)
         if np.isfinite(aim).all():
@@ -245,10 +245,10 @@ def _draw_top_view(tile: NDArray, picture: NDArray | None) -> None:
 
 
 def _frame_points(points: NDArray, fovy: float) -> NDArray:
-    """Return the middle of points, m, and the distance from which all are in view, m. (n, 3) -> (4,)
+    """Return the middle of points and the distance from which all points are in view, m. (4,)
 
     Args:
-        points: Points, m; points that are not finite are left out.
+        points: Points, m; points that are not finite are left out. (n, 3)
         fovy: Vertical field of view, degrees; images are at least as wide as high.
     """
     points = points[np.isfinite(points).all(-1)]

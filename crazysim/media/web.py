@@ -22,7 +22,7 @@ from crazysim.storage import check_writable, write_file
 
 FPS = 30
 """Samples per second of a page."""
-PLANE_SIZE = 20.0
+PLANE_HALF_SIZE = 20.0
 """Half size of infinite planes, m."""
 LIGHT_RADIUS = 0.03
 """Radius of a light, m."""
@@ -37,7 +37,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
 
     Args:
         flight: Flight.
-        world: Index of the world in the simulation; None for the first that was recorded.
+        world: Index of the world in the simulation; None for the first recorded world.
         lights: Colour of the light on each drone at each of the flight's times, 0 to 1; None for no lights.
             (n, n_drones, 3)
 
@@ -49,9 +49,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
     if lights is not None and np.shape(lights) != shape:
         raise ConfigError(f"expected lights of shape {shape} = (n, n_drones, 3), got {np.shape(lights)}")
     viser = import_viser()
-    with contextlib.redirect_stdout(
-        io.StringIO()
-    ):  # viser prints the address of its server, which runs for this call only
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints the address of this temporary server
         server = start_guarded_server(viser, Access("127.0.0.1", free_port()))
         try:
             return _record_scene(server, flight, k, lights).as_html()
@@ -80,7 +78,7 @@ def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.
         host: Address to listen at; ``0.0.0.0`` for every network.
 
     Raises:
-        RenderError: If it cannot listen there.
+        RenderError: If the server cannot listen at the address.
     """
     content = html.encode()
 
@@ -106,7 +104,10 @@ def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.
 
 
 def initial_camera_pose(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
-    """Return the initial position of a page's camera and the point it looks at, for a whole flight, m. (3,), (3,)"""
+    """Return the initial position of a page's camera, and the point that it looks at, m. (3,), (3,)
+
+    The camera shows the whole flight of the k-th world.
+    """
     points = flight.pos[:, k].reshape(-1, 3)
     points = points[np.isfinite(points).all(-1)]
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
@@ -119,7 +120,7 @@ def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str 
 
     Raises:
         ImportError: If viser is not installed.
-        RenderError: If it cannot listen there.
+        RenderError: If the server cannot listen at the address.
     """
     serve_page(page(flight, world), port, host)
 
@@ -128,7 +129,7 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
     """Serve a page of a flight at a port until interrupted.
 
     Raises:
-        RenderError: If it cannot listen there.
+        RenderError: If the server cannot listen at the address.
     """
     with create_server(html, port, host) as server:
         print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
@@ -214,11 +215,11 @@ def add_geoms(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> N
     """Add the geoms of one body and colour to a viser scene: each plane as a grid, all other geoms as one mesh."""
     solid_shapes = [shape for shape in shapes if shape.kind != "plane"]
     for i, shape in enumerate(shape for shape in shapes if shape.kind == "plane"):
-        width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
+        width, height = (2 * PLANE_HALF_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
         scene.add_grid(
             f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=rgb(rgba, 0.9), section_size=5.0,
             section_color=rgb(rgba, 0.8), plane_color=rgb(rgba), plane_opacity=float(rgba[3]),
-            infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_SIZE,
+            infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_HALF_SIZE,
             position=shape.pos, wxyz=np.roll(shape.quat, 1),
         )  # fmt: skip
     if solid_shapes:
@@ -273,10 +274,10 @@ def rgb(rgba: Any, brightness: float = 1.0) -> tuple[int, int, int]:
 
 
 def import_viser() -> Any:
-    """Return viser.
+    """Return the module ``viser``.
 
     Raises:
-        ImportError: If it is not installed.
+        ImportError: If viser is not installed.
     """
     try:
         import viser

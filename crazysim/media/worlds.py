@@ -12,7 +12,7 @@ from crazysim.sim.sim import Sim
 
 
 def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
-    """Return indices of worlds, checked. (n,)
+    """Return indices of worlds, after a check that they exist. (n,)
 
     Args:
         sim: Simulation.
@@ -27,6 +27,6 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
 
 
 def require_world(sim: Sim, world: int) -> None:
-    """Check that a world exists."""
+    """Raise ``ConfigError`` unless a world exists."""
     if world not in range(sim.n_worlds):
         raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world!r}")

@@ -16,10 +16,10 @@ from crazysim.engine.ir.program import Program, Segment, Slot
 
 
 def prepare_derivative(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
-    """Return a program without its check, and the perturbed leaves, without leaves that are unused or not floats.
+    """Return a program without its check, and the perturbed leaves that it uses and that are floats.
 
     Raises:
-        UnsupportedError: If it has no derivative in a kernel.
+        UnsupportedError: If the program has no derivative in a kernel.
     """
     if not program.fused:
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
@@ -36,12 +36,14 @@ def prepare_derivative(program: Program, perturbed: Collection[int]) -> tuple[Pr
 def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
     """Return the numbers that depend differentiably on the perturbed leaves.
 
-    Also return, by segment, the indices of the outputs of its hoisted block that do.
+    Returns:
+        The slots of these numbers, and for each segment of the steps the indices of the outputs of its hoisted block
+        that depend on the perturbed leaves.
     """
     changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
 
-    def active_outputs(block: Block, slots: Sequence[Slot], active_constants: Sequence[int] = ()) -> list[int]:
+    def find_active_outputs(block: Block, slots: Sequence[Slot], active_constants: Sequence[int] = ()) -> list[int]:
         active_inputs = [
             x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"
         ]
@@ -52,13 +54,13 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     def propagate(s: Segment) -> None:
         written_slots = program.drone_slots(s, s.writes)
         reads = program.drone_slots(s, s.reads)
-        changed.update(written_slots[k] for k in active_outputs(s.block, reads, constants.get(s, ())))
+        changed.update(written_slots[k] for k in find_active_outputs(s.block, reads, constants.get(s, ())))
 
     for s in program.phase_segments("before"):
         propagate(s)
     for s in program.phase_segments("each"):
-        constants[s] = tuple(active_outputs(s.hoisted, s.hoisted_reads))
-    while True:  # numbers that depend on the leaves after one step may affect others in the next
+        constants[s] = tuple(find_active_outputs(s.hoisted, s.hoisted_reads))
+    while True:  # numbers that become dependent in one step may affect other numbers in the next step
         n_changed_before = len(changed)
         for s in program.phase_segments("each"):
             propagate(s)
@@ -81,7 +83,7 @@ def _propagate(block: Block, active: set[Value]) -> None:
         if op.name == "over_others":
             (body,) = op.blocks
             active.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in active)
-        if op.name in ("loop", "while"):  # an active number of one iteration may affect all floats of the next
+        if op.name in ("loop", "while"):  # an active number may affect all floats of the next iteration
             has_active = any(x in active for x in (*op.args, *op.blocks[-1].used_values()))
             if has_active:
                 active.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")

@@ -1,7 +1,7 @@
-"""Stages and data as seen from one population, whose members an engine computes side by side.
+"""Stages and data for an engine whose lanes are the members of one population.
 
-The engine treats the members of that population as drones. Leaves of other populations are viewed as leaves of the
-world, (n_worlds, 1, n_members, ...), and their stages as stages of the world.
+The engine treats the members of that population as drones. Leaves of other populations become leaves of the world,
+(n_worlds, 1, n_members, ...), and their stages become stages of the world.
 """
 
 from __future__ import annotations
@@ -58,16 +58,16 @@ class RelativeStage(Stage):
     def __call__(self, data: Any) -> Any:
         treedef, views = self.axes.treedef, self.axes.views
         leaves_before = jax.tree.leaves(data)
-        restored = restore_leaves(views, leaves_before)
-        leaves_after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored)))
+        restored_leaves = restore_leaves(views, leaves_before)
+        leaves_after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored_leaves)))
         if after_treedef != treedef:
             return after_treedef.unflatten(leaves_after)  # the caller raises an error
         new_leaves = view_leaves(views, leaves_after)
-        unchanged = [x is y for x, y in zip(leaves_after, restored, strict=True)]
+        unchanged_flags = [x is y for x, y in zip(leaves_after, restored_leaves, strict=True)]
         return treedef.unflatten(
             [
-                old if is_unchanged else x
-                for old, x, is_unchanged in zip(leaves_before, new_leaves, unchanged, strict=True)
+                old if is_unchanged else new
+                for old, new, is_unchanged in zip(leaves_before, new_leaves, unchanged_flags, strict=True)
             ]
         )
 
@@ -94,11 +94,11 @@ def adapt_to_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[
     if not views:
         return run
 
-    def steps(leaves: Sequence[Any], n_steps: Any) -> Any:
+    def run_steps(leaves: Sequence[Any], n_steps: Any) -> Any:
         results, flagged = run(view_leaves(views, leaves), n_steps)
         new_leaves = dict(zip(written, results, strict=True))
         partial_leaves = [new_leaves.get(i) for i in range(len(leaves))]
         restored = restore_leaves(views, partial_leaves)
         return [restored[i] for i in written], flagged
 
-    return steps
+    return run_steps

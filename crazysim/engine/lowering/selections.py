@@ -1,6 +1,6 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
-Its derivative is the derivative of the number of the first drone that has the smallest or largest number, as
+The derivative is the derivative of the number of the first drone that has the smallest or largest number, as
 ``crazysim.core.pair_reductions`` defines it. That drone is identified by its index, not by comparing numbers, since
 numbers that are computed twice may be rounded differently.
 """
@@ -16,7 +16,7 @@ INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
 def add_selections(block: Block) -> Block:
     """Return a block with two further loops for each operation with minima or maxima over other drones.
 
-    The first finds the drones that have them. The second selects the numbers of these drones.
+    The first loop finds the drones that have the minima or maxima. The second loop selects the numbers of these drones.
     """
     if not any(map(_selected_results, block.operations)):
         return block
@@ -61,17 +61,16 @@ def _add_selection(
         return inner, [*new_inputs[len(args) :], is_self], [outs[k] for k in indices]
 
     inner, (is_self,), candidates = copy_body(0)
-    one_number, zero = (constant(x, dtypes[0]) for x in (1, 0))
-    is_largest = inner.add(
-        "select_n", (is_self, zero, one_number), dtypes[0]
-    )  # its argmax is the index of the drone itself
+    one, zero = (constant(x, dtypes[0]) for x in (1, 0))
+    # The argmax of this number is the index of the drone itself.
+    is_self_number = inner.add("select_n", (is_self, zero, one), dtypes[0])
     reductions = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
-    block = prune(inner.finish([*candidates, is_largest]))
+    block = prune(inner.finish([*candidates, is_self_number]))
     params = (("reduce", reductions), n_members)
-    *selected, number = builder.add_many("over_others", args, ["int32"] * len(reductions), params, (block,))
+    *selected_indices, own_index = builder.add_many("over_others", args, ["int32"] * len(reductions), params, (block,))
 
     inner, (other_index, _), candidates = copy_body(1)
-    terms = [inner.add("select_n", (inner.add("eq", (other_index, which), bool), constant(0, x.dtype), x), x.dtype)
-             for which, x in zip(selected, candidates, strict=True)]  # fmt: skip
+    terms = [inner.add("select_n", (inner.add("eq", (other_index, index), bool), constant(0, x.dtype), x), x.dtype)
+             for index, x in zip(selected_indices, candidates, strict=True)]  # fmt: skip
     params = (("reduce", ("add",) * len(indices)), n_members)
-    return builder.add_many("over_others", [*args, number], dtypes, params, (prune(inner.finish(terms)),))
+    return builder.add_many("over_others", [*args, own_index], dtypes, params, (prune(inner.finish(terms)),))

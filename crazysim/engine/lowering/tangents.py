@@ -25,6 +25,7 @@ from crazysim.engine.lowering.selections import add_selections
 from crazysim.pytree import replace_leaves
 
 Values = dict[Value, Element]
+"""Elements of a builder by the values of the block that is differentiated."""
 
 
 def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
@@ -39,15 +40,19 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
         perturbed: Leaves whose tangents are given; leaves that are not floats are ignored.
 
     Raises:
-        UnsupportedError: If a part of it has no derivative in a kernel.
+        UnsupportedError: If a part of the program has no derivative in a kernel.
     """
     program, perturbed = prepare_derivative(program, perturbed)
-    n = len(program.leaves)
+    n_leaves = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
-    segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
-    zero_slots = dict.fromkeys((i, k) for s in segments for i in s.written_leaves if i >= n and i - n not in perturbed
-                         for k in range(program.leaves[i - n].size))  # fmt: skip
-    zeros = [constant(0, program.leaves[i - n].number_type) for i, _ in zero_slots]
+    segments = [
+        _add_segment_tangents(program, n_leaves, s, changed, constants.get(s, ())) for s in program.fused_segments
+    ]
+    written_tangents = [
+        i for s in segments for i in s.written_leaves if i >= n_leaves and i - n_leaves not in perturbed
+    ]
+    zero_slots = dict.fromkeys((i, k) for i in written_tangents for k in range(program.leaves[i - n_leaves].size))
+    zeros = [constant(0, program.leaves[i - n_leaves].number_type) for i, _ in zero_slots]
     zero_segment = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero_slots))
     return dataclasses.replace(
         program,
@@ -64,7 +69,7 @@ def _tangent_leaf(leaf: Leaf) -> Leaf:
 
 
 def _add_segment_tangents(
-    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int]
+    program: Program, n_leaves: int, s: Segment, changed: set[Slot], constants: Sequence[int]
 ) -> Segment:
     """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.drone_slots(s, s.reads), len(s.reads)
@@ -96,10 +101,12 @@ def _add_segment_tangents(
     return dataclasses.replace(
         s,
         block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in output_tangents))),
-        reads=(*s.reads, *((n + s.reads[k][0], s.reads[k][1]) for k in input_indices)),
-        writes=(*s.writes, *((n + s.writes[k][0], s.writes[k][1]) for k, _ in output_tangents)),
+        reads=(*s.reads, *((n_leaves + s.reads[k][0], s.reads[k][1]) for k in input_indices)),
+        writes=(*s.writes, *((n_leaves + s.writes[k][0], s.writes[k][1]) for k, _ in output_tangents)),
         hoisted=hoisted,
-        hoisted_reads=(*s.hoisted_reads, *((n + i, k) for i, k in hoisted_slots)) if constants else s.hoisted_reads,
+        hoisted_reads=(*s.hoisted_reads, *((n_leaves + i, k) for i, k in hoisted_slots))
+        if constants
+        else s.hoisted_reads,
     )
 
 
@@ -126,11 +133,11 @@ def add_block_tangents(block: Block, perturbed: Sequence[Value]) -> Block:
 
 def _collect_tangents(elements: Sequence[Element], tangents: Values) -> list[Element]:
     """Return the tangents of the floats among some elements; a missing tangent is zero."""
-    return [_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
+    return [_get_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
 
 
-def _tangent(x: Element, tangents: Values) -> Element:
-    zero = known_zero(x.dtype)  # terms with it are left out
+def _get_tangent(x: Element, tangents: Values) -> Element:
+    zero = known_zero(x.dtype)  # terms with this zero are left out
     return tangents.get(x, zero) if isinstance(x, Value) else zero
 
 
@@ -141,7 +148,7 @@ def _add_with_tangents(builder: Builder, block: Block, values: Values, tangents:
         builder: Builder that the operations are added to.
         block: The block.
         values: Elements of the builder for the block's inputs and for values of enclosing blocks. Results are added.
-        tangents: Tangents of these values that are not zero. The tangents of its results are added.
+        tangents: Tangents of these values that are not zero. The tangents of the block's results are added.
     """
     for op in block.operations:
         builder.stage = op.stage
@@ -157,7 +164,7 @@ def _add_with_tangents(builder: Builder, block: Block, values: Values, tangents:
         derivative = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
         operands = [*(_map_element(x, values) for x in op.args), *_collect_tangents(op.args, tangents)]
         results = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
-        _record_tangents(op.results, results, tangents)
+        _store_tangents(op.results, results, tangents)
     return [_map_element(x, values) for x in block.outputs]
 
 
@@ -165,14 +172,14 @@ def _map_element(x: Element, values: Values) -> Element:
     return values.get(x, x) if isinstance(x, Value) else x
 
 
-def _record_tangents(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
-    """Record the tangents of some results, unless they are zero."""
+def _store_tangents(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
+    """Add the tangents of some results to ``tangents``, unless they are zero."""
     tangents.update((x, t) for x, t in zip(results, elements, strict=True) if isinstance(t, Value) or t != 0)
 
 
 @functools.lru_cache(maxsize=1024)
 def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block from the operands of an operation and the tangents of its float operands to its tangent."""
+    """Return the block that computes the tangent of an operation from its operands and the tangents of its floats."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def tangent(*args: Any) -> Any:
@@ -187,26 +194,27 @@ def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, 
 
 
 def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    mask, *old = op.args
+    mask, *old_values = op.args
     (block,) = op.blocks
     inner, inner_tangents = Builder(builder), dict(tangents)
     outputs = _add_with_tangents(inner, block, dict(values), inner_tangents)
-    new_tangents = [_tangent(x, inner_tangents) for x in block.outputs]
-    old_tangents = [_tangent(x, tangents) for x in old]
+    new_tangents = [_get_tangent(x, inner_tangents) for x in block.outputs]
+    old_tangents = [_get_tangent(x, tangents) for x in old_values]
     indices = [
         k
         for k, pair in enumerate(zip(old_tangents, new_tangents, strict=True))
         if any(isinstance(x, Value) for x in pair)
     ]
-    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(old_tangents[k] for k in indices)]
+    old_elements = [_map_element(x, values) for x in old_values]
+    args = [_map_element(mask, values), *old_elements, *(old_tangents[k] for k in indices)]
     new_block = inner.finish([*outputs, *(new_tangents[k] for k in indices)])
     results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (new_block,))
     values.update(zip(op.results, results, strict=False))
-    _record_tangents([op.results[k] for k in indices], results[len(old) :], tangents)
+    _store_tangents([op.results[k] for k in indices], results[len(old_values) :], tangents)
 
 
 def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Use the function's custom derivative."""
+    """Add the function, and its custom derivative."""
     (block,) = op.blocks
     args = [_map_element(x, values) for x in op.args]
     results = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
@@ -214,15 +222,15 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
     if not any(isinstance(x, Value) and x in tangents for x in op.args):
         return
     derivative = op.param("derivative")()
-    arg_tangents = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
-    parts = inline(builder, derivative, dict(zip(derivative.inputs, [*args, *arg_tangents], strict=True)))
-    parts = [x for x, out in zip(parts, derivative.outputs, strict=True) if out.dtype.kind == "f"]
-    _record_tangents([x for x in op.results if x.dtype.kind == "f"], parts, tangents)
+    arg_tangents = [_get_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
+    result_tangents = inline(builder, derivative, dict(zip(derivative.inputs, [*args, *arg_tangents], strict=True)))
+    float_tangents = [x for x, out in zip(result_tangents, derivative.outputs, strict=True) if out.dtype.kind == "f"]
+    _store_tangents([x for x in op.results if x.dtype.kind == "f"], float_tangents, tangents)
 
 
 def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
     """Carry a tangent for each float: any float may depend on a perturbed number after further iterations."""
-    *test, body = op.blocks
+    *tests, body = op.blocks
     if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.used_values())):
         inline(builder, Block((), (op,), ()), values)
         return
@@ -232,7 +240,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     outputs = _add_with_tangents(inner, body, inner_values, inner_tangents)
     blocks = [inner.finish([*outputs, *_collect_tangents(body.outputs, inner_tangents)])]
     args = [*(_map_element(x, values) for x in op.args), *_collect_tangents(op.args, tangents)]
-    for block in test:
+    for block in tests:
         inner = Builder(builder)
         inner_values = values | {x: inner.input(x.dtype) for x in block.inputs}
         for x in args[len(op.args) :]:
@@ -240,29 +248,29 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
         blocks.insert(0, inner.finish(inline(inner, block, inner_values)))
     results = builder.add_many(op.name, args, [x.dtype for x in args], op.params, tuple(blocks))
     values.update(zip(op.results, results, strict=False))
-    _record_tangents([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
+    _store_tangents([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
     """Publish the tangents of published numbers too, and sum the tangents of outputs that are summed."""
     (body,) = op.blocks
-    *others, is_self = body.inputs
+    *other_inputs, is_self = body.inputs
     inner = Builder(builder)
-    inner_values = values | {x: inner.input(x.dtype) for x in others}
-    published = [(x, y) for x, y in zip(op.args, others, strict=True) if isinstance(x, Value) and x in tangents]
+    inner_values = values | {x: inner.input(x.dtype) for x in other_inputs}
+    published = [(x, y) for x, y in zip(op.args, other_inputs, strict=True) if isinstance(x, Value) and x in tangents]
     inner_tangents = tangents | {y: inner.input(y.dtype) for _, y in published}
     inner_values[is_self] = inner.input(is_self.dtype)
     outputs = _add_with_tangents(inner, body, inner_values, inner_tangents)
     names = op.param("reduce")
-    body_tangents = [_tangent(x, inner_tangents) for x in body.outputs]
-    summed = [k for k, x in enumerate(body_tangents) if names[k] == "add" and isinstance(x, Value)]
-    block = inner.finish([*outputs, *(body_tangents[k] for k in summed)])
+    body_tangents = [_get_tangent(x, inner_tangents) for x in body.outputs]
+    summed_indices = [k for k, x in enumerate(body_tangents) if names[k] == "add" and isinstance(x, Value)]
+    block = inner.finish([*outputs, *(body_tangents[k] for k in summed_indices)])
     args = [*(_map_element(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
-    dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in summed]
-    params = (("reduce", (*names, *("add" for _ in summed))), ("n_members", op.param("n_members")))
+    dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in summed_indices]
+    params = (("reduce", (*names, *("add" for _ in summed_indices))), ("n_members", op.param("n_members")))
     results = builder.add_many("over_others", args, dtypes, params, (block,))
     values.update(zip(op.results, results, strict=False))
-    _record_tangents([op.results[k] for k in summed], results[len(op.results) :], tangents)
+    _store_tangents([op.results[k] for k in summed_indices], results[len(op.results) :], tangents)
 
 
 STRUCTURED_RULES: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {

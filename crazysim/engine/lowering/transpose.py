@@ -2,7 +2,7 @@
 
 The derivatives of operations come from JAX: the VJP of an operation is traced once for each combination of types, and
 lowered like any other function. The returned block first computes the whole block forward. The backward pass then goes
-through it part by part. For each part but the last, it recomputes the results that the derivatives need.
+through the block part by part. For each part but the last, it recomputes the results that the derivatives need.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def _recompute(
 ) -> dict[Value, Element]:
     """Recompute a part of a block from the values that it uses, and return the new elements by value.
 
-    Otherwise all results of the forward pass would take registers until the backward pass needs them. Reductions over
-    other drones and loops are not recomputed.
+    Without this, all results of the forward pass would take registers until the backward pass needs them. Reductions
+    over other drones and loops are not recomputed.
     """
     operations = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
     recomputed, used = {x for op in operations for x in op.results}, part.used_values()
@@ -96,12 +96,12 @@ def _recompute(
 def _add_cotangents(
     builder: Builder, block: Block, values: dict[Value, Element], active_set: set[Value], cts: Cotangents
 ) -> None:
-    """Go through a block backwards, from the cotangents of its results to the cotangents of the values that it uses.
+    """Add the cotangents of the values that a block uses, computed backwards from the cotangents of its results.
 
     Args:
         builder: Builder that the operations are added to.
         block: The block.
-        values: Elements of the builder that stand for its values.
+        values: Elements of the builder by the values of the block.
         active_set: Values whose cotangents are computed.
         cts: Cotangents so far; changed in place.
     """
@@ -135,7 +135,7 @@ def _accumulate(builder: Builder, cts: Cotangents, x: Value, part: Element) -> N
 
 @functools.lru_cache(maxsize=1024)
 def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block from the operands of an operation and its cotangent to the cotangents of its float operands."""
+    """Return the block that computes the cotangents of float operands from all operands and the result's cotangent."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def cotangents(*args: Any) -> list[Any]:
@@ -157,24 +157,24 @@ def _when(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Pass cotangents through the block where the mask is true, and to the old numbers elsewhere."""
-    mask, *old = op.args
+    mask, *old_values = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks
     inner, inner_values, inner_cts = Builder(builder), dict(values), Cotangents()
     inline(inner, block, inner_values)
-    for x, before, ct in zip(block.outputs, old, result_cts, strict=True):
+    for x, old, ct in zip(block.outputs, old_values, result_cts, strict=True):
         if ct is None:
             continue
-        if isinstance(before, Value) and before in active_set:
+        if isinstance(old, Value) and old in active_set:
             masked_ct = builder.add("select_n", (mask, ct, constant(0, ct.dtype)), ct.dtype)
-            _accumulate(builder, cts, before, masked_ct)
+            _accumulate(builder, cts, old, masked_ct)
         if isinstance(x, Value) and x in active_set:
             _accumulate(inner, inner_cts, x, ct)
     _add_cotangents(inner, block, inner_values, active_set, inner_cts)
-    before = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
-    sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(before, inner_cts, strict=True)]
+    old_cts = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
+    sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(old_cts, inner_cts, strict=True)]
     if inner_cts:
-        results = builder.add_many("when", (mask, *before), [x.dtype for x in inner_cts], (), (inner.finish(sums),))
+        results = builder.add_many("when", (mask, *old_cts), [x.dtype for x in inner_cts], (), (inner.finish(sums),))
         cts.update(zip(inner_cts, results, strict=True))
 
 
@@ -202,25 +202,35 @@ def _transpose_derivative(derivative: Block) -> Block:
 def _over_others(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Add cotangents to the drone's own numbers that the block uses, and to its published numbers from all readers."""
+    """Add the cotangents of numbers that the block uses from outside, and of the numbers that each drone published."""
     given_cts = [ct for ct in result_cts if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
         raise UnsupportedError(f"{', '.join(names)} over other drones has no derivative in a kernel", op.name)
     (body,) = op.blocks
     used = body.used_values()
-    # A list, so that the order is always the same.
+    # A list, not a set, so that the order is always the same.
     captured = [x for x in values if x in used and not x.size and isinstance(values[x], Value)]
     published = [values.get(x, x) for x in op.args]
 
     def add_reverse_loop(
-        inputs: Sequence[Value], own_values: dict, perturbed: Sequence[Value], shared: Sequence[Element]
+        read_values: Sequence[Value],
+        own_values: dict,
+        perturbed: Sequence[Value],
+        published_elements: Sequence[Element],
     ) -> None:
-        """Add a loop over the other drones for the cotangents of some values."""
+        """Add a loop over the other drones, which sums the cotangents of some values.
+
+        Args:
+            read_values: Values that have the numbers of the other drone.
+            own_values: Elements of values that have the numbers of the drone itself.
+            perturbed: Values whose cotangents are computed.
+            published_elements: Elements that the drones publish for ``read_values``.
+        """
         inner, inner_values, inner_cts = Builder(builder), dict(values), Cotangents()
-        new_inputs = [inner.input(x.dtype) for x in (*inputs, body.inputs[-1])]
+        new_inputs = [inner.input(x.dtype) for x in (*read_values, body.inputs[-1])]
         inner_values.update(own_values)
-        inner_values.update(zip((*inputs, body.inputs[-1]), new_inputs, strict=True))
+        inner_values.update(zip((*read_values, body.inputs[-1]), new_inputs, strict=True))
         inline(inner, body, inner_values)
         for x, ct in zip(body.outputs, result_cts, strict=True):
             if ct is not None and isinstance(x, Value) and x in active_set:
@@ -231,7 +241,7 @@ def _over_others(
             return
         block = prune(inner.finish([inner_cts[x] for x in perturbed]))
         used_inside = block.used_values()
-        pairs = [(y, s) for y, s in zip(new_inputs, shared, strict=False) if y in used_inside]
+        pairs = [(y, s) for y, s in zip(new_inputs, published_elements, strict=False) if y in used_inside]
         block = Block((*(y for y, _ in pairs), new_inputs[-1]), block.operations, block.outputs)
         params = (("reduce", ("add",) * len(perturbed)), ("n_members", op.param("n_members")))
         sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in perturbed], params, (block,))
@@ -240,18 +250,19 @@ def _over_others(
             if isinstance(target, Value) and target in active_set:
                 _accumulate(builder, cts, target, part)
 
-    others = body.inputs[:-1]
-    add_reverse_loop(others, {}, [x for x in captured if x in active_set], published)
+    other_inputs = body.inputs[:-1]
+    add_reverse_loop(other_inputs, {}, [x for x in captured if x in active_set], published)
     seeds = [ct for ct in given_cts if isinstance(ct, Value)]
     add_reverse_loop(
         (*captured, *seeds),
-        dict(zip(others, published, strict=True)),
-        [x for x in others if x in active_set],
+        dict(zip(other_inputs, published, strict=True)),
+        [x for x in other_inputs if x in active_set],
         [*(values[x] for x in captured), *seeds],
     )
 
 
 Rule = Callable[[Builder, Operation, dict, set[Value], ResultCotangents, Cotangents], None]
+"""Function that adds the cotangents of the values that a structured operation uses."""
 STRUCTURED_RULES: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
 
 

@@ -128,8 +128,8 @@ def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> l
 def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     p, length = eqn.params, eqn.params["length"]
     body = close_jaxpr(p["jaxpr"])
-    # The parameters with the sizes of these groups have different names in different versions of JAX, so the sizes are
-    # found by the number of axes: an operand per iteration has one axis more than in the body.
+    # The parameters with the numbers of constants, carried and stacked operands have different names in different
+    # versions of JAX, so these are counted by axes: a stacked operand has one axis more than in the body.
     n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
     n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
     n_consts = len(eqn.invars) - n_carry - n_stacked
@@ -143,16 +143,16 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
         raise UnsupportedError(
             f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
         )
-    stacked: list[list[ElementArray]] = []
+    outs_by_iteration: list[list[ElementArray]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
         outs = ctx.lower(body, [*consts, *carry, *(x[i, ...] for x in xs)])
         carry = outs[:n_carry]
-        stacked.append(outs[n_carry:])
+        outs_by_iteration.append(outs[n_carry:])
     if p["reverse"]:
-        stacked.reverse()
+        outs_by_iteration.reverse()
     if not length:
         return [*carry, *(np.empty(v.aval.shape, object) for v in eqn.outvars[n_carry:])]
-    ys = [np.stack([outs[k] for outs in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
+    ys = [np.stack([outs[k] for outs in outs_by_iteration]) for k in range(len(body.jaxpr.outvars) - n_carry)]
     return [*carry, *ys]
 
 
@@ -188,13 +188,15 @@ def _add_operation(
     ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
 ) -> list[ElementArray]:
     """Add an operation with the results of an equation, and return the results as arrays of elements."""
-    keys = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
-    sizes = [int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, keys, strict=True)]
-    dtypes = [np.uint32 if is_key else v.aval.dtype for v, is_key in zip(eqn.outvars, keys, strict=True)]
+    key_flags = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
+    sizes = [
+        int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, key_flags, strict=True)
+    ]
+    dtypes = [np.uint32 if is_key else v.aval.dtype for v, is_key in zip(eqn.outvars, key_flags, strict=True)]
     result_dtypes = [dtype for dtype, size in zip(dtypes, sizes, strict=True) for _ in range(size)]
-    flat = iter(ctx.builder.add_many(op, tuple(args), result_dtypes, params, blocks))
+    results = iter(ctx.builder.add_many(op, tuple(args), result_dtypes, params, blocks))
     out = []
-    for v, is_key, size in zip(eqn.outvars, keys, sizes, strict=True):
-        items = [next(flat) for _ in range(size)]
+    for v, is_key, size in zip(eqn.outvars, key_flags, sizes, strict=True):
+        items = [next(results) for _ in range(size)]
         out.append(as_elements(list(zip(items[::2], items[1::2], strict=True)) if is_key else items, v.aval.shape))
     return out

@@ -14,7 +14,7 @@ from crazysim.jaxcompat import JaxprEqn
 PRIMITIVES_WITH_RULES = frozenset(
     "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()
 )
-"""Operations whose primitives have rules of their own, or that have no primitive of the same name."""
+"""Operations whose primitives have separate rules, or that have no primitive of the same name."""
 
 
 @rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in PRIMITIVES_WITH_RULES))
@@ -53,12 +53,12 @@ def _convert(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
 def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Select one of two cases by a bool, or one of several by an integer."""
     which, *cases = args
-    dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
-    if np.dtype(kind).kind == "b":
+    dtype, which_dtype = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
+    if np.dtype(which_dtype).kind == "b":
         return [ctx.elementwise("select_n", args, dtype)]
     selected = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
-        is_case = ctx.elementwise("le", [which, constants(k, kind)], bool)
+        is_case = ctx.elementwise("le", [which, constants(k, which_dtype)], bool)
         selected = ctx.elementwise("select_n", [is_case, selected, cases[k]], dtype)
     return [selected]
 
@@ -196,9 +196,9 @@ def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) ->
         bias, largest = (1 << (info.nexp - 1)) - 1, (1 << (exponent - 1)) - 1
         infinity = ((1 << info.nexp) - 1) << info.nmant
         sign = bits.apply("and", x, 1 << (bits.n_bits - 1))
-        size = bits.apply("and", x, infinity)
-        is_overflow = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
-        is_underflow = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
+        magnitude = bits.apply("and", x, infinity)
+        is_overflow = ctx.elementwise("gt", [magnitude, constants((bias + largest) << info.nmant, bits.dtype)], bool)
+        is_underflow = ctx.elementwise("le", [magnitude, constants((bias - largest) << info.nmant, bits.dtype)], bool)
         x = ctx.elementwise("select_n", [is_overflow, x, bits.apply("or", sign, infinity)], bits.dtype)
         x = ctx.elementwise("select_n", [is_underflow, x, sign], bits.dtype)
     rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)

@@ -38,18 +38,18 @@ def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> li
 
 def _take(ctx: Lowering, x: ElementArray, start: Element, size: int, axis: int) -> ElementArray:
     """Return ``size`` elements along an axis, beginning at a start that is clamped to the array."""
-    last = x.shape[axis] - size
-    if is_constant(start) or last == 0:
-        k = int(np.clip(start, 0, last)) if last else 0
+    max_start = x.shape[axis] - size
+    if is_constant(start) or max_start == 0:
+        k = int(np.clip(start, 0, max_start)) if max_start else 0
         return np.take(x, range(k, k + size), axis)
-    table = tables.find_table(ctx, x, (axis,), last + 1)
+    table = tables.find_table(ctx, x, (axis,), max_start + 1)
     if table is not None:
         offsets = np.take(table.offsets, range(size), axis)
-        return table.look_up(offsets, [table.get_base([start], [last])] * offsets.size)
-    _check_range(last + 1)
-    pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
-    selected = pieces[last]
-    for k in range(last - 1, -1, -1):
+        return table.look_up(offsets, [table.get_base([start], [max_start])] * offsets.size)
+    _check_range(max_start + 1)
+    pieces = [np.take(x, range(k, k + size), axis) for k in range(max_start + 1)]
+    selected = pieces[max_start]
+    for k in range(max_start - 1, -1, -1):
         is_start = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
         selected = _select(ctx, is_start, pieces[k], selected)
     return selected
@@ -61,13 +61,19 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]
     starts = [a[()] for a in args[2:]]
     ranges = []
     for start, size, length in zip(starts, update.shape, x.shape, strict=True):
-        last = length - size
-        ranges.append([last and int(np.clip(start, 0, last))] if not last or is_constant(start) else range(last + 1))
-    _check_range(int(np.prod([len(options) for options in ranges])))
+        max_start = length - size
+        if max_start and not is_constant(start):
+            ranges.append(range(max_start + 1))
+        else:
+            ranges.append([int(np.clip(start, 0, max_start)) if max_start else 0])
+    _check_range(int(np.prod([len(positions) for positions in ranges])))
     out = x
     for corner in itertools.product(*ranges):
         axes = zip(starts, corner, ranges, strict=True)
-        is_here = _conjunction(ctx, (_is_at(ctx, s, k, options[-1]) for s, k, options in axes if len(options) > 1))
+        is_here = _conjunction(
+            ctx,
+            (_is_at(ctx, start, k, positions[-1]) for start, k, positions in axes if len(positions) > 1),
+        )
         window_index = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
         out = out.copy()
         out[window_index] = update if is_here is None else _select(ctx, is_here, update, out[window_index])
@@ -113,7 +119,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
     n_places = int(np.prod([limit + 1 for limit in limits]))
     rows = indices.reshape(-1, indices.shape[-1])
     out = eqn.outvars[0].aval
-    # Row of indices that each element of the result belongs to, from the axes of the result that are not offsets.
+    # For each element of the result, the row of indices that selects it: the batch axes of the result number the rows.
     row_shape = indices.shape[:-1]
     batch_axes = [axis for axis in range(len(out.shape)) if axis not in dims.offset_dims]
     shape = [1] * len(out.shape)
@@ -168,19 +174,19 @@ def _select_windows(
 
 
 def _gather_filled(eqn: JaxprEqn, x: ElementArray, indices: np.ndarray) -> ElementArray:
-    """Gather at known indices; elements at indices outside the array have the fill value."""
+    """Return the elements at known indices; elements at indices outside the array have the fill value."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (positions,) = evaluate(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
     fill_element = constants(
         _fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype
     )[()]
-    flat = x.reshape(-1)
-    return as_elements([fill_element if i < 0 else flat[i] for i in positions.reshape(-1)], positions.shape)
+    elements = x.reshape(-1)
+    return as_elements([fill_element if i < 0 else elements[i] for i in positions.reshape(-1)], positions.shape)
 
 
 def _fill_value(dtype: DTypeLike) -> Any:
-    """Return the fill value of JAX: NaN, the smallest signed or the largest unsigned integer, True."""
+    """Return the fill value of JAX: NaN, the smallest signed integer, the largest unsigned integer, or True."""
     kind = np.dtype(dtype).kind
     if kind == "f":
         return np.nan
@@ -204,48 +210,48 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
     partly outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
     """
     x, indices, updates = args
-    dims, clip = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
+    dims, is_clipped = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
     window_axes = dims.update_window_dims
     row_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
     collapsed = {*dims.inserted_window_dims, *dims.operand_batching_dims}
     sizes = iter(updates.shape[axis] for axis in window_axes)
-    window = [1 if axis in collapsed else next(sizes) for axis in range(x.ndim)]
+    window_shape = [1 if axis in collapsed else next(sizes) for axis in range(x.ndim)]
     start_axes = dims.scatter_dims_to_operand_dims
-    limits = [x.shape[axis] - window[axis] for axis in start_axes]
-    blocks = updates.transpose(*row_axes, *window_axes)
+    limits = [x.shape[axis] - window_shape[axis] for axis in start_axes]
+    window_updates = updates.transpose(*row_axes, *window_axes)
     out = x.copy()
     for row in np.ndindex(indices.shape[:-1]):
-        start, block = indices[row], blocks[(*row, ...)]
-        options = [_window_positions(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
-        _check_range(int(np.prod([len(positions) for positions in options])))
+        start, window_update = indices[row], window_updates[(*row, ...)]
+        positions_by_axis = [_window_positions(i, limit, is_clipped) for i, limit in zip(start, limits, strict=True)]
+        _check_range(int(np.prod([len(positions) for positions in positions_by_axis])))
         corner = [0] * x.ndim
         for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
             corner[axis] = row[batch_axis]
-        for positions in itertools.product(*options):
+        for positions in itertools.product(*positions_by_axis):
             for axis, k in zip(start_axes, positions, strict=True):
                 corner[axis] = k
             is_here = _conjunction(
                 ctx,
                 (
                     _is_at(ctx, i, k, limit)
-                    if clip
+                    if is_clipped
                     else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
                     for i, k, limit in zip(start, positions, limits, strict=True)
-                    if not is_constant(i) and not (clip and limit == 0)
+                    if not is_constant(i) and not (is_clipped and limit == 0)
                 ),
             )
-            window_index = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
+            window_index = tuple(slice(k, k + size) for k, size in zip(corner, window_shape, strict=True))
             old = out[window_index]
-            new = _combine(ctx, eqn, old, block.reshape(old.shape))
+            new = _combine(ctx, eqn, old, window_update.reshape(old.shape))
             out[window_index] = new if is_here is None else _select(ctx, is_here, new, old)
     return [out]
 
 
-def _window_positions(index: Element, limit: int, clip: bool) -> Sequence[int]:
+def _window_positions(index: Element, limit: int, is_clipped: bool) -> Sequence[int]:
     """Return the positions that a window may have along an axis; none if it is known to be outside."""
     if not is_constant(index):
         return range(limit + 1)
-    if clip:
+    if is_clipped:
         return [int(np.clip(int(index), 0, limit))]
     return [int(index)] if 0 <= index <= limit else []
 

@@ -11,7 +11,7 @@ from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedE
 from crazysim.jaxcompat import JaxprEqn
 
 MAX_SYSTEM_SIZE = 6
-"""Maximum number of rows of a matrix; for larger ones the unrolled arithmetic is longer than the rest of a step."""
+"""Maximum number of rows of a matrix. The unrolled arithmetic of a larger matrix is longer than a whole step."""
 
 
 def _check_size(eqn: JaxprEqn, n: int) -> None:
@@ -31,7 +31,7 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
     zero = constant(0, dtype)
     out = []
     for a in _matrices(args[0]):
-        factor, fails = np.full((n, n), zero, object), constant(False, bool)
+        factor, has_failed = np.full((n, n), zero, object), constant(False, bool)
         for j in range(n):
             for i in range(j, n):
                 remainder = a[i, j]
@@ -43,9 +43,9 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
                     else ctx.scalar("div", remainder, factor[j, j])
                 )
                 if i == j:
-                    fails = ctx.scalar("or", fails, ctx.scalar("le", remainder, zero, dtype=bool))
+                    has_failed = ctx.scalar("or", has_failed, ctx.scalar("le", remainder, zero, dtype=bool))
         for j, i in itertools.combinations_with_replacement(range(n), 2):
-            factor[i, j] = ctx.scalar("select_n", fails, factor[i, j], constant(np.nan, dtype))
+            factor[i, j] = ctx.scalar("select_n", has_failed, factor[i, j], constant(np.nan, dtype))
         out.append(factor)
     return [as_elements([x for factor in out for x in factor.reshape(-1)], args[0].shape)]
 
@@ -57,23 +57,25 @@ def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) ->
     out = []
     for a, b in zip(_matrices(args[0]), _matrices(args[1]), strict=True):
         a = a.T if p["transpose_a"] else a
-        lower = p["lower"] != p["transpose_a"]
+        is_lower = p["lower"] != p["transpose_a"]
         if not p["left_side"]:  # x a = b is a' x' = b'
-            a, b, lower = a.T, b.T, not lower
-        x = _substitute(ctx, a, b, lower, p["unit_diagonal"])
+            a, b, is_lower = a.T, b.T, not is_lower
+        x = _substitute(ctx, a, b, is_lower, p["unit_diagonal"])
         out.append(x if p["left_side"] else x.T)
     return [as_elements([e for x in out for e in x.reshape(-1)], args[1].shape)]
 
 
-def _substitute(ctx: Lowering, a: ElementArray, b: ElementArray, lower: bool, unit: bool) -> ElementArray:
+def _substitute(
+    ctx: Lowering, a: ElementArray, b: ElementArray, is_lower: bool, has_unit_diagonal: bool
+) -> ElementArray:
     n, x = len(a), np.empty(b.shape, object)
-    order = list(range(n)) if lower else list(range(n))[::-1]
+    order = list(range(n)) if is_lower else list(range(n))[::-1]
     for column in range(b.shape[1]):
         for n_done, i in enumerate(order):
             remainder = b[i, column]
             for k in order[:n_done]:
                 remainder = ctx.scalar("sub", remainder, ctx.scalar("mul", a[i, k], x[k, column]))
-            x[i, column] = remainder if unit else ctx.scalar("div", remainder, a[i, i])
+            x[i, column] = remainder if has_unit_diagonal else ctx.scalar("div", remainder, a[i, i])
     return x
 
 
@@ -93,10 +95,10 @@ def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementA
         for j in range(n):
             pivot, largest = constant(j, np.int32), ctx.scalar("abs", a[j, j])
             for i in range(j + 1, n):
-                size = ctx.scalar("abs", a[i, j])
-                is_larger = ctx.scalar("gt", size, largest, dtype=bool)
+                magnitude = ctx.scalar("abs", a[i, j])
+                is_larger = ctx.scalar("gt", magnitude, largest, dtype=bool)
                 pivot = ctx.scalar("select_n", is_larger, pivot, constant(i, np.int32))
-                largest = ctx.scalar("select_n", is_larger, largest, size)
+                largest = ctx.scalar("select_n", is_larger, largest, magnitude)
             pivots.append(pivot)
             for i in range(j + 1, n):
                 is_pivot = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
@@ -105,7 +107,7 @@ def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementA
                         ctx.scalar("select_n", is_pivot, x[i], x[j]),
                         ctx.scalar("select_n", is_pivot, x[j], x[i]),
                     )
-            is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # then the column is zero, and stays
+            is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # the column is zero and stays unchanged
             divisor = ctx.scalar("select_n", is_zero, a[j, j], constant(1, a[j, j].dtype))
             for i in range(j + 1, n):
                 a[i, j] = ctx.scalar("div", a[i, j], divisor)

@@ -55,16 +55,16 @@ def move_by_indices(eqn: JaxprEqn, args: list[ElementArray], known_operands: Seq
         args: The arrays whose elements are moved.
         known_operands: Further operands, such as indices, that are known.
     """
-    numbers, elements = [], []
+    indices, elements = [], []
     for x in args:
-        numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
+        indices.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
         elements.extend(x.reshape(-1))
-    positions = _source_indices(eqn, [*numbers, *known_operands])
+    positions = _source_indices(eqn, [*indices, *known_operands])
     return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in positions]
 
 
 def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
-    """Return, for each result, the indices of the elements that it takes; NumPy avoids a compilation where possible."""
+    """Return for each result the indices of its elements. NumPy is used where possible, to avoid a compilation."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "split":
@@ -76,7 +76,7 @@ def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
         case "pad":
             return [_pad(x, args[1], p["padding_config"])]
         case "gather":
-            return evaluate(eqn, args, fill_value=0)  # not used: in bounds, or a mode that does not fill
+            return evaluate(eqn, args, fill_value=0)  # the fill value is not used: indices are in bounds, or clipped
     return evaluate(eqn, args)
 
 

@@ -29,13 +29,13 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) 
     published = [x for x in scalars(*args[n_captured:]) if not is_constant(x)]
     shared = _shared_numbers(ctx)
     inner = ctx.make_inner()
-    others = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared}
+    other_inputs = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared}
     is_self = inner.builder.input(bool)
-    other_elements = [_replace_elements(x, others) for x in args[n_captured:]]
+    other_elements = [_replace_elements(x, other_inputs) for x in args[n_captured:]]
     results = inner.lower(eqn.params["jaxpr"], [*args[:n_captured], *other_elements, as_elements([is_self], ())])
     block = inner.finish(results)
     used = block.used_values()  # numbers that the block does not use are not published
-    pairs = [(x, y) for x, y in others.items() if y in used]
+    pairs = [(x, y) for x, y in other_inputs.items() if y in used]
     block = dataclasses.replace(block, inputs=(*(y for _, y in pairs), is_self))
     types = [x.dtype for x in block.outputs]
     name = ops.REDUCTIONS[eqn.params["reduce"]]
@@ -50,13 +50,9 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) 
 
 def _replace_elements(x: ElementArray, replacements: dict[Value, Value]) -> ElementArray:
     def replace(item: Any) -> Any:
-        return (
-            tuple(map(replace, item))
-            if isinstance(item, tuple)
-            else replacements.get(item, item)
-            if isinstance(item, Value)
-            else item
-        )
+        if isinstance(item, tuple):
+            return tuple(map(replace, item))
+        return replacements.get(item, item) if isinstance(item, Value) else item
 
     return as_elements([replace(item) for item in x.reshape(-1)], x.shape)
 

@@ -64,8 +64,8 @@ def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
     op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
-    for last, i in itertools.pairwise(order):
-        x[i, ...] = ctx.elementwise(op, [x[last, ...], x[i, ...]], eqn.outvars[0].aval.dtype)
+    for previous, i in itertools.pairwise(order):
+        x[i, ...] = ctx.elementwise(op, [x[previous, ...], x[i, ...]], eqn.outvars[0].aval.dtype)
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
 
@@ -94,7 +94,7 @@ def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 @rule("top_k")
 def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the k largest elements in descending order, and their indices. Of equal elements the first comes first.
+    """Return the k largest elements in descending order, and their indices. Equal elements keep their order.
 
     XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
     """
@@ -102,7 +102,7 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Eleme
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
     positions = constants(np.broadcast_to(numbers, x.shape), np.int32)
     key = x
-    if dtype.kind == "f":  # as integers, the bits have the order of the floats, but for negative floats the reverse
+    if dtype.kind == "f":  # bits as integers are in the order of the floats, negative floats in reverse
         ctx.builder.barrier()  # without it, XLA may recompute a NaN for another exchange, with the other sign
         integer = np.dtype(f"i{dtype.itemsize}")
         key = ctx.elementwise("bitcast_convert_type", [x], integer)
@@ -116,12 +116,12 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Eleme
 def _sort_rows(
     ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray], axis: int, n_keys: int, descending: bool = False
 ) -> list[ElementArray]:
-    """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
+    """Sort by odd-even transposition, which only exchanges neighbours and is therefore stable. NaN goes last.
 
     Args:
         ctx: Lowering that the operations are added to.
         eqn: Equation, for error messages.
-        args: Keys, then the other operands, which are permuted with them.
+        args: Keys, followed by other operands, which are permuted with the keys.
         axis: Axis to sort along.
         n_keys: Number of operands that are keys.
         descending: True to sort the largest first; the keys must then contain no NaN.
@@ -145,7 +145,7 @@ def _sort_rows(
 
 
 def _precedes(ctx: Lowering, first: Sequence[ElementArray], second: Sequence[ElementArray]) -> ElementArray:
-    """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
+    """Return True where ``first`` precedes ``second`` in ascending order of several keys, with NaN last."""
     precedes, is_tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
         is_less, is_equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
@@ -167,26 +167,27 @@ def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Element
         raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
     def as_matrices(
-        x: ElementArray, batch: Sequence[int], summed: Sequence[int]
+        x: ElementArray, batch: Sequence[int], contracted_axes: Sequence[int]
     ) -> tuple[ElementArray, tuple[int, ...]]:
-        free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
-        sizes = tuple(x.shape[i] for i in free)
-        x = x.transpose(*batch, *free, *summed)
+        free_axes = [i for i in range(x.ndim) if i not in (*batch, *contracted_axes)]
+        sizes = tuple(x.shape[i] for i in free_axes)
+        x = x.transpose(*batch, *free_axes, *contracted_axes)
         n_batch, n_free = int(np.prod(x.shape[: len(batch)])), int(np.prod(sizes))
         return x.reshape(n_batch, n_free, -1), sizes
 
     batch = tuple(a.shape[i] for i in lhs_batch)
     a, a_sizes = as_matrices(a, lhs_batch, lhs_axes)
     b, b_sizes = as_matrices(b, rhs_batch, rhs_axes)
-    times, plus = ("and", "or") if dtype.kind == "b" else ("mul", "add")
+    multiply, add = ("and", "or") if dtype.kind == "b" else ("mul", "add")
     out = []
     for n in range(a.shape[0]):
         for row in a[n]:
             for column in b[n]:
                 terms = [
-                    ctx.scalar(times, *(_cast(ctx, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)
+                    ctx.scalar(multiply, *(_cast(ctx, x, dtype) for x in pair))
+                    for pair in zip(row, column, strict=True)
                 ]
-                out.append(functools.reduce(lambda s, t: ctx.scalar(plus, s, t), terms, constant(0, dtype)))
+                out.append(functools.reduce(lambda s, t: ctx.scalar(add, s, t), terms, constant(0, dtype)))
     return [as_elements(out, (*batch, *a_sizes, *b_sizes))]
 
 

@@ -1,4 +1,7 @@
-"""Tables: arrays that all drones share, or constants, read from memory at computed indices instead of selected."""
+"""Tables: shared arrays and constants in memory, which are read at computed indices.
+
+Elements of a small array are selected in registers instead.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ MAX_SELECTED = 4
 MAX_SELECTED_CONSTANTS = 8
 """Maximum number of constants from which an entry is selected: they are parts of instructions."""
 
-ZERO = constant(0, np.int32)
+ZERO_INDEX = constant(0, np.int32)
 
 
 class TableView:
@@ -35,7 +38,7 @@ class TableView:
         """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
 
     def get_base(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
-        """Return the base of the elements at an index along the axes; each part is clamped to 0 and its limit."""
+        """Return the base of the elements at an index along the axes. Each part of it is clamped to 0 and its limit."""
         base = self.base
         for i, limit, stride in zip(index, limits, self.strides.values(), strict=True):
             if limit == 0:
@@ -43,18 +46,18 @@ class TableView:
             largest = constant(min(limit, np.iinfo(i.dtype).max), i.dtype)
             clamped = self.ctx.scalar("clamp", constant(0, i.dtype), i, largest)
             integer = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
-            step = self.ctx.scalar("mul", integer, constant(stride, np.int32))
-            base = self.ctx.scalar("add", base, step)
+            increment = self.ctx.scalar("mul", integer, constant(stride, np.int32))
+            base = self.ctx.scalar("add", base, increment)
         return base
 
     def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> ElementArray:
         """Return the entries at some offsets, each relative to its base."""
-        flat = [int(k) for k in offsets.reshape(-1)]
+        flat_offsets = [int(k) for k in offsets.reshape(-1)]
         numbers = [
             self.constants_by_offset[k]
             if k in self.constants_by_offset
             else self.ctx.lookup(self.table, base, k, self.aligned)
-            for k, base in zip(flat, bases, strict=True)
+            for k, base in zip(flat_offsets, bases, strict=True)
         ]
         return as_elements(numbers, offsets.shape)
 
@@ -78,12 +81,12 @@ def find_table(ctx: Lowering, x: ElementArray, axes: Sequence[int], n_indices: i
     locations = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
     first_location = locations[0]
     if first_location is None or not all(
-        p is not None and p.table is first_location.table and p.base is first_location.base for p in locations
+        x is not None and x.table is first_location.table and x.base is first_location.base for x in locations
     ):
         return None
     if n_indices <= MAX_SELECTED and first_location.table.size <= MAX_UNROLL:
         return None
-    offsets = np.array([p.offset for p in locations if p is not None]).reshape(x.shape)
+    offsets = np.array([entry.offset for entry in locations if entry is not None]).reshape(x.shape)
     strides = _strides(offsets, axes)
     return None if strides is None else TableView(ctx, first_location, offsets, strides)
 
@@ -95,7 +98,7 @@ def _table_of_constants(ctx: Lowering, x: ElementArray, axes: Sequence[int]) -> 
         return None
     offsets = np.arange(x.size).reshape(x.shape)
     (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", TableEntries(numbers)),))
-    table = TableView(ctx, TableEntry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
+    table = TableView(ctx, TableEntry(value, ZERO_INDEX, 0), offsets, _strides(offsets, axes) or {})
     first_rows = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
     is_equal = np.all(bits == bits[first_rows], tuple(axes), keepdims=True)
