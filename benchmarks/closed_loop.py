@@ -1,10 +1,10 @@
-"""Closed loop against logs: tracking errors of simulated flights over the real ones.
+"""Closed loop compared with logs: tracking errors of simulated flights, divided by the errors of the real flights.
 
     python benchmarks/closed_loop.py FOLDER --drone cf2x_L250 --quat-deviation 0.06
 
 FOLDER has logs of NanoBench (Ullah and Baca 2026, arXiv 2603.09908) as .npz files. Each simulated drone follows the
-logged setpoint with the firmware's PID controller on the estimate of its filter; ``--truth`` uses the true state. There
-is one JSON line for each log, with root mean square distances from the setpoint in m, and lags in s.
+logged setpoint with the firmware's PID controller on the estimate of its filter; with ``--truth`` it uses the true
+state. There is one JSON line for each log, with root mean square distances from the setpoint in m, and lags in s.
 """
 
 from __future__ import annotations

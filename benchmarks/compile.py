@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:
-    """Return the times of one case."""
+    """Return the line of one case, with the times to build, trace and compile it."""
     start_time = time.perf_counter()
     sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
     start_hovering(sim, control)

@@ -17,7 +17,7 @@ def main(package: str) -> None:
     """Answer requests until standard input ends."""
     start_time = time.perf_counter()
     module = importlib.import_module(f"{package}.sim")
-    import jax  # after the package, so that its import counts as part of the package's
+    import jax  # after the package, whose import time includes the import of JAX
     from measure import describe_machine
 
     import_s = time.perf_counter() - start_time
@@ -67,7 +67,7 @@ class Loop:
     """The loop of every script: a command from NumPy, some steps, the positions into NumPy."""
 
     def __init__(self, sim: Any, control: str, n_steps: int, iterations: int = 50):
-        """Fly it once, which compiles it."""
+        """Run the loop once, which compiles the step."""
         import numpy as np
         from measure import start_hovering
 
@@ -140,10 +140,13 @@ class Gradient:
 
 
 class GymSteps:
-    """Steps of a Gymnasium vector environment that reaches a position: the same drone, model, rates and autoreset."""
+    """Steps of a Gymnasium vector environment in which drones reach a position.
+
+    Drone, dynamics model, rates and autoreset are the same in both programs.
+    """
 
     def __init__(self, package: str, case: dict[str, Any], device: str):
-        """Make the environment and step it a few times, which compiles it."""
+        """Make the environment and step it a few times, which compiles the step."""
         import gymnasium
         import jax
         import numpy as np
@@ -174,10 +177,10 @@ class GymSteps:
         return time.perf_counter() - start_time
 
     def require_flying(self) -> None:
-        """Check that the drones do not crash all the time.
+        """Check that few drones crash.
 
         Raises:
-            SystemExit: If they do.
+            SystemExit: If more than a tenth of the worlds ends with every step.
         """
         import numpy as np
 
@@ -190,10 +193,11 @@ OBJECTS = {
     "pole": ('<geom type="capsule" size="0.02 0.8"/>', [[3, 1, 1], [3, 2, 1]]),
     "ball": ('<geom type="sphere" size="0.1"/>', [[2, 0, 1.1], [-3, 2, 1]]),
 }
-"""Kinds and positions of eight movable objects, none of them in the way of the drones."""
+"""Geoms and positions of eight movable objects, away from the drones."""
 BATCH_SECONDS = 0.25
-"""Duration of a batch of queries, s. Their median counts, because the first after a pause are slower."""
+"""Duration of a batch of queries, s. The median is reported, because the first queries after a pause are slower."""
 SCENE_QUERIES = ("contacts", "depth", "swarm_build")
+"""Tasks that query or build a scene."""
 
 
 def make_scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) -> Any:
@@ -203,13 +207,13 @@ def make_scene(module: Any, package: str, n_worlds: int, n_drones: int, device: 
 
     sim = module.Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", device=device)
     for name, (geom, positions) in OBJECTS.items():
-        text = f'<mujoco><worldbody><body name="{name}">{geom}</body></worldbody></mujoco>'
+        xml = f'<mujoco><worldbody><body name="{name}">{geom}</body></worldbody></mujoco>'
         if package == "crazysim":
-            sim.scene.add(mujoco.MjSpec.from_string(text).body(name), name, count=len(positions), pos=positions)
+            sim.scene.add(mujoco.MjSpec.from_string(xml).body(name), name, count=len(positions), pos=positions)
             continue
         frame = sim.spec.worldbody.add_frame()
         for k, pos in enumerate(positions):
-            spec = mujoco.MjSpec.from_string(text)
+            spec = mujoco.MjSpec.from_string(xml)
             body = frame.attach_body(spec.body(name), "", f":{k}")
             body.pos, body.mocap = pos, True
     if package != "crazysim":
@@ -228,7 +232,7 @@ def bytes_in_use(sim: Any, package: str) -> int:
 
 
 class SceneQuery:
-    """Scene query after a step, timed without the step; or the construction of a swarm."""
+    """Scene query after a step, timed without the step, or the construction of a swarm."""
 
     def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
         """Build the scene and query it once."""

@@ -1,10 +1,10 @@
-"""Controllers compared on the same flights: one line for each controller and airframe, one for its cost.
+"""Controllers compared on the same flights: a line for each controller and airframe, and a line for its cost.
 
     python benchmarks/controllers.py [--controllers auto indi ...] [--drones cf21B_500 my_drone.toml ...] [--speed 2]
 
 - hover: from the floor to a height of 1 m, distance from the setpoint after 5 s, m
 - tracking: figure eight of 2 m with ``--speed`` in its middle, from a start on it, RMS distance over 9 s, m
-- pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later, and its largest, m
+- pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later and largest distance, m
 - heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
 - home: fraction of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
 - lost_178: height lost from rest at a roll of 178 degrees, m
@@ -12,8 +12,9 @@
 - error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; omitted with --worlds 0
 
-Without --drones, the airframes are all built-in ones with rotors, and three generic ones (``generic_airframes``). A
-controller is left out for an airframe that lacks its constants. ``tracking_lqr`` only flies the figure eight.
+Without --drones, the airframes are all built-in airframes with rotors, and three generic airframes
+(``generic_airframes``). A controller is left out for an airframe that lacks its constants. ``tracking_lqr`` only flies
+the figure eight.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from crazysim.trajectories import figure_eight
 
 CONTROLLERS = ("auto", "crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
 GAIN_INTERVAL = 0.15
-"""Time between gains of tracking_lqr, s; 60 of them last 9 s."""
+"""Time between gains of tracking_lqr, s; 60 intervals last 9 s."""
 COMMAND_STEPS = {
     "attitude": ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5)),
     "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
@@ -51,18 +52,25 @@ TAKE_OFF_WORLD, TRACKING_WORLD, PUSHED_WORLD, HEAVY_WORLD, INVERTED_WORLD, FIRST
 
 
 def generic_airframe(
-    name: str, mass: float, radius: float, n: int, inertia: list[float], thrust_max: float, rpm: float, lag_rate: float
+    name: str,
+    mass: float,
+    radius: float,
+    n_rotors: int,
+    inertia: list[float],
+    thrust_max: float,
+    rpm: float,
+    lag_rate: float,
 ) -> Airframe:
     """Return a generic airframe: rotors on a circle that hover at ``rpm``, without constants of controllers."""
-    angles = 2 * np.pi * (np.arange(n) + 0.5) / n
-    k2 = mass * 9.81 / n / rpm**2
+    angles = 2 * np.pi * (np.arange(n_rotors) + 0.5) / n_rotors
+    k2 = mass * 9.81 / n_rotors / rpm**2
     return load_airframe(
         {
             "name": name,
             "rigid_body": {"mass": mass, "inertia": inertia},
             "rotors": {
                 "position": np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles], -1).tolist(),
-                "yaw_torque_sign": [1, -1] * (n // 2),
+                "yaw_torque_sign": [1, -1] * (n_rotors // 2),
                 "thrust_min": 0.02 * thrust_max,
                 "thrust_max": thrust_max,
                 "inertia": 1e-3 * inertia[2],
@@ -76,7 +84,7 @@ def generic_airframe(
 
 
 def generic_airframes() -> list[Airframe]:
-    """Return a quadrotor with propellers of 3 inches, one of 5 inches, and a hexarotor."""
+    """Return a quadrotor with propellers of 3 inches, a quadrotor with propellers of 5 inches, and a hexarotor."""
     return [
         generic_airframe("quad_3_inch", 0.25, 0.07, 4, [2.5e-4, 2.5e-4, 4.2e-4], 2.2, 15e3, 30.0),
         generic_airframe("quad_5_inch", 1.2, 0.12, 4, [5e-3, 5e-3, 9e-3], 12.0, 11e3, 20.0),
@@ -143,15 +151,15 @@ def fly_airframes(
     dynamics: str = "first_principles",
     device: str = "cpu",
 ) -> dict[str, dict[str, float]]:
-    """Return the metrics of a controller for each airframe; all fly at once, one drone each in every world."""
+    """Return the metrics of a controller by airframe. All fly at once: every world has one drone of each airframe."""
     worlds, drones = FIRST_TUMBLING_WORLD + n_attitudes, len(airframes)
     controller = make_controller(name, speed)
     sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
-    path, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
+    path, states, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
     start_setpoint, rng = path.evaluate(jnp.float32(0)), np.random.default_rng(0)
 
-    pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
-    rotor_vel = np.array(np.broadcast_to(hover_rotor_states(params), s.rotor_vel.shape))
+    pos, vel, quat, ang_vel = (np.array(x) for x in (states.pos, states.vel, states.quat, states.ang_vel))
+    rotor_vel = np.array(np.broadcast_to(hover_rotor_states(params), states.rotor_vel.shape))
     pos[:], rotor_vel[TAKE_OFF_WORLD] = [0, 0, 1], 0
     pos[TAKE_OFF_WORLD, :, 2], pos[INVERTED_WORLD:, :, 2] = 0, START_HEIGHT
     pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start_setpoint.pos, start_setpoint.vel
@@ -167,8 +175,8 @@ def fly_airframes(
     force[PUSHED_WORLD, :, 0] = 0.1 * 9.81 * mass[PUSHED_WORLD, :, 0]
     mass[HEAVY_WORLD] *= 1.2
 
-    as_data = lambda x: jnp.asarray(x, s.pos.dtype)  # noqa: E731
-    states = s.replace(pos=as_data(pos), vel=as_data(vel), quat=as_data(quat), ang_vel=as_data(ang_vel))
+    as_data = lambda x: jnp.asarray(x, states.pos.dtype)  # noqa: E731
+    states = states.replace(pos=as_data(pos), vel=as_data(vel), quat=as_data(quat), ang_vel=as_data(ang_vel))
     sim.data = sim.data.replace(
         states=states.replace(rotor_vel=as_data(rotor_vel)), params=params.replace(mass=as_data(mass))
     )
@@ -181,7 +189,7 @@ def fly_airframes(
 def step_response_metrics(
     name: str, airframes: list[Airframe], level: str, device: str = "cpu"
 ) -> dict[str, dict[str, float]]:
-    """Return overshoot and error of a controller for each airframe after steps of the command."""
+    """Return overshoot and error of a controller after steps of the command, by airframe."""
     normalized_responses = step_responses(name, airframes, level, device)
     overshoot = normalized_responses.max(axis=(0, 1)) - 1
     error = np.abs(normalized_responses[100:] - 1).max(axis=(0, 1))
@@ -192,16 +200,18 @@ def step_response_metrics(
 
 
 def step_responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
-    """Return angles or body rates during the 3 s after a step of the command, divided by the step's size.
+    """Return angles or body rates during the 3 s after a step of the command, divided by the size of the step.
 
-    One every 0.02 s. (n_times, n_command_steps, n_airframes)
+    There is a sample every 0.02 s. (n_times, n_command_steps, n_airframes)
     """
     steps = COMMAND_STEPS[level]
     sim = Sim(len(steps), drone=airframes, control=level, controller=make_controller(name), device=device)
-    s, params = sim.data.states, sim.data.params
-    start_pos = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
+    states, params = sim.data.states, sim.data.params
+    start_pos = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], states.pos.dtype), states.pos.shape)
     sim.data = sim.data.replace(
-        states=s.replace(pos=start_pos, rotor_vel=jnp.broadcast_to(hover_rotor_states(params), s.rotor_vel.shape))
+        states=states.replace(
+            pos=start_pos, rotor_vel=jnp.broadcast_to(hover_rotor_states(params), states.rotor_vel.shape)
+        )
     )
     command = np.zeros((len(steps), len(airframes), 4), np.float32)
     command[..., 3] = [9.81 * airframe.value("rigid_body.mass") for airframe in airframes]
@@ -211,16 +221,19 @@ def step_responses(name: str, airframes: list[Airframe], level: str, device: str
     results = []
     for _ in range(150):
         sim.step(sim.freq // 50)
-        s = sim.data.states
-        quat = np.asarray(s.quat)
+        states = sim.data.states
+        quat = np.asarray(states.quat)
         angles = Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
-        response = angles if level == "attitude" else np.asarray(s.ang_vel)
+        response = angles if level == "attitude" else np.asarray(states.ang_vel)
         results.append(np.stack([response[k, :, axis] / size for k, (axis, size) in enumerate(steps)]))
     return np.array(results)
 
 
 def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of all drones, m, and those of the figure eight, m, after each step of a flight of 15 s."""
+    """Return the positions of all drones and the positions on the figure eight, m, after each step of 15 s of flight.
+
+    (n_steps, n_worlds, n_drones, 3) and (n_steps, 3)
+    """
     step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1

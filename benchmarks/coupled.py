@@ -1,7 +1,7 @@
 """Drone steps per second of worlds whose drones act on each other, compared with the same worlds without an effect.
 
-One JSON line for each number of drones per world, with the same number of drones in all. ``downwash`` adds up the
-jets of all drones of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are
+One JSON line for each number of drones per world, with the same total number of drones. ``downwash`` adds up the jets
+of all drones of a world at each drone; ``uncoupled`` is the same simulation without an effect. Both simulations are
 measured alternately.
 
     python benchmarks/coupled.py [--device gpu] [--total 262144] [--drones 4 8 16 64 256] [--check]
@@ -19,7 +19,7 @@ from measure import Flight, engine_name, medians, report, round_digits
 from crazysim import Downwash, Sim, __version__
 
 MAX_CHECKED_WORLDS = 100
-"""Largest number of worlds of a comparison of engines."""
+"""Largest number of worlds in a comparison of engines."""
 
 
 def main() -> None:

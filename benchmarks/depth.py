@@ -1,9 +1,8 @@
 """Rays per second of depth images, and the time to the first image; or the time of a step with a range finder.
 
-One JSON line for each number of poles, fixed and movable, with rates by wall time (median) and by
-processor time (least). To compare with another version, run this file with the folder of that version in PYTHONPATH,
-alternating with this one. With ``--range-finder``, drones at random positions measure six distances up to 4 m in each
-step.
+One JSON line for each number of poles, fixed and movable, with rates by wall time (median) and by processor time
+(least). To compare with another version, run this file alternately with and without the folder of that version in
+PYTHONPATH. With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
 
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
 """
@@ -83,15 +82,15 @@ def report_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Na
     )  # fmt: skip
 
 
-def processor_seconds(render: Callable[[], Array]) -> float:
-    """Return the processor time of a call over all threads, s, which other work on the machine affects less."""
+def processor_seconds(fn: Callable[[], Array]) -> float:
+    """Return the processor time of a call over all threads, s. Other work on the machine hardly affects it."""
     start_time = time.process_time()
-    jax.block_until_ready(render())
+    jax.block_until_ready(fn())
     return time.process_time() - start_time
 
 
 def make_scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:
-    """Return a drone at a height of 1 m amid poles."""
+    """Return a simulation with one drone per world, at a height of 1 m amid poles."""
     sim = Sim(n_worlds, control="attitude", device=device)
     if n_poles:
         pos = np.zeros((n_poles, 3))

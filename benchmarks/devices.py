@@ -3,13 +3,14 @@
     python benchmarks/devices.py [--device gpu] [--devices 1 2] [--hosts 2] [--cases physics PPO] [--processes 12]
 
 The worlds of each device are the same for any number of devices (weak scaling), except for ``seeds``: sixteen seeds are
-divided among the devices. One JSON line for each case and number of devices: the rate, its ratio to that on the
-first number of devices, the bytes that the devices exchange in a call and the memory of its program on a device, both
-from the compiled program, and the compile time. With ``--processes`` several cases are compiled at the same time, in
-separate processes, and then timed one after another. With ``--hosts`` the largest number of devices is measured
-again, divided among processes that ``jax.distributed`` connects. The line ``weights`` compares the weights of PPO
-after three iterations. ``--small`` is for a trial run on CPUs, with
-``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
+divided among the devices. There is a JSON line for each case and number of devices. It has the rate, the ratio of the
+rate to the rate on the first number of devices, and the compile time. It also has the bytes that the devices exchange
+in a call and the memory of the program on a device, both read from the compiled program.
+
+With ``--processes`` several cases are compiled at the same time, in separate processes, and then timed one after
+another. With ``--hosts`` the largest number of devices is measured again, divided among processes that
+``jax.distributed`` connects. The line ``weights`` compares the weights of PPO after three iterations. ``--small`` is
+for a trial run on CPUs, with ``XLA_FLAGS=--xla_force_host_platform_device_count=4``.
 """
 
 from __future__ import annotations
@@ -72,8 +73,8 @@ class Size(NamedTuple):
 
     n_worlds: int
     """Worlds of each device, or of each seed in the cases of seeds."""
-    small: int
-    """The same with ``--small``."""
+    n_small_worlds: int
+    """The same number with ``--small``."""
     unit: str
     """Unit of the rate."""
 
@@ -109,13 +110,13 @@ def main() -> None:
         multiprocessing.connection.wait([process.sentinel for process in hosts])
         for process in hosts:
             process.join(60)
-            process.kill()  # one that waits for another that failed
+            process.kill()  # a process may wait for another process that failed
         if any(process.exitcode for process in hosts):
             raise SystemExit("a host failed; the errors are above")
 
 
 def run_on_host(i: int, address: str, args: argparse.Namespace) -> None:
-    """Run all cases as one of the processes that share the devices; the first one prints the lines."""
+    """Run all cases as one of the processes that share the devices; only the first process prints lines."""
     n_devices = args.devices[0] // args.hosts
     if args.device == "cpu":
         os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={n_devices}"
@@ -126,7 +127,7 @@ def run_on_host(i: int, address: str, args: argparse.Namespace) -> None:
 
 
 def run_in_processes(args: argparse.Namespace) -> None:
-    """Run each case in a separate process, several of which compile at the same time."""
+    """Run each case in a separate process. Up to ``args.processes`` of them compile at the same time."""
     context = multiprocessing.get_context("spawn")
     failed = []
     for k in range(0, len(args.cases), args.processes):
@@ -142,8 +143,15 @@ def run_in_processes(args: argparse.Namespace) -> None:
         raise SystemExit(f"{', '.join(failed)} failed; the errors are above")
 
 
-def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None) -> None:
-    """Compile a case for each number of devices, time it once all cases are ``ready``, and print its lines."""
+def run(name: str, args: argparse.Namespace, barrier: Any = None, lock: Any = None) -> None:
+    """Compile a case for each number of devices, time it, and print its lines.
+
+    Args:
+        name: Name of the case.
+        args: Options of the command.
+        barrier: Barrier at which processes wait until all of them have compiled their case; None for one process.
+        lock: Lock of the process that measures; None for one process.
+    """
     devices = jax.devices(args.device)
     if len(devices) < max(args.devices):
         raise SystemExit(f"expected {max(args.devices)} devices, got {len(devices)}. See --help for CPUs.")
@@ -154,9 +162,9 @@ def run(name: str, args: argparse.Namespace, ready: Any = None, turn: Any = None
     try:
         results: dict[int, Any] = {n: make_result(devices[:n], args.small) for n in args.devices}
     finally:
-        if ready is not None:
-            ready.wait()
-    with nullcontext() if turn is None else turn:
+        if barrier is not None:
+            barrier.wait()
+    with nullcontext() if lock is None else lock:
         print_result(results, args)
 
 
@@ -173,13 +181,13 @@ def compare_weights(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: arg
         )  # fmt: skip
 
 
-def build_case(name: str, devices: list[jax.Device], small: bool) -> Case:
+def build_case(name: str, devices: list[jax.Device], is_small: bool) -> Case:
     """Return a case on some devices."""
     (make_case, size), n = CASES[name], len(devices)
-    n_worlds = size.small if small else size.n_worlds
+    n_worlds = size.n_small_worlds if is_small else size.n_worlds
     first_device = next(device for device in devices if device.process_index == jax.process_index())
     device_options = {"device": first_device, "mesh": world_mesh(devices) if n > 1 else None}
-    return make_case(n_worlds if name.startswith("seeds") else n * n_worlds, device_options, 4 if small else None)
+    return make_case(n_worlds if name.startswith("seeds") else n * n_worlds, device_options, 4 if is_small else None)
 
 
 def time_and_report(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
@@ -208,7 +216,7 @@ def time_and_report(name: str, cases: dict[int, Case], args: argparse.Namespace)
         n_bytes = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
         report(
             args.device, benchmark="devices", case=name, n_devices=n, n_hosts=args.hosts, unit=size.unit,
-            n_worlds=size.small if args.small else size.n_worlds, call_s=round_digits(call_times[n]),
+            n_worlds=size.n_small_worlds if args.small else size.n_worlds, call_s=round_digits(call_times[n]),
             rate=round_digits(rates[n]), ratio=round_digits(rates[n] / rates[args.devices[0]]),
             exchanged=exchanged_bytes(text), memory_bytes=n_bytes - memory.alias_size_in_bytes,
             compile_s=round(case.compile_s, 1), crazysim=__version__,
@@ -226,7 +234,7 @@ def compile_case(
 
 
 def physics_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
-    """Return steps of attitude commands."""
+    """Return the case of steps with attitude commands."""
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
     start_hovering(sim, "attitude")
@@ -239,7 +247,7 @@ def physics_case(n_worlds: int, device_options: dict[str, Any], small_size: int 
 def rollout_case(
     task: str, with_policy: bool, n_worlds: int, device_options: dict[str, Any], small_size: int | None
 ) -> Case:
-    """Return rollouts with automatic resets, with random actions or with a policy of two layers of 64."""
+    """Return the case of rollouts with automatic resets, with random actions or a policy of two layers of 64 units."""
     n_steps = small_size or 50
     env = envs.AutoReset(envs.make(task, n_worlds, **device_options))
     replicated = replicated_sharding(env.sim)
@@ -266,7 +274,7 @@ def rollout_case(
 def training_case(
     algorithm: Any, n_seeds: int, n_worlds: int, device_options: dict[str, Any], small_size: int | None
 ) -> Case:
-    """Return iterations of a training of ``hover``, all of its seeds."""
+    """Return the case of iterations of a training of ``hover`` with all its seeds."""
     recipe = TrainConfig.create("hover", "ppo" if algorithm is ppo else "apg", n_worlds=n_worlds).algorithm_config()
     recipe = recipe if small_size is None else dataclasses.replace(recipe, n_steps=small_size)
     base = envs.make("hover", n_seeds * n_worlds, **device_options)
@@ -282,7 +290,7 @@ def training_case(
 
 
 def gradient_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
-    """Return gradients of distances after some steps with respect to attitude commands."""
+    """Return the case of gradients of distances after some steps with respect to attitude commands."""
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
     start_hovering(sim, "attitude")
@@ -297,7 +305,7 @@ def gradient_case(n_worlds: int, device_options: dict[str, Any], small_size: int
 
 
 def depth_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
-    """Return depth images of a drone amid 30 movable poles, rays."""
+    """Return the case of depth images of a drone amid 30 movable poles; its units are rays."""
     size = (small_size, small_size) if small_size else IMAGE
     sim = Sim(n_worlds, control="attitude", **device_options)
     pos = np.zeros((30, 3))
@@ -308,11 +316,11 @@ def depth_case(n_worlds: int, device_options: dict[str, Any], small_size: int | 
     return compile_case(jax.jit(lambda data: take_image(data).distance), sim.data, n_units=n_worlds * size[0] * size[1])
 
 
-def trained_weights(devices: list[jax.Device], small: bool) -> tuple[np.ndarray, np.ndarray]:
+def trained_weights(devices: list[jax.Device], is_small: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of a policy before and after three iterations of PPO."""
     device_options = {"device": devices[0], "mesh": world_mesh(devices) if len(devices) > 1 else None}
-    with jax.default_matmul_precision("highest"):  # a GPU would round the products of each order of sums to 10 bits
-        case = training_case(ppo, 1, 256 if small else 16384, device_options, 4 if small else None)
+    with jax.default_matmul_precision("highest"):  # by default a GPU rounds the operands to 10 bits
+        case = training_case(ppo, 1, 256 if is_small else 16384, device_options, 4 if is_small else None)
     learner = case.arguments[0]
     weights = [learner.agents.policy]
     for _ in range(3):
@@ -335,7 +343,7 @@ CASES: dict[str, tuple[Callable[..., Case], Size]] = {
     "seeds": (partial(training_case, ppo, N_SEEDS), Size(16384, 16, "environment steps")),
     "seeds, recipe": (partial(training_case, ppo, N_SEEDS), Size(1024, 16, "environment steps")),
 }
-"""Cases by name: function that builds one, and its size."""
+"""Function that builds each case, and the size of the case, by name."""
 
 
 if __name__ == "__main__":

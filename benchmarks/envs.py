@@ -6,8 +6,8 @@
 An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
 contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
 ``Randomize.crazyflie()`` are timed alternately. With ``--depth`` the policies also receive a depth image of each
-drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO, rollout
-and updates, without compilation and evaluation; its batches grow with the number of worlds.
+drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO. This includes
+rollout and updates, but no compilation or evaluation. Batches of training grow with the number of worlds.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def report_rates(
     device: str,
     repeats: int,
     randomize: bool,
-    size: Sequence[int] | None,
+    image_size: Sequence[int] | None,
     actions: Sequence[str],
 ) -> None:
     """Print the rates of rollouts and of training."""
@@ -75,7 +75,7 @@ def report_rates(
     env_device = base.sim.device
     key = jax.device_put(jax.random.key(0), env_device)
     starts = {drones: jax.jit(env.reset)(key) for drones, env in env_by_drones.items()}
-    n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
+    n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (image_size[0] * image_size[1] if image_size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, env_device)
 
@@ -88,8 +88,8 @@ def report_rates(
         return step.reward.mean(), step.done.mean()
 
     def rollout_with_images(env: Any, state: Any, act: Any, key: Any) -> Any:
-        """Return the results of a rollout of a policy that also gets depth images."""
-        render = base.sim.scene.depth_fn("fpv_cam", *size)  # type: ignore[misc]
+        """Return the results of a rollout of a policy that also receives depth images."""
+        render = base.sim.scene.depth_fn("fpv_cam", *image_size)  # type: ignore[misc]
 
         def step(state: Any, key: Any) -> Any:
             depth = jnp.minimum(render(state.data).distance, MAX_DEPTH)
@@ -103,7 +103,7 @@ def report_rates(
         def run(carry: Any) -> Any:
             state, key = carry
             key, step_key = jax.random.split(key)
-            if size:
+            if image_size:
                 state, outputs = rollout_with_images(env, state, act, step_key)
             else:
                 state, _, outputs = envs.rollout(env, state, act, step_key, n_steps, summarize_transition)
@@ -154,7 +154,7 @@ def report_rates(
                 drones=drones,
                 n_worlds=n_worlds,
                 n_steps=steps,
-                depth=size,
+                depth=image_size,
                 engine=engine_name(base.sim),
                 compile_s=round(compile_s[drones], 2),
                 env_steps_per_s=round_digits(n_worlds * base.sim.n_drones * steps / seconds),

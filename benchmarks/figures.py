@@ -1,4 +1,4 @@
-"""Figures of README.md and of the pages: make them again, write their tables, and list those that are too old.
+"""Figures of README.md and of the pages: measure them again, write their tables, and list outdated records.
 
     python benchmarks/figures.py --list
     python benchmarks/figures.py --write [--only loop step] [--device gpu] [--peer-python PATH/OF/python]
@@ -10,8 +10,8 @@ the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of o
 the repository, ``--write --records FILE --commit COMMIT`` writes the records to a file, and ``--write --take FILE`` in
 the repository puts them into the pages.
 
-``--stale`` lists each record that is older than a change of what it measures, and ends with status 1 if there is one.
-Changes of comments, docstrings, annotations of functions, names and error messages do not count.
+``--stale`` lists each record that is older than a change of the code that it measures, and ends with status 1 if there
+is such a record. Changes of comments, docstrings, annotations of functions, names and error messages are ignored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import tables
 from tables import Line
 
 ROOT = Path(__file__).parents[1]
-STORE = ROOT / "docs" / "concepts" / "figures.json"
+RECORDS_FILE = ROOT / "docs" / "concepts" / "figures.json"
 MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
 """Keys of lines that a record holds once for all lines."""
 
@@ -56,13 +56,13 @@ class Figure(NamedTuple):
     sources: tuple[str, ...]
     """Sources that the figure measures, as Git's path specifications, without the script of the command."""
     cpu: str = ""
-    """Command on two cores, without ``python benchmarks/``; empty if there is none."""
+    """Command on two cores, without ``python benchmarks/``; empty if the figure has no command for a CPU."""
     gpu: str = ""
-    """Command on one GPU."""
+    """Command on GPUs, in the same form."""
     table: Callable[[list[Line]], str] | None = None
-    """Function that returns the Markdown of a record's lines; None where the page is written by hand."""
+    """Function that returns the Markdown of a record's lines; None if another command writes the page."""
     commits: Callable[[], dict[str, str]] | None = None
-    """Commits of figures that another command stores, by name."""
+    """Function that returns the commits of records that another command stores, by name; None for other figures."""
 
     def command(self, device: str) -> str:
         """Return the command for a device."""
@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument(
         "--take", type=Path, nargs="+", default=[], help="files with records to write instead of new ones"
     )
-    parser.add_argument("--commit", help="commit of the sources; by default the one that is checked out")
+    parser.add_argument("--commit", help="commit of the sources; by default the commit that is checked out")
     args = parser.parse_args()
     failures: list[str] = []
     if args.list:
@@ -136,13 +136,13 @@ def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
         if process.returncode or not lines:
             failures.append(f"{name}: {shown_command} failed with status {process.returncode}; its error is above.")
             continue
-        records.append(record(name, shown_command, commit, lines))
+        records.append(make_record(name, shown_command, commit, lines))
         if args.records is not None:
             args.records.write_text(records_text(records))
     return records, failures
 
 
-def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
+def make_record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
     """Return the record of a figure."""
     machine_line = next(line for line in lines if "device" in line)
     cores = f"{machine_line['cores']} cores of {machine_line['processor']} ({machine_line['vectors']})"
@@ -159,12 +159,12 @@ def record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
 
 
 def current_commit() -> str:
-    """Return the commit that is checked out, with ``+`` if the sources have been changed since."""
-    changes = git("status", "--porcelain", "--", "crazysim", "benchmarks").strip()
-    return git("rev-parse", "--short=9", "HEAD").strip() + "+" * bool(changes)
+    """Return the commit that is checked out, followed by ``+`` if the sources differ from it."""
+    changes = run_git("status", "--porcelain", "--", "crazysim", "benchmarks").strip()
+    return run_git("rev-parse", "--short=9", "HEAD").strip() + "+" * bool(changes)
 
 
-def git(*words: str) -> str:
+def run_git(*words: str) -> str:
     """Return the output of a Git command in this repository."""
     process = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
     if process.returncode:
@@ -174,19 +174,20 @@ def git(*words: str) -> str:
 
 def load_records() -> list[Line]:
     """Return the stored records."""
-    return json.loads(STORE.read_text())
+    return json.loads(RECORDS_FILE.read_text())
 
 
 def records_text(records: Iterable[Line]) -> str:
-    """Return records as the store holds them."""
+    """Return records as the text of ``RECORDS_FILE``."""
     return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
 
 
 def store_records(records: list[Line]) -> None:
-    """Store records instead of earlier ones of the same figures and machines."""
-    by_figure = {(record["figure"], record["machine"]): record for record in [*load_records(), *records]}
+    """Store records in place of earlier records of the same figures and machines."""
+    record_by_key = {(record["figure"], record["machine"]): record for record in [*load_records(), *records]}
     order = list(FIGURES)
-    STORE.write_text(records_text(sorted(by_figure.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))))
+    sorted_records = sorted(record_by_key.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))
+    RECORDS_FILE.write_text(records_text(sorted_records))
 
 
 def write_pages() -> None:
@@ -199,7 +200,7 @@ def write_pages() -> None:
 
 
 def figure_names(text: str) -> list[str]:
-    """Return the names of the figures that a page has places for."""
+    """Return the names of the figures whose comments a page has."""
     return re.findall(r"^<!-- figure (\S+) -->$", text, re.MULTILINE)
 
 
@@ -227,44 +228,45 @@ def figure_tables(name: str, records: list[Line]) -> str:
 
 
 def stale_records() -> list[str]:
-    """Return a line for each record that is older than a change of what it measures."""
+    """Return a line for each record that is older than a change of the code that it measures."""
     reports = []
     for name, figure in FIGURES.items():
-        measured = [(record["machine"], record["commit"]) for record in load_records() if record["figure"] == name]
-        measured += list(figure.commits().items()) if figure.commits else []
-        if not measured:
+        commits = [(record["machine"], record["commit"]) for record in load_records() if record["figure"] == name]
+        commits += list(figure.commits().items()) if figure.commits else []
+        if not commits:
             reports.append(f"{name}: no record")
-        for machine, commit in measured:
+        for machine, commit in commits:
             try:
                 paths = changed_files(commit, figure.tracked_paths())
             except RuntimeError as error:
                 reports.append(f"{name}, {machine}: {error}")
                 continue
             if paths:
-                others = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
-                reports.append(f"{name}, {machine}: {', '.join(paths[:3])}{others} changed after {commit}")
+                more_text = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+                reports.append(f"{name}, {machine}: {', '.join(paths[:3])}{more_text} changed after {commit}")
     return reports
 
 
-def changed_files(commit: str, spec: Iterable[str]) -> list[str]:
+def changed_files(commit: str, path_specs: Iterable[str]) -> list[str]:
     """Return the files whose code differs between a commit and the working tree, apart from renamed names."""
     if commit.endswith("+"):
         raise RuntimeError(f"measured with changes beyond commit {commit[:-1]}")
-    paths = git("diff", "--name-only", "--no-renames", commit, "--", *spec).split()
-    pairs = {path: pair for path in paths if (pair := versions(commit, path)) is not None}
+    paths = run_git("diff", "--name-only", "--no-renames", commit, "--", *path_specs).split()
+    pairs = {path: pair for path in paths if (pair := read_versions(commit, path)) is not None}
     old_names, new_names = ({name for pair in pairs.values() for name in pair[k].defined} for k in (0, 1))
 
     def is_same_name(old: str, new: str) -> bool:
-        """Return True if two names are equal, or if the new one replaced the old one.
+        """Return True if two names are equal, or if the new name replaced the old name.
 
-        A name replaced another one if both are defined in the changed files, and the old one is no longer defined, or
-        the new one was not defined before. The file that defines it has changed if it names new code.
+        The new name replaced the old name if both are defined in the changed files, and either the old name is no
+        longer defined, or the new name was not defined before. If the new name is a name of new code, the file that
+        defines it has changed.
         """
         is_renamed = old in old_names and new in new_names and (new not in old_names or old not in new_names)
         return old == new or is_renamed
 
     def is_unchanged(path: str) -> bool:
-        """Return True if a file differs only in names; local variables are renamed one to one within a function."""
+        """Return True if a file differs only in names. Local variables must be renamed one to one within a function."""
         if path not in pairs:
             return False
         old, new = pairs[path]
@@ -302,7 +304,7 @@ class Atom(NamedTuple):
     is_name: bool = False
     """True for a name, or for a constant that may be one."""
     function: int | None = None
-    """For a local variable, number of the function in the module that binds it; else None."""
+    """Number, in the module, of the function that binds a local variable; None for anything else."""
 
 
 class Code(NamedTuple):
@@ -316,31 +318,31 @@ class Code(NamedTuple):
     """Names that it defines."""
 
 
-def versions(commit: str, path: str) -> tuple[Code, Code] | None:
-    """Return the code of a Python file at a commit and in the working tree; None if one of them has no such file."""
+def read_versions(commit: str, path: str) -> tuple[Code, Code] | None:
+    """Return the code of a Python file at a commit and in the working tree; None if the file is missing in one."""
     if not path.endswith(".py") or not (ROOT / path).exists():
         return None
     try:
-        return code_at(commit, path), code_of((ROOT / path).read_text())
+        return read_code(commit, path), parse_code((ROOT / path).read_text())
     except RuntimeError:
         return None
 
 
 @functools.cache
-def code_at(commit: str, path: str) -> Code:
+def read_code(commit: str, path: str) -> Code:
     """Return the code of a file at a commit."""
-    return code_of(git("show", f"{commit}:{path}"))
+    return parse_code(run_git("show", f"{commit}:{path}"))
 
 
 @functools.cache
-def code_of(source: str) -> Code:
+def parse_code(source: str) -> Code:
     """Return the code of a Python source."""
     code = Code([], set(), set())
     _add_atoms(code, ast.parse(source), itertools.count(), {})
     return code
 
 
-FUNCTIONS = (
+FUNCTION_NODES = (
     ast.FunctionDef,
     ast.AsyncFunctionDef,
     ast.Lambda,
@@ -365,7 +367,7 @@ def _add_atoms(code: Code, node: ast.AST, counter: Iterator[int], functions: dic
         module = getattr(node, "module", None) or ""
         code.imports.update((*module.split("."), name.name, name.asname or "") for name in node.names)
         return
-    if isinstance(node, FUNCTIONS):
+    if isinstance(node, FUNCTION_NODES):
         functions = functions | dict.fromkeys(_local_variables(node), next(counter))
     code.atoms.append(Atom(type(node).__name__))
     is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
@@ -395,18 +397,18 @@ def _add_atoms(code: Code, node: ast.AST, counter: Iterator[int], functions: dic
 
 
 def _local_variables(function: ast.AST) -> set[str]:
-    """Return the names that a function binds as parameters or variables, without the functions in it."""
+    """Return the names that a function binds as parameters or variables, without the names of its inner functions."""
     names, nodes = set(), list(ast.iter_child_nodes(function))
     while nodes:
         node = nodes.pop()
         if _defines(node) and not isinstance(node, ast.Attribute):
             names.add(next(getattr(node, field) for field in ("arg", "id", "name") if hasattr(node, field)))
-        nodes += [] if isinstance(node, FUNCTIONS) else ast.iter_child_nodes(node)
+        nodes += [] if isinstance(node, FUNCTION_NODES) else ast.iter_child_nodes(node)
     return names
 
 
 def _defines(node: ast.AST) -> bool:
-    """Return True if a node gives a meaning to its name."""
+    """Return True if a node defines its name."""
     return isinstance(node, ast.arg | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.ExceptHandler) or (
         isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store)
     )

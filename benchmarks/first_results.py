@@ -1,6 +1,6 @@
 """Time from ``python`` to the first result of a new user, without and with persistent caches.
 
-Each run is a process of its own. ``wall_s`` and ``cpu_s`` (user and system, with the C++ compiler) are medians.
+Each run is a separate process. ``wall_s`` and ``cpu_s`` (user and system, with the C++ compiler) are medians.
 
     python benchmarks/first_results.py [--repeat 3] [--cases step contacts ...]
 """
@@ -56,7 +56,7 @@ print(env.step(np.zeros((16, 4), np.float32))[1])
 print(crazysim.Sim().render("rgb_array").mean())
 """,
 }
-"""Programs after ``import crazysim``."""
+"""Programs by case, without their first line ``import crazysim``."""
 
 
 def main() -> None:
@@ -66,9 +66,9 @@ def main() -> None:
     args = parser.parse_args()
     for case in args.cases:
         with tempfile.TemporaryDirectory() as folder:
-            uncached = [measure_cases(case, "off") for _ in range(args.repeat)]
-            measure_cases(case, folder)
-            cached = [measure_cases(case, folder) for _ in range(args.repeat)]
+            uncached = [measure_case(case, "off") for _ in range(args.repeat)]
+            measure_case(case, folder)
+            cached = [measure_case(case, folder) for _ in range(args.repeat)]
         for name, runs in (("off", uncached), ("on", cached)):
             wall, cpu = map(statistics.median, zip(*runs, strict=True))
             line = {"benchmark": "first_results", "case": case, "cache": name}
@@ -76,8 +76,8 @@ def main() -> None:
             print(json.dumps(line | times | describe_machine("cpu")), flush=True)
 
 
-def measure_cases(case: str, cache: str) -> tuple[float, float]:
-    """Return the wall time and the CPU time of a process, s."""
+def measure_case(case: str, cache: str) -> tuple[float, float]:
+    """Return the wall time and the CPU time of a process that runs a case, s."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {CACHE_VARIABLE: cache}
     program = f"import crazysim\n{CASES[case]}"
     usage_before, start_time = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()

@@ -1,8 +1,8 @@
 """Steps per second of mixed fleets: drones with cars, and drones of two airframes in one world.
 
-One JSON line for each case. ``cars``: worlds of drones and cars, and the same worlds without cars; the figure is
-the ratio of their rates. ``airframes``: every other drone has a second airframe; the reference has one airframe,
-and parameters for each drone. The two simulations of a case are measured alternately.
+One JSON line for each case, with the ratio of the rates of a fleet and of a reference, measured alternately. ``cars``:
+the fleet has drones and cars, the reference only drones. ``airframes``: two airframes alternate among the drones of the
+fleet; the reference has one airframe, and parameters for each drone.
 
     python benchmarks/fleets.py [--device gpu] [--worlds 4096] [--drones 4] [--cars 2]
 """
@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     args = parser.parse_args()
     cases = {
-        "cars": (drones(args), drones_and_cars(args)),
-        "airframes": (drones(args, has_own_params=True), two_airframes(args)),
+        "cars": (make_drones(args), make_drones_and_cars(args)),
+        "airframes": (make_drones(args, has_own_params=True), make_two_airframes(args)),
     }
     for case, (reference, fleet) in cases.items():
         flights = {name: Flight(sim, "state", args.steps, args.device)
@@ -49,8 +49,8 @@ def main() -> None:
                ratio=round_digits(durations["reference"] / durations["fleet"]), crazysim=__version__)  # fmt: skip
 
 
-def drones(args: argparse.Namespace, has_own_params: bool = False) -> Sim:
-    """Return drones alone, which share their parameters or have a set each."""
+def make_drones(args: argparse.Namespace, has_own_params: bool = False) -> Sim:
+    """Return a simulation of drones, which share their parameters or have separate parameters."""
     sim = Sim(args.worlds, args.drones, control="state", device=args.device)
     if has_own_params:
         shape = sim.data.states.pos.shape[:2]
@@ -66,15 +66,15 @@ def drones(args: argparse.Namespace, has_own_params: bool = False) -> Sim:
     return sim
 
 
-def two_airframes(args: argparse.Namespace) -> Sim:
-    """Return drones whose airframes alternate."""
+def make_two_airframes(args: argparse.Namespace) -> Sim:
+    """Return a simulation of drones with two airframes that alternate."""
     airframes = [AIRFRAMES[k % 2] for k in range(args.drones)]
     return Sim(args.worlds, args.drones, drone=airframes, control="state", device=args.device)
 
 
-def drones_and_cars(args: argparse.Namespace) -> Sim:
-    """Return drones, and cars that drive circles."""
-    sim = drones(args)
+def make_drones_and_cars(args: argparse.Namespace) -> Sim:
+    """Return a simulation of drones, and of cars that drive circles."""
+    sim = make_drones(args)
     cars = sim.add(Cars(args.cars, in_scene=False))
     command = np.tile(np.array([0.08, 0.2], np.float32), (args.worlds, args.cars, 1))
     sim.data = cars.with_command(sim.data, command)

@@ -1,15 +1,16 @@
-"""Cost of trajectories, controllers and loads: physics steps per second of each, and its ratio, one JSON line each.
+"""Cost of trajectories, controllers and loads: one JSON line for each case, with its physics steps per second.
 
     python benchmarks/flight_stack.py [--device gpu] [--worlds 1024] [--cases state follow rod ...] [--operations]
 
-Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time over the reference's: constant
-state commands for trajectories and controllers, the bare drone with rotor commands for loads.
+Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time of the case divided by the time of its
+reference. The reference is ``state`` for trajectories and controllers, and ``rotor`` for loads.
 
 - state: the default controller, a constant command; follow: a figure eight for all; starts: with a start per world
 - slots: 16 trajectories of 60 pieces, index and start per world
 - geometric: geometric control at 100 Hz along a figure eight
 - pid, mellinger: the firmware's controllers, a constant command
-- rotor: rotor commands; rod, cable: with a load at the centre of mass; offset: a rod below it, with damping
+- rotor: rotor commands without a load; rod, cable: a load attached to the centre of mass; offset: a rod attached below
+  the centre of mass, with damping
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ N_STEPS = 100
 FIGURE_EIGHT_SIZE = (0.4, 0.2)
 """Size of the figure eight that drones follow, m; its period is 5 s."""
 N_SLOTS, N_PIECES = 16, 60
-"""Trajectories and pieces of each in the case ``slots``."""
+"""Number of trajectories, and of the pieces of each trajectory, in the case ``slots``."""
 LOAD_SETTINGS = {"mass": 0.0005, "length": 0.3, "in_scene": False}
 """Settings of loads, kg and m: so light that the rotor command of a bare drone holds them up for a while."""
 
@@ -56,25 +57,25 @@ def main() -> None:
 
 def make_flight(args: argparse.Namespace, name: str) -> Flight:
     """Return the compiled flight of a case."""
-    reference, settings, add = CASES[name]
+    reference, settings, add_plugin = CASES[name]
     sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
-    if add is not None:
-        add(sim)
+    if add_plugin is not None:
+        add_plugin(sim)
     return Flight(sim, "rotor_vel" if reference == "rotor" else "state", N_STEPS, args.device)
 
 
 def follow_trajectory(sim: Sim) -> None:
-    """Let all drones follow one trajectory."""
+    """Make all drones follow one trajectory."""
     sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), visible=False))
 
 
 def follow_from_own_starts(sim: Sim) -> None:
-    """Let all drones follow one trajectory, each from a different time on."""
+    """Make all drones follow one trajectory, from a different time on in each world."""
     sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), start=start_times(sim), visible=False))
 
 
 def follow_slots(sim: Sim) -> None:
-    """Let the drones follow 16 trajectories of 60 pieces, each from a different time on."""
+    """Make the drones follow 16 trajectories of 60 pieces, from a different time on in each world."""
     coefficients = np.random.default_rng(0).normal(0.0, 0.01, (N_PIECES, 4, 8))
     coefficients[:, 2, 0] = 1.0
     pieces = Trajectory.of_pieces(np.full(N_PIECES, 0.1), coefficients)
@@ -108,11 +109,11 @@ CASES: dict[str, tuple[str, dict[str, Any], Callable[[Sim], Any] | None]] = {
     "cable": ("rotor", ROTOR_SETTINGS, load_adder(cable=True)),
     "offset": ("rotor", ROTOR_SETTINGS, load_adder(attach=[0.0, 0.0, -0.02], damping=1e-5)),
 }
-"""Reference, settings of ``Sim``, and function that adds to the simulation, of each case."""
+"""Name of the reference, settings of ``Sim``, and function that adds a plugin to the simulation, of each case."""
 
 
 def count_operations(sim: Sim) -> dict[str, int]:
-    """Return the number of operations of each kind in the program of a step, or none if the step has no program."""
+    """Return the number of operations of each kind in the program of a step; empty if the step has no program."""
     program = sim.build_step_fn().plan(sim.data).program
     blocks = [segment.block for segment in program.segments if isinstance(segment, Segment)] if program else []
     return dict(Counter(operation.name for block in blocks for operation in block.walk()).most_common())

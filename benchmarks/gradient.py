@@ -1,10 +1,10 @@
-"""Times of gradients and of the steps that they go through: one JSON line for each command level and number of worlds.
+"""Times of gradients and of the steps that they differentiate: a JSON line for each command level and number of worlds.
 
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
-The gradient is taken of the squared distances from the start after ``--steps`` steps, with respect to the commands.
-``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode, and ``forward_s`` the
-time of the distances alone. Calls alternate; on a GPU the calls of a batch are queued.
+The gradient is the gradient of the squared distances from the start after ``--steps`` steps, with respect to the
+commands. ``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode. ``forward_s``
+is the time of the distances alone. Calls alternate; on a GPU the calls of a batch are queued.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from crazysim import Sim, __version__
 from crazysim.core import functional
 
 BATCH_CALLS = {"cpu": 1, "gpu": 10}
-"""Calls of a batch."""
+"""Number of calls in a batch."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
 
 
 def seconds(fn: Callable[[jax.Array], Any], cmd: jax.Array, n_calls: int) -> float:
-    """Return the time of a call in a batch, s."""
+    """Return the time of one call in a batch of ``n_calls``, s."""
     start_time = time.perf_counter()
     jax.block_until_ready([fn(cmd) for _ in range(n_calls)])
     return (time.perf_counter() - start_time) / n_calls

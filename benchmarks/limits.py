@@ -1,9 +1,9 @@
 """Lower bound of the time of each case on this machine, and the measured time relative to it.
 
-The lower bound is the larger of two times: for the operations at the rate of multiply-adds measured here through
-the same engine, and for the data, with each number that a call reads or writes moved once at the bandwidth of a
-copy measured here. Both rates are the best of all repeats; the measured time is a median. Data that fits into a cache
-may move faster than the copy, which does not fit.
+The lower bound is the larger of two times. One is the time of the operations at the rate of multiply-adds that the same
+engine reaches on this machine. The other is the time to move each number that a call reads or writes once, at the
+bandwidth of a copy on this machine. Both rates are the best of all repeats; the measured time is a median. The copy is
+larger than the caches. Data that fits into a cache may move faster.
 
 Operations are counted in multiply-adds in the program of one drone (``Plan.program``), see ``ops.TABLE``. The count is
 never too high, so the lower bound is valid.
@@ -33,7 +33,7 @@ COPY_SIZES = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""
 
 DEFAULT_WORLDS = {"cpu": 2**14, "gpu": 2**20}
-"""Number of drones, and default number of worlds, that fill every core."""
+"""Number of worlds of one drone that fill every core; also the default of --worlds."""
 
 N_CHAINS, CHAIN_LENGTH = 8, 32
 """Number of independent chains of multiply-adds, and their length in one step."""
@@ -101,7 +101,7 @@ def measure(
 
 
 def count_work(sim: Sim) -> tuple[float, float, int]:
-    """Return the multiply-adds of one drone per step, those per call, and the bytes that a call reads and writes.
+    """Return three numbers of one drone: multiply-adds per step, multiply-adds per call, and bytes that a call moves.
 
     The program is taken from ``lanes`` with one world, whichever engine runs.
 
@@ -114,9 +114,7 @@ def count_work(sim: Sim) -> tuple[float, float, int]:
     if program.unfused_stages:
         stage = program.unfused_stages[0]
         raise SystemExit(f"{stage.explanation}; its operations cannot be counted. Remove the stage.")
-    when_rate = (
-        sim.control_freq / sim.freq
-    )  # the one condition in the built-in pipelines is the state controller's rate
+    when_rate = sim.control_freq / sim.freq  # the only condition in the built-in pipelines is the tick of a controller
     step_operations = sum(count_operations(segment.block, when_rate) for segment in program.fused_segments)
     blocks = [s.hoisted for s in program.fused_segments] + (
         [program.check_segment.block] if program.check_segment else []
@@ -124,14 +122,19 @@ def count_work(sim: Sim) -> tuple[float, float, int]:
     call_operations = sum(count_operations(block, when_rate) for block in blocks)
     batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
     sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in batched}
-    read_numbers, written_numbers = (
+    read_bytes, written_bytes = (
         sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read_leaves, program.written_leaves)
     )
-    return step_operations, call_operations, read_numbers + written_numbers
+    return step_operations, call_operations, read_bytes + written_bytes
 
 
 def count_operations(block: Block, when_rate: float) -> float:
-    """Return the operations of a block in multiply-adds; conditional blocks count with their frequency."""
+    """Return the operations of a block in multiply-adds.
+
+    Args:
+        block: The block.
+        when_rate: Fraction of the steps at which conditional blocks run.
+    """
     total = -float(_count_contracted(block))
     for op in block.operations:
         count = {"when": when_rate, "loop": dict(op.params).get("length", 1)}.get(op.name, 1)
@@ -151,8 +154,8 @@ def _count_contracted(block: Block) -> int:
     contracted = 0
     for op in block.operations:
         sums = {user.results[0]: user for x in op.results for user in users.get(x, []) if user.results}
-        fits = all(u.name in ("add", "sub") and k not in products for k, u in sums.items())
-        if op.name == "mul" and op.dtype.kind == "f" and sums and fits and op.results[0] not in outputs:
+        is_summed = all(user.name in ("add", "sub") and x not in products for x, user in sums.items())
+        if op.name == "mul" and op.dtype.kind == "f" and sums and is_summed and op.results[0] not in outputs:
             products |= sums.keys()
             contracted += 1
     return contracted
@@ -191,7 +194,7 @@ def multiply_adds(data: Any) -> Any:
 
 
 def arithmetic_rate(device: str, n_worlds: int, repeats: int, n_steps: int = 1000) -> float:
-    """Return the multiply-adds per second of a pipeline that does nothing else, on the fastest engine."""
+    """Return the multiply-adds per second of a pipeline of only multiply-adds, on the fastest engine."""
     sim = Sim(n_worlds, device=device, engine=fastest_engine(device))
     sim.data = sim.data.replace(plugins={"chain": Chain(jnp.zeros((n_worlds, 1, N_CHAINS)))})
     sim.step_pipeline = {"multiply_adds": multiply_adds}

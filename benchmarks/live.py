@@ -5,9 +5,9 @@
 - max: as fast as possible, setpoints of all drones renewed at every control step; simulated seconds per second
 - recorded: the same, with 50 samples per simulated second written to a file
 - pictures: in real time, with a page in a server that one client reads, and 50 pictures a second
-- jitter: in real time without viewers; lateness of control steps, which 99.9% keep below lateness_999, ms
+- jitter: in real time without viewers; 99.9% of control steps are late by at most ``lateness_999_ms``
 
-One world, control at 100 Hz, physics at 500 Hz. For the stated figure of jitter use --seconds 600 on an idle machine.
+One world, control at 100 Hz, physics at 500 Hz. To measure jitter, use --seconds 600 on an idle machine.
 """
 
 from __future__ import annotations

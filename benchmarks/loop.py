@@ -2,9 +2,9 @@
 
     python benchmarks/loop.py [--device gpu] [--worlds 1 64 1024 16384] [--controls state attitude]
 
-One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. The
-next lines show how much of it JAX takes: one compiled addition to as many positions, read into NumPy. The last line is
-the loop of C MuJoCo with one free box: set its force, take 5 steps with ``mj_step``, read its position.
+One JSON line for each command level and number of worlds, with the median and the shortest time of an iteration. The
+lines ``loop/jax`` show how much of this time JAX takes: one compiled addition to as many positions, read into NumPy.
+The last line is the loop of C MuJoCo with one free box: set its force, take 5 ``mj_step``, read its position.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def measure_times(reset: Callable[[], None], iterate: Callable[[], None], repeat
 
 
 def jax_loop(device: str, n_worlds: int) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return the reset and the iteration of a loop that adds one to as many positions and reads them."""
+    """Return the reset and the iteration of a loop that adds one to ``n_worlds`` positions and reads them."""
     positions = jax.device_put(np.zeros((n_worlds, 1, 3), np.float32), jax.devices(device)[0])
     plus_one = jax.jit(lambda x: x + 1.0)
 
@@ -90,8 +90,8 @@ def jax_loop(device: str, n_worlds: int) -> tuple[Callable[[], None], Callable[[
 
 def mujoco_loop() -> tuple[Callable[[], None], Callable[[], None]]:
     """Return the reset and the iteration of a loop of C MuJoCo with one box that a force holds up."""
-    text = '<mujoco><worldbody><body><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>'
-    model = mujoco.MjModel.from_xml_string(text)
+    xml = '<mujoco><worldbody><body><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     force = np.array([0.0, 0.0, -model.opt.gravity[2] * model.body_mass[1]])
 

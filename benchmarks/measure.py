@@ -1,6 +1,6 @@
 """Shared timing: compile separately, warm up, synchronise, repeat, take the median.
 
-This module imports neither program, because it also runs in Crazyflow's environment, which has no crazysim.
+This module imports neither crazysim nor Crazyflow, because it runs in the environments of both.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ COMMANDS = {
 """Command of each level that makes a cf21B_500 hover, since a crashed drone costs less to simulate."""
 
 BATCH_STEPS = {"cpu": 100, "gpu": 1000}
-"""Steps after which the flight restarts; hovering without a position controller drifts by 7 cm in 1,000 steps."""
+"""Steps after which a flight restarts. Without a position controller, hovering drones drift by 7 cm in 1,000 steps."""
 
 REPEATS_TIME_LIMIT = 60.0
 """Duration after which three repeats are enough, s."""
@@ -65,18 +65,17 @@ def engine_name(sim: Any) -> str:
 class Flight:
     """Hovering simulation of either program, timed in batches of calls that start from the same data.
 
-    On a GPU the calls of a batch are queued back to back, and waited for once at the end. On a CPU every call is
-    waited for.
+    On a GPU the calls of a batch are queued, and the program waits once at the end. On a CPU it waits for every call.
     """
 
     def __init__(self, sim: Any, control: str, n_steps: int, device: str):
-        """Make the drones hover, and step once, which compiles."""
+        """Make the drones hover, and step once, which compiles the step."""
         start_hovering(sim, control)
         self.sim, self.n_steps, self.start_data = sim, n_steps, sim.data
         self.is_queued = device != "cpu"
         self.n_calls = max(BATCH_STEPS["gpu" if self.is_queued else "cpu"] // n_steps, 1)
         self.first_s = seconds(self._step)
-        self.seconds()  # Crazyflow compiles a second time for data that a step returned; no figure includes that
+        self.seconds()  # Crazyflow compiles again for data that a step returned; no figure includes this
 
     def seconds(self) -> float:
         """Return the time of one call in a batch, s."""
@@ -94,7 +93,7 @@ class Flight:
         """Check that the drones still fly.
 
         Raises:
-            SystemExit: If one does not.
+            SystemExit: If a drone does not fly.
         """
         if not is_flying(self.sim):
             raise SystemExit(f"{self.sim.control}, {self.sim.integrator}: the drones do not fly any more; no figure")
@@ -112,7 +111,7 @@ def seconds(call: Callable[[], Any]) -> float:
 
 
 def medians(measures: dict[Any, Callable[[], float]], repeats: int) -> dict[Any, float]:
-    """Return the median of each measurement, alternating between them so that noise affects all equally."""
+    """Return the median of each measurement. Measurements alternate, so that noise affects all of them equally."""
     durations: dict[Any, list[float]] = {name: [] for name in measures}
     start_time = time.perf_counter()
     for n_done in range(repeats):
@@ -130,14 +129,14 @@ def report_flights(
     references: dict[str, str],
     **entries: Any,
 ) -> None:
-    """Time flights alternately, and print the rate of each and the ratio of its time to that of its reference.
+    """Time flights alternately, and print a line for each, with its rate and the ratio of its time to a reference.
 
     Args:
         device: The platform.
         flights: Flights by name of the case.
-        repeats: Number of times that each is measured.
-        references: Name of the flight that each is compared with.
-        entries: Further entries of each line; one that is a function is called with the simulation.
+        repeats: Number of times that each flight is measured.
+        references: Name of the reference of each flight.
+        entries: Further entries of each line. A function is called with the simulation and returns the entry.
     """
     durations = medians({name: flight.seconds for name, flight in flights.items()}, repeats)
     for name, flight in flights.items():
@@ -165,7 +164,7 @@ def run_in_process(function: Any, *args: Any) -> Any:
 
 
 def round_digits(value: float, n: int = 3) -> float:
-    """Return a number rounded to its significant digits."""
+    """Return a number rounded to ``n`` significant digits."""
     return float(f"{value:.{n}g}")
 
 
@@ -199,7 +198,7 @@ def _vectors() -> str:
 
 
 def _cpu_info(key: str) -> str:
-    """Return an entry of /proc/cpuinfo for the first processor; empty on other systems than Linux."""
+    """Return an entry of /proc/cpuinfo for the first processor; empty on systems other than Linux."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")

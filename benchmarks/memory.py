@@ -1,20 +1,21 @@
-"""Success on airframes that policies have not seen, with and without memory and privileged critic.
+"""Success on airframes that were not in the training, with and without memory and privileged critic.
 
     python benchmarks/memory.py [--device gpu] [--tasks hover track] [--variants memoryless memory] [--seeds 0:4]
     python benchmarks/memory.py --device gpu --tasks hover --variants memory --seeds 0:4 --iterations 300
     python benchmarks/memory.py --worlds 16 --iterations 2 --starts 8 --seeds 0:2 --seconds 0.4
 
-Every variant of a task is trained by PPO on drones drawn by ``randomize="generic"`` around one airframe, all seeds in
-one program. Each kept policy is then flown on other drones, drawn in the same way around the training's airframe
-(``drawn``) and around each of the other Crazyflies, with the controller and the actions of that airframe.
+Every variant of a task is trained by PPO on drones that ``randomize="generic"`` draws around one airframe, all seeds in
+one program. Each kept policy is then flown on other drones. They are drawn in the same way around the airframe of the
+training (``drawn``) and around each of the other Crazyflies, with the controller and the actions of that airframe.
 
-A JSON line for each seed. Runs in the folder ``--out`` are continued from their checkpoints.
+There is a JSON line for each seed. Runs in the folder ``--out`` are continued from their checkpoints.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Hyperparameters of the variants, by name."""
 AIRFRAMES = ("cf2x_L250", "cf2x_P250", "cf2x_T350")
-"""Crazyflies other than ``cf21B_500``, with which the policies are trained."""
+"""Crazyflies other than ``cf21B_500``, the airframe of the training."""
 
 
 def main() -> None:
@@ -50,10 +51,11 @@ def main() -> None:
     args = parser.parse_args()
     options: dict[str, Any] = {"randomize": "generic", "device": args.device}
     options |= {} if args.seconds is None else {"seconds": args.seconds}
-    sets: dict[str, dict[str, Any]] = {"drawn": options} | {drone: options | {"drone": drone} for drone in AIRFRAMES}
+    drone_options = {drone: options | {"drone": drone} for drone in AIRFRAMES}
+    options_by_drones: dict[str, dict[str, Any]] = {"drawn": options} | drone_options
     machine_facts = describe_machine(args.device)
     for task in args.tasks:
-        envs = {name: make(task, args.starts, **env_options) for name, env_options in sets.items()}
+        envs = {name: make(task, args.starts, **env_options) for name, env_options in options_by_drones.items()}
         for variant in args.variants:
             folder = args.out / f"{task}-{variant}"
             training = {"n_steps": 64, "minibatches": 16, "discount": 0.98, "iterations": args.iterations}
@@ -74,9 +76,8 @@ def main() -> None:
                 line |= {name: round_digits(result.metrics[name]) for name in ("env_steps", "seconds")}
                 for name, env in envs.items():
                     metrics = evaluate(env, result.policy)
-                    line[name] = {
-                        x: round_digits(metrics[x]) for x in ("success", "crashed", "error") if metrics[x] == metrics[x]
-                    }
+                    numbers = {key: metrics[key] for key in ("success", "crashed", "error")}
+                    line[name] = {key: round_digits(x) for key, x in numbers.items() if not math.isnan(x)}
                 print(json.dumps(line | machine_facts), flush=True)
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/mocap.py --objects 50 --freq 240 --seconds 10
 
-A thread sends frames in real time, and the simulation takes them between control steps, as a live one does. One JSON
-line has the time that the rules take for a frame, and the time of an update of the scene, each as median and 99th
+A thread sends frames in real time, and the simulation takes them between control steps, as a live loop does. One JSON
+line has the time that the tracker takes for a frame and the time of an update of the scene, as median and 99th
 percentile.
 """
 
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def circling_bodies(n_objects: int) -> Callable[[float], dict]:
-    """Return a function of time, s, that gives the poses of objects that circle, each around its own centre."""
+    """Return a function of time, s, that returns the poses of objects, which circle around different centres."""
     phases = np.arange(n_objects)
 
     def bodies(t: float) -> dict:

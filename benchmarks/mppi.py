@@ -2,8 +2,8 @@
 
     python benchmarks/mppi.py [--device gpu] [--samples 1024 16384] [--horizon 50] [--substeps 2] [--knots 10]
 
-A command flies all samples over the horizon from the present state, weights them, and returns the first command of the
-new plan. On a GPU the state stays on the device, and the program waits for every command.
+A call flies all samples over the horizon from the present state, weights them, and returns the first command of their
+weighted mean. On a GPU the state stays on the device, and the program waits for every command.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Cost of sensors, estimators and effects: time of a step with each of them over the time without, one JSON line each.
+"""Cost of sensors, estimators and effects: a JSON line for each case, with the time of a step relative to no plugins.
 
     python benchmarks/plugins.py [--device gpu] [--worlds 262144] [--drones 2] [--cases imu kalman everything ...]
 
-Drones hover on a constant state command, in calls of 100 steps; all cases alternate. Sensors have their default rates;
-``kalman``, ``eskf`` and ``complementary`` are what ``Sim(estimator=...)`` adds with its sensors (the last only runs
-along); ``all_aids`` is one Kalman filter on all kinds of sensors that it takes, ``outdoors`` an error-state filter on
-satellites, barometer and magnetometer. ``everything`` is all sensors, the Kalman filter, wind with gusts, downwash,
-ground effect, battery and latency.
+Drones hover on a constant state command, in calls of 100 steps; all cases alternate. Sensors have their default rates.
+``kalman``, ``eskf`` and ``complementary`` are estimators with their sensors; the controllers do not use the estimate of
+``complementary``. ``all_aids`` is a Kalman filter with all kinds of sensors that it takes. ``outdoors`` is an
+error-state filter with satellite navigation, barometer and magnetometer. ``everything`` is all sensors, the Kalman
+filter, wind with gusts, downwash, ground effect, battery and latency.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from crazysim.plugins.estimators import ESKF, Complementary, Estimator
 N_STEPS = 100
 """Steps per call."""
 ANCHOR_POSITIONS = np.array([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
-"""Positions of anchors, m."""
+"""Positions of the anchors of ultra-wideband ranging, m. (4, 3)"""
 LIGHTHOUSE_POSES = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
-"""Positions, m, and roll, pitch and yaw, rad, of lighthouses."""
+"""Positions, m, and roll, pitch and yaw, rad, of two lighthouses."""
 SPACING = 3.0
 """Distance between drones of a world, m."""
 MakePlugins = Callable[[], Sequence[Plugin]]

@@ -1,8 +1,8 @@
 """Scaling of steps per second, compile time and bytes with the number of worlds and of drones per world.
 
-One JSON line for each engine and size, in two series: ``worlds`` of one drone each, and ``drones`` per world with a
-constant total. Each case runs in its own process, so that nothing is cached. ``bytes_a_world`` are the bytes of
-``sim.data`` per world, without shared leaves.
+One JSON line for each engine and size, in two series. In the series ``worlds`` each world has one drone. In the series
+``drones`` the number of drones per world grows and the total number of drones is constant. Each case runs in its own
+process, so that nothing is cached. ``bytes_a_world`` are the bytes of ``sim.data`` per world, without shared leaves.
 
     python benchmarks/scaling.py [--engine plain lanes fused] [--most-worlds 4194304] [--plot out/scaling.png]
     python benchmarks/scaling.py --lines out/scaling.jsonl --plot out/scaling.png     # plots stored lines
@@ -60,10 +60,8 @@ def measure_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
                 line = {"benchmark": "scaling", "series": series, "engine": engine, **case, "n_steps": args.steps}
                 try:
                     line |= run_in_process(measure, {**case, "engine": engine}, args.steps, args.device, args.repeats)
-                except (
-                    BrokenProcessPool,
-                    jax.errors.JaxRuntimeError,
-                ) as error:  # out of memory: continue with the other sizes
+                except (BrokenProcessPool, jax.errors.JaxRuntimeError) as error:
+                    # Out of memory: continue with the other sizes.
                     line |= {"error": f"{type(error).__name__}: {error}"[:200]}
                 print(json.dumps(line), flush=True)
                 lines.append(line)
@@ -71,7 +69,7 @@ def measure_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def powers_of_4(limit: int) -> list[int]:
-    """Return 1, 4, 16, ... up to a maximum."""
+    """Return 1, 4, 16, ... up to ``limit``."""
     return [4**k for k in range(limit.bit_length()) if 4**k <= limit]
 
 
@@ -100,12 +98,14 @@ def bytes_a_world(sim: Sim) -> int:
 
 
 SERIES_AXES = {"worlds": ("n_worlds", "worlds of one drone"), "drones": ("n_drones", "drones a world")}
+"""Key of the size of a case, and label of its axis, by series."""
 ENGINE_STYLES = {
     "plain": ("#9a6a3a", "s"),
     "lanes": ("#2b7a78", "o"),
     "fused": ("#c1443c", "^"),
     "auto": ("#555555", "D"),
 }
+"""Colour and marker of the lines of each engine."""
 
 
 def plot(lines: list[dict[str, Any]], path: Path) -> None:
@@ -125,13 +125,13 @@ def plot(lines: list[dict[str, Any]], path: Path) -> None:
     for row, (quantity, label) in zip(grid, quantities.items(), strict=True):
         for axes, series in zip(row, plotted_series, strict=True):
             size, name = SERIES_AXES[series]
-            for engine, (colour, mark) in ENGINE_STYLES.items():
+            for engine, (color, marker) in ENGINE_STYLES.items():
                 for control, style in zip(controls, ("-", "--", ":", "-.", (0, (1, 3))), strict=False):
                     selection = {"series": series, "engine": engine, "control": control}
                     points = [(line[size], line[quantity]) for line in lines if line.items() >= selection.items()]
                     if points:
                         title = engine if len(controls) == 1 else f"{engine}, {control}"
-                        axes.loglog(*zip(*points, strict=True), marker=mark, color=colour, ls=style, label=title)
+                        axes.loglog(*zip(*points, strict=True), marker=marker, color=color, ls=style, label=title)
             axes.set(xlabel=name, ylabel=label)
             axes.grid(alpha=0.3)
     grid[0][0].legend()

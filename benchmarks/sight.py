@@ -103,7 +103,7 @@ def measure_lidars(args: argparse.Namespace, n_images: int) -> None:
 
 
 def time_calls(run: Callable[[Any], Any], carry: Any, repeats: int) -> tuple[float, float, Any]:
-    """Return the median time of a call, the time of the first one, s, and the second result of the last one."""
+    """Return the median time of a call, s, the time of the first call, s, and the second result of the last call."""
     results = [carry, None]
 
     def call(n_calls: int) -> float:

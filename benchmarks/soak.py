@@ -6,17 +6,17 @@ Drones circle in real time while motion capture sends 240 frames a second, 50 pi
 the page, and poses are recorded. Linux only. The program prints one JSON line with these keys, among others:
 
 - ``factor``: simulated seconds per second;
-- ``memory_mb``: resident memory of the process, MB, at the first reading after a tenth of the time and at the last;
+- ``memory_mb``: resident memory of the process, MB, at the first reading after a tenth of the time and at the end;
 - ``growth_mb_per_hour``: slope of a line fitted to all readings after that tenth, MB/h;
-- ``frames``, ``frames_lost``: frames of motion capture that were accepted, and polls that found frames lost;
+- ``frames``, ``frames_lost``: frames of motion capture that were accepted, and polls that found lost frames;
 - ``pictures_per_s``, ``recorded_mb``: pictures sent per second, and size of the recording, MB;
-- ``late``, ``lateness_999_ms``, ``worst_ms``: control steps that began more than 2 ms late, lateness that 99.9% of them
-  did not exceed, and the greatest, ms;
+- ``late``: number of control steps that began more than 2 ms late;
+- ``lateness_999_ms``, ``worst_ms``: 99.9th percentile and maximum of the lateness of control steps, ms;
 - ``lost_s``: time that was given up because the simulation could not catch up, s;
 - ``failures``: errors that were logged without ending the run.
 
-The first tenth is left out of the memory, because programs are compiled in it. In a run of ten minutes or more, it also
-contains the first minute, in which the snapshots of the loop reach their largest number.
+Memory in the first tenth of the time is not counted, because programs are compiled then. In a run of ten minutes or
+more, this tenth also contains the first minute, in which the snapshots of the loop reach their largest number.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from crazysim.lab.live.circles import Circles
 FREQ = 240.0
 """Frames per second of motion capture, Hz."""
 WARM_UP = 0.1
-"""Fraction of the time, from the beginning, whose readings of the memory are left out."""
+"""Fraction of the run, from the beginning, in which readings of the memory are left out."""
 
 
 def main() -> None:
@@ -114,7 +114,7 @@ class Memory:
         self._stop_event.set()
 
     def samples(self, start_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return times, s, and memory, MB, of the readings from a time on; times begin with the thread. (n,), (n,)"""
+        """Return times since the start of the thread, s (n,), and memory, MB (n,), of readings from ``start_s`` on."""
         times, memory_mb = np.asarray(self._readings).T
         return times[times >= start_s], memory_mb[times >= start_s]
 

@@ -43,7 +43,7 @@ def main() -> None:
 def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
     """Print one line for each engine and number of steps; all numbers of steps share one compilation."""
     cases = list(itertools.product(args.engine, args.controllers))
-    sims = {case: build(args, *case, control, integrator, n_worlds, n_drones) for case in cases}
+    sims = {case: build_sim(args, *case, control, integrator, n_worlds, n_drones) for case in cases}
     compile_s: dict[tuple[str, str], float] = {}
     for n_steps in args.steps:
         flights = {case: Flight(sim, control, n_steps, args.device) for case, sim in sims.items()}
@@ -69,10 +69,10 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
             )
 
 
-def build(
+def build_sim(
     args: argparse.Namespace, engine: str, controller: str, control: str, integrator: str, n_worlds: int, n_drones: int
 ) -> Sim:
-    """Return the simulation given by the options."""
+    """Return the simulation of a case."""
     sim = Sim(
         n_worlds,
         n_drones,
@@ -91,7 +91,7 @@ def build(
 
 
 def randomise_parameters(sim: Sim, max_deviation: float = 1e-4) -> None:
-    """Give every drone its own value of every parameter, varied so little that all of them still hover."""
+    """Give every drone its own value of every parameter, with so little variation that all drones still hover."""
     batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
 
     def randomise_leaf(scope: str, x: jax.Array) -> jax.Array:

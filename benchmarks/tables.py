@@ -14,30 +14,38 @@ Line = dict[str, Any]
 def pivot(
     lines: list[Line], row: Callable[..., str], column: Callable[..., str], value: Callable[..., str], corner: str
 ) -> str:
-    """Return a table of lines by row and column."""
+    """Return a Markdown table with a cell for each line.
+
+    Args:
+        lines: The lines.
+        row: Function from a line to the name of its row.
+        column: Function from a line to the name of its column.
+        value: Function from a line to the text of its cell.
+        corner: Heading of the names of rows.
+    """
     cells = {(row(line), column(line)): value(line) for line in lines}
     columns = list(dict.fromkeys(name for _, name in cells))
     rows = dict.fromkeys(name for name, _ in cells)
-    return table_of([corner, *columns], [[name, *(cells.get((name, x), "") for x in columns)] for name in rows])
+    return markdown_table([corner, *columns], [[name, *(cells.get((name, x), "") for x in columns)] for name in rows])
 
 
-def table_of(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table."""
     head = list(head)
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def columns(**getters: Callable[[Line], str]) -> Callable[[list[Line]], str]:
-    """Return a function that makes a table with a row for each line; underscores of headings are spaces."""
+    """Return a function that makes a table with a row for each line. Underscores in names become spaces in headings."""
     head = [name.replace("_", " ") for name in getters]
-    return lambda lines: table_of(head, [[get(line) for get in getters.values()] for line in lines])
+    return lambda lines: markdown_table(head, [[get(line) for get in getters.values()] for line in lines])
 
 
 LEVELS = {"rotor_vel": "rotor speeds", "attitude": "attitude", "state": "state"}
 INTEGRATORS = {"euler": "Euler", "rk4": "RK4"}
 
 
-def case_of(line: Line) -> str:
+def case_text(line: Line) -> str:
     """Return command level, integrator and controller of a line as text."""
     parts = [LEVELS[line["control"]], *([INTEGRATORS[line["integrator"]]] if "integrator" in line else [])]
     return ", ".join(
@@ -45,7 +53,7 @@ def case_of(line: Line) -> str:
     )
 
 
-def worlds_of(line: Line) -> str:
+def worlds_text(line: Line) -> str:
     """Return the number of worlds as text."""
     return f"{line['n_worlds']:,}"
 
@@ -75,16 +83,16 @@ def loops(lines: list[Line]) -> str:
     names = {"loop/jax": "a compiled sum, read", "loop/mj_step": "C MuJoCo, one box"}
 
     def row_of(line: Line) -> str:
-        return names[line["benchmark"]] if line["benchmark"] in names else case_of(line).replace(", Euler", "")
+        return names[line["benchmark"]] if line["benchmark"] in names else case_text(line).replace(", Euler", "")
 
-    return pivot(lines, row_of, worlds_of, time_of, "Commands, worlds")
+    return pivot(lines, row_of, worlds_text, time_of, "Commands, worlds")
 
 
 def versus(lines: list[Line]) -> str:
     """Return rates of crazysim and Crazyflow, their ratio, and the times of compilation."""
     return columns(
-        Commands=case_of,
-        Worlds=worlds_of,
+        Commands=case_text,
+        Worlds=worlds_text,
         crazysim=lambda x: si_text(x["crazysim_steps_per_s"]),
         Crazyflow=lambda x: si_text(x["crazyflow_steps_per_s"]),
         Ratio=lambda x: f"{round_digits(x['ratio'], 2):g}",
@@ -94,14 +102,14 @@ def versus(lines: list[Line]) -> str:
 
 def rates(lines: list[Line]) -> str:
     """Return steps per second by case and number of worlds."""
-    return pivot(lines, case_of, worlds_of, lambda x: si_text(x["steps_per_s"]), "Commands, worlds")
+    return pivot(lines, case_text, worlds_text, lambda x: si_text(x["steps_per_s"]), "Commands, worlds")
 
 
 def gradients(lines: list[Line]) -> str:
     """Return rates of gradients, and the ratios of their times to the times of the steps alone."""
     return columns(
         Commands=lambda x: LEVELS[x["control"]],
-        Worlds=worlds_of,
+        Worlds=worlds_text,
         Steps_per_second=lambda x: si_text(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
         Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
         Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
@@ -119,7 +127,7 @@ def env_rates(lines: list[Line]) -> str:
         drawn = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
         return f"`{line['task']}`, {names[line['actions']]}{image}{drawn}"
 
-    return pivot(lines, row_of, worlds_of, lambda x: si_text(x["env_steps_per_s"]), "Environment steps/s, worlds")
+    return pivot(lines, row_of, worlds_text, lambda x: si_text(x["env_steps_per_s"]), "Environment steps/s, worlds")
 
 
 def queries(lines: list[Line]) -> str:
@@ -144,16 +152,16 @@ def queries(lines: list[Line]) -> str:
             f"{round_digits(line['ratio'], 2):g}",
         ]
 
-    return table_of(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
+    return markdown_table(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
 
 
-def poles_of(line: Line) -> str:
+def poles_text(line: Line) -> str:
     """Return the poles of a scene as text."""
     return f"{line['n_poles']:,} {'movable' if line['movable'] else 'fixed'} poles" if line["n_poles"] else "none"
 
 
 depths = columns(
-    Poles=poles_of,
+    Poles=poles_text,
     Image=lambda x: f"{x['width']} x {x['height']}, {x['n_worlds']:,} worlds",
     Rays_per_second=lambda x: si_text(x["rays_per_s"]),
     First_image=lambda x: duration_text(x["first_s"]),
@@ -169,15 +177,15 @@ sight = columns(
     First_call=lambda x: duration_text(x["first_s"]),
 )
 range_finders = columns(
-    Poles=poles_of,
-    Worlds=worlds_of,
+    Poles=poles_text,
+    Worlds=worlds_text,
     One_step=lambda x: duration_text(1e-6 * x["step_us"]),
     First_step=lambda x: duration_text(x["first_s"]),
 )
 
 
 def costs(lines: list[Line]) -> str:
-    """Return the ratios of the times of cases to those of their references, and the rates of the cases."""
+    """Return the times of cases relative to their references, and the rates of the cases."""
     return columns(
         Case=lambda x: f"`{x['case']}`",
         Time_over_reference=lambda x: f"{x['ratio']:.3g}",
@@ -197,7 +205,7 @@ fleets = columns(
         "cars": "four drones and two cars, over the drones alone",
         "airframes": "two airframes, over one with parameters per drone",
     }[x["case"]],
-    Worlds=worlds_of,
+    Worlds=worlds_text,
     Rate_of_the_drones=lambda x: f"{round_digits(x['ratio'], 2):g}",
 )
 vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si_text(x["steps_per_s"]))
@@ -271,27 +279,27 @@ def control(lines: list[Line]) -> str:
         "Attitude",
         "Rate",
     )
-    return table_of(head, [row_of(line) for line in lines if "drone" in line])
+    return markdown_table(head, [row_of(line) for line in lines if "drone" in line])
 
 
 def control_rates(lines: list[Line]) -> str:
     """Return the ratios of the rates of the controllers to the rate of ``crazyflow``."""
     rate_by_controller = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
     cells = [f"{rate / rate_by_controller['crazyflow']:.2f} ({si_text(rate)})" for rate in rate_by_controller.values()]
-    return table_of([f'`"{name}"`' for name in rate_by_controller], [cells])
+    return markdown_table([f'`"{name}"`' for name in rate_by_controller], [cells])
 
 
 def limits(lines: list[Line]) -> str:
-    """Return the measured rates as fractions of the highest possible ones."""
+    """Return the measured rates as fractions of the highest possible rates."""
     lines = [line for line in lines if "ratio" in line]
-    return pivot(lines, case_of, worlds_of, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
+    return pivot(lines, case_text, worlds_text, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
 
 
 def trainers(lines: list[Line]) -> str:
     """Return the table of ``trainers.py``."""
     names = {"crazysim": "crazysim", "brax": "Brax", "rsl_rl": "RSL-RL"}
     return columns(
-        Worlds=worlds_of,
+        Worlds=worlds_text,
         Trainer=lambda x: f"{names[x['trainer']]} {x['version']}" + (f", torch {x['torch']}" if "torch" in x else ""),
         Environment_steps_a_second=lambda x: si_text(x["env_steps_per_s"]),
         Training_without_compilation=lambda x: f"{si_text(x['env_steps'])} steps in {duration_text(x['seconds'])}",
@@ -305,7 +313,7 @@ def readme(records: list[Line]) -> str:
     head = ["", "two CPU cores (AVX2)", "one NVIDIA H100"]
 
     def lines_of(name: str, device: str, **case: Any) -> list[Line]:
-        """Return the lines of a figure's records on a device that have the values of a case."""
+        """Return the lines of the records of a figure on a device that contain the entries of ``case``."""
         lines = [
             line
             for record in records
@@ -315,7 +323,7 @@ def readme(records: list[Line]) -> str:
         return [line for line in lines if all(line.get(key) == value for key, value in case.items())]
 
     def range_text(values: Iterable[float]) -> str:
-        """Return the least and the largest number as text, with two digits."""
+        """Return the smallest and the largest number as text, with two digits."""
         ordered_values = sorted(round_digits(value, 2) for value in values)
         return f"{ordered_values[0]:g} to {ordered_values[-1]:g}" if ordered_values else ""
 
@@ -364,13 +372,13 @@ def readme(records: list[Line]) -> str:
             for x in lines_of("envs", device, actions="random", n_worlds=largest_n_worlds[device])
         ),
     }
-    return table_of(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])
+    return markdown_table(head, [[name, cells("cpu"), cells("gpu")] for name, cells in rows.items()])
 
 
 def devices(lines: list[Line]) -> str:
-    """Return rates on numbers of devices, their ratios, and bytes, memory and compile time of the last number.
+    """Return rates by number of devices, their ratios, and bytes, memory and compile time for the largest number.
 
-    The last column of rates is of several hosts, if they were measured.
+    If several hosts were measured, the last column of rates has their rates.
     """
     cases: dict[str, dict[tuple[int, int], Line]] = {}
     for line in lines:
@@ -384,11 +392,11 @@ def devices(lines: list[Line]) -> str:
         rates = [si_text(case[column]["rate"]) if column in case else "" for column in columns]
         sizes = sum(last["exchanged"].values()), last["memory_bytes"]
         exchanged, memory = (f"{x} B" if x < 1000 else f"{si_text(x)}B" for x in sizes)
-        worlds = f"{worlds_of(last)} a {'seed' if name.startswith('seeds') else 'device'}"
+        worlds = f"{worlds_text(last)} a {'seed' if name.startswith('seeds') else 'device'}"
         ratios = [f"{line['ratio']:.3g}" for (n_hosts, n), line in sorted(case.items()) if n_hosts == 1 and n > 1]
         facts = [", ".join(ratios), exchanged, memory, duration_text(last["compile_s"])]
         rows.append([f"{name}, {last['unit']} a second", worlds, *rates, *facts])
-    text = table_of(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
+    text = markdown_table(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
     for line in lines:
         if "difference" in line:
             text += (

@@ -6,20 +6,20 @@
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
 All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
-building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. If the recipe of a
-task has a teacher, each seed has its own process and its own teacher, whose steps and time count. When a process ends,
-it prints a JSON line for each seed, and at the end one for each task, with medians over its seeds. A seed that diverges
-counts as no success, and is named.
+building, compilation and evaluation for all seeds; ``--together`` limits the seeds of a process. If the recipe of a
+task has a teacher, each seed has its own process and its own teacher, whose steps and time are included. When a process
+ends, a JSON line for each of its seeds is printed. At the end there is a line for each task, with medians over its
+seeds. A seed that diverges has a success of 0, and the line of its task names it.
 
-Finished seeds are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
-sources of the package are the same: an interrupted command continues where it was, also on another machine that is
-given this file. A process that was interrupted continues from its last checkpoint if its folder is still there. A
-failed training is reported at the end, and the others go on.
+Finished seeds are stored in the file ``results.jsonl`` of the folder ``--out``. They are not trained again while the
+sources of the package are the same: an interrupted command continues where it was, also on another machine that has
+this file. A process that was interrupted continues from its last checkpoint if its folder still exists. A failed
+training is reported at the end, and the other trainings continue.
 
 ``--write`` puts the rows of tasks with all seeds finished into the committed table,
 docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task, and fails
-where its success is below the lowest of the table by more than two standard errors of 1,000 starts. Arguments after
-``--`` are passed to ``crazysim train``.
+if its success is lower than the least success in the table by more than two standard errors of 1,000 starts. Arguments
+after ``--`` are passed to ``crazysim train``.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ def main() -> None:
     tasks = args.tasks or (list(TASKS) if args.all or args.check else ["hover", "recover", "track", "race"])
     seeds = args.seeds or ([0] if args.check else [0, 1, 2, 3, 4])
 
-    store, source = args.out / "results.jsonl", source_hash()
+    results_file, source = args.out / "results.jsonl", source_hash()
     keys = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
     results = {
-        key: x for key, x in read_results(store).items() if key in keys and (args.keep or x["sources"] == source)
+        key: x for key, x in read_results(results_file).items() if key in keys and (args.keep or x["sources"] == source)
     }
     failures = []
     if not args.only_plot:
@@ -98,12 +98,11 @@ def main() -> None:
         groups = group_runs(missing_keys, args.together)
         run_info = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
         if missing_keys:
-            run_info |= run_in_process(
-                describe_machine, args.device
-            )  # in this process it would hold memory of the device
+            # In a separate process, because this process would keep memory of the device.
+            run_info |= run_in_process(describe_machine, args.device)
             cores = f"{run_info['cores']} cores of {run_info['processor']}"
             run_info["machine"] = cores if run_info["device"] == "cpu" else run_info["device"]
-        failures = train_all(groups, args.out, store, run_info, results)
+        failures = train_all(groups, args.out, results_file, run_info, results)
 
     finished = {task: [results[key] for key in keys if key[0] == task and key in results] for task in tasks}
     rows = [make_row(runs) for runs in finished.values() if runs]
@@ -120,7 +119,7 @@ def main() -> None:
 
 
 def source_hash() -> str:
-    """Return a hash of the package's sources, which shows whether a finished run is of the same sources."""
+    """Return a hash of the sources of the package, to recognise finished runs of the same sources."""
     digest = hashlib.sha256()
     for path in sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml", ".xml")):
         digest.update(str(path.relative_to(PACKAGE)).encode() + path.read_bytes())
@@ -128,7 +127,7 @@ def source_hash() -> str:
 
 
 def source_commit() -> str:
-    """Return the commit of the sources, with a + if the package has changed since; without Git, the version."""
+    """Return the commit of the sources, followed by ``+`` if the package differs from it; without Git, the version."""
     git = ["git", "-C", str(PACKAGE)]
     process = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
     if process.returncode:
@@ -137,16 +136,16 @@ def source_commit() -> str:
     return process.stdout.strip() + "+" * bool(changed)
 
 
-def read_results(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Return the results in a file by task, seed, device and arguments, the last of each."""
-    results = [json.loads(line) for line in store.read_text().splitlines()] if store.exists() else []
+def read_results(results_file: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Return the last result in a file for each task, seed, device and arguments."""
+    results = [json.loads(line) for line in results_file.read_text().splitlines()] if results_file.exists() else []
     return {(x["task"], x["seed"], x["on"], *x["arguments"]): x for x in results}
 
 
 def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[Any, ...]]]:
     """Return the runs to train in groups of at most ``max_size`` that differ only in the seed, the longest first.
 
-    Runs of a recipe with a teacher are groups of their own, since all seeds of a process have the same teacher.
+    Each run of a recipe with a teacher is a separate group, because all seeds of a process have the same teacher.
     """
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     for key in keys:
@@ -166,7 +165,7 @@ def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[An
 def train_all(
     groups: list[list[tuple[Any, ...]]],
     out: Path,
-    store: Path,
+    results_file: Path,
     run_info: dict[str, Any],
     results: dict[Any, dict[str, Any]],
 ) -> list[str]:
@@ -174,22 +173,23 @@ def train_all(
     failures = []
     out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(run_info["parallel"]) as pool:
-        runs = {pool.submit(train, group, out, run_info): group for group in groups}
+        group_by_future = {pool.submit(train, group, out, run_info): group for group in groups}
         try:
-            for run in as_completed(runs):
-                task, _, device, *arguments = runs[run][0]
-                seeds = [key[1] for key in runs[run]]
+            for future in as_completed(group_by_future):
+                group = group_by_future[future]
+                task, _, device, *arguments = group[0]
+                seeds = [key[1] for key in group]
                 try:
-                    new_results = run.result()
+                    new_results = future.result()
                 except RuntimeError as error:
                     failures.append(f"{task}: training with seeds {', '.join(map(str, seeds))} failed")
                     print(json.dumps({"task": task, "seeds": seeds, "failed": str(error)}), flush=True)
                     continue
-                for key, result in zip(runs[run], new_results, strict=True):
+                for key, result in zip(group, new_results, strict=True):
                     results[key] = (
                         {"task": task, "seed": key[1], "on": device, "arguments": arguments} | result | run_info
                     )
-                    with store.open("a") as file:
+                    with results_file.open("a") as file:
                         file.write(json.dumps(results[key]) + "\n")
                     print(json.dumps({name: results[key][name] for name in TABLE_COLUMNS}), flush=True)
         except BaseException:
@@ -204,7 +204,7 @@ def run_folder(out: Path, task: str, seeds: str, device: str, *arguments: str) -
 
 
 def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Train some seeds of a task in a new process and return the results of each.
+    """Train some seeds of a task in a new process, and return the result of each seed.
 
     Args:
         group: Task, seed, device and further arguments of ``crazysim train`` for each run; only the seeds differ.
@@ -224,7 +224,7 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
         folder.mkdir(parents=True)
         sources_file.write_text(run_info["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
-    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # a training that was interrupted
+    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # the training was interrupted
     # By default each process would take three quarters of the memory of a GPU.
     environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if run_info["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
@@ -249,14 +249,14 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
 
 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve, with the seconds of its process for all its seeds.
+    """Return the results of one seed from its learning curve. Seconds are those of its process, for all its seeds.
 
-    Steps and seconds include those of a teacher that was trained first.
+    Steps and seconds include the steps and seconds of a teacher that was trained first.
 
     Args:
         folder: Folder of the seed.
-        diverged: Iteration in which its numbers became NaN or infinite, which counts as no success; None if they did
-            not.
+        diverged: Iteration in which a number became NaN or infinite, so that the success is 0; None if all numbers
+            stayed finite.
     """
     curve, teacher_folder = read_curve(folder), folder.parent / TEACHER_FOLDER
     if teacher_folder.exists():
@@ -335,14 +335,14 @@ def table_markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def time_text(row: dict[str, Any]) -> str:
-    """Return the training time in a row as text, with the number of seeds and processes that shared it."""
+    """Return the training time in a row as text, with the number of seeds and processes that ran at the same time."""
     text = f"{round_digits(row['seconds'], 2):g} s"
     text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
     return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")
 
 
 def check_success(runs: list[dict[str, Any]]) -> list[str]:
-    """Return a message for each run whose success is below the lowest of the table by more than two standard errors."""
+    """Return a message for each run whose success is too low: by two standard errors below the least in the table."""
     least_success = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
     failures = []
     for run in runs:

@@ -5,16 +5,16 @@
 
 All train the task with the hyperparameters of its recipe: the same worlds, steps, epochs, minibatches, networks with
 tanh, initial learning rate, discount and clipping. The learning rate decreases linearly to zero in crazysim, and is
-constant in Brax and RSL-RL. Everything else is the default of each. Brax steps the environment by ``BraxEnv``, within
-its compiled program. RSL-RL steps it with one compiled call a step, and shares arrays with Torch.
+constant in Brax and RSL-RL. Other settings are the defaults of each library. Brax steps the environment by ``BraxEnv``,
+within its compiled program. RSL-RL steps it with one compiled call a step, and shares arrays with Torch.
 
-A JSON line for each trainer and number of worlds, with the median over the seeds of the environment steps a second, and
-the success of each seed on 1,000 held-out starts after the same number of steps. The rate is that of the last three
-quarters of a training, since the first quarter includes the compilation. No quarter includes evaluations.
-``benchmarks/figures.py --write --only trainers`` puts the table into docs/concepts/training-results.md.
+There is a JSON line for each trainer and number of worlds. It has the environment steps per second, the median over the
+seeds, and the success of each seed on 1,000 held-out starts after the same number of steps. The rate is measured over
+the last three quarters of a training, because the first quarter includes the compilation. No quarter includes
+evaluations. ``benchmarks/figures.py --write --only trainers`` puts the table into docs/concepts/training-results.md.
 
-The others are installed by ``pip install brax==0.14.2`` and ``pip install rsl-rl-lib==5.5.1``, the latter with PyTorch.
-A trainer that is not installed is left out, with a line that says so.
+``pip install brax==0.14.2`` installs Brax, and ``pip install rsl-rl-lib==5.5.1`` installs RSL-RL with PyTorch. A
+trainer that is not installed is left out, and a printed line says so.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from crazysim.train.config import find_recipe
 from crazysim.train.networks import Layers, mlp
 
 QUARTERS = 4
-"""Equal parts of a training; the first one is not timed."""
+"""Number of equal parts of a training; the first part is not timed."""
 PACKAGES = {"crazysim": "crazysim", "brax": "brax", "rsl_rl": "rsl-rl-lib"}
 """Package on PyPI of each trainer, by the name of its module."""
 
@@ -91,7 +91,7 @@ def train_crazysim(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
 @functools.cache
 def _auto_reset(env: Env) -> AutoReset:
-    """Return the environment with automatic resets, the same one for all seeds, so that they share programs."""
+    """Return the environment with automatic resets, the same object for all seeds, so that they share programs."""
     return AutoReset(env)
 
 
@@ -100,7 +100,7 @@ def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     from brax.training.agents.ppo import networks, train
     from flax import linen
 
-    if not hasattr(jax, "device_put_replicated"):  # Brax 0.14.2 calls what jax 0.10 removed
+    if not hasattr(jax, "device_put_replicated"):  # Brax 0.14.2 calls this function, which jax 0.10 removed
         jax.device_put_replicated = _device_put_replicated  # type: ignore[attr-defined]
     times: list[float] = []
     n_worlds = env.sim.n_worlds
@@ -135,8 +135,8 @@ def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     )
     weights = policy["params"]
     *hidden, (weight, bias) = ((weights[name]["kernel"], weights[name]["bias"]) for name in sorted(weights))
-    n = env.actions.size  # the means; the other outputs are standard deviations
-    layers = [*hidden, (weight[:, :n], bias[:n])]
+    n_actions = env.actions.size  # the first outputs are means, the others standard deviations
+    layers = [*hidden, (weight[:, :n_actions], bias[:n_actions])]
     return times[-1] - times[1], PeerPolicy(normalizer.mean, normalizer.std, layers, True)
 
 

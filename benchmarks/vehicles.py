@@ -2,8 +2,8 @@
 
     python benchmarks/vehicles.py [--device gpu] [--worlds 1048576] [--cases drive kinematic path] [--steps 20]
 
-``alone`` is true in the lines of cases whose pipeline lacks the stages of the drones. Cars drive on circles all the
-time; a case whose cars stop or leave their circle is an error.
+``alone`` is true if the pipeline of the case has no stages of drones. Cars drive on circles all the time. If they stop
+or leave their circles, the script ends with an error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from crazysim import Sim
 from crazysim.plugins.vehicles import Cars, PathLQR, PurePursuit, Stanley
 from crazysim.trajectories import circle
 
-WORLDS = {"cpu": 16384, "gpu": 1048576}
+DEFAULT_WORLDS = {"cpu": 16384, "gpu": 1048576}
+"""Default number of worlds on each platform."""
 CASES: dict[str, dict[str, Any]] = {
     "drive": {},
     "speed": {"level": "speed"},
@@ -48,7 +49,7 @@ def main() -> None:
 
 def measure(case: str, args: argparse.Namespace) -> None:
     """Print the rate of one case."""
-    n_worlds = args.worlds or WORLDS["cpu" if args.device == "cpu" else "gpu"]
+    n_worlds = args.worlds or DEFAULT_WORLDS["cpu" if args.device == "cpu" else "gpu"]
     sim = Sim(n_worlds, control="rotor_vel", device=args.device, engine=args.engine)
     cars = sim.add(Cars(args.cars, in_scene=False, **CASES[case]))
     if cars.path is None:

@@ -1,14 +1,14 @@
 """Comparison of crazysim with Crazyflow 0.4.0, which runs in a virtual environment that this script creates.
 
-Each program runs in its own process with the same JAX. The two alternate batch by batch, so that the noise of a shared
-machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients are measured with
-each controller of ``--controllers``; ``crazyflow`` is Crazyflow's. The cases:
+Each program runs in its own process with the same JAX. The programs alternate batch by batch, so that the noise of a
+shared machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients are
+measured with each controller of ``--controllers``; ``crazyflow`` is the controller of Crazyflow. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds
     loop        a command from NumPy, 5 steps, the positions into NumPy, for attitude and state commands
     call        one step(1) of one world, for each command level
-    gradient    of 100 attitude steps with respect to their commands, 1,024 worlds
+    gradient    gradient of 100 attitude steps with respect to their commands, 1,024 worlds
     swarm       64 drones in 1,024 worlds compared with as many single drones, crazysim only
     contacts    contact query after a step, 4,096 worlds of 4 drones with 8 objects
     depth       64 x 64 depth of 1,024 worlds with 8 objects
@@ -154,7 +154,7 @@ class Comparison:
             print(json.dumps(line | self.machine), flush=True)
 
     def compare_swarm(self, n_worlds: int, n_drones: int) -> None:
-        """Print the rates of drones that share worlds and of as many in separate worlds, and their ratio."""
+        """Print the rates of drones that share worlds and of as many drones in separate worlds, and their ratio."""
         case = {"control": "attitude", "integrator": "euler", "n_steps": 100}
         sizes = {"swarm": (n_worlds, n_drones), "single": (n_worlds * n_drones, 1)}
         for engine in self.engines:
@@ -171,7 +171,7 @@ class Comparison:
             print(json.dumps(line | self.machine), flush=True)
 
     def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
-        """Return the median time of a call and of its compilation, s, alternating between the programs."""
+        """Return the median time of a call and its compile time, s, by contestant. Calls of contestants alternate."""
         first_durations = {
             name: worker.request(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
@@ -219,7 +219,7 @@ class Worker:
         raise SystemExit("a worker ended without an answer; its error is above")
 
     def time(self, name: str) -> float:
-        """Return the time of a call of the case with a name, s."""
+        """Return the time of a call of the case that was built under a name, s."""
         return self.request(do="time", name=name)["seconds"]
 
     def close(self) -> None:
@@ -230,7 +230,10 @@ class Worker:
 
 
 def peer_environment(device: str) -> Path:
-    """Return the interpreter of an environment with Crazyflow 0.4.0 and our JAX, made at first use."""
+    """Return the interpreter of an environment with Crazyflow 0.4.0 and the version of JAX that is installed here.
+
+    The environment is created at the first use.
+    """
     folder = PEER_FOLDER if device == "cpu" else PEER_FOLDER.with_name(f"{PEER_FOLDER.name}-{device}")
     python = folder / "bin" / "python"
     if not python.exists():

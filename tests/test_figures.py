@@ -47,23 +47,23 @@ def repository(figures, monkeypatch, tmp_path):
     table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si_text(x["rate"]))
     figure = figures.Figure("page.md", ("thrust.py",), cpu="speed.py --fast", table=table)
     monkeypatch.setattr(figures, "ROOT", tmp_path)
-    monkeypatch.setattr(figures, "STORE", tmp_path / "figures.json")
+    monkeypatch.setattr(figures, "RECORDS_FILE", tmp_path / "figures.json")
     monkeypatch.setattr(figures, "FIGURES", {"speed": figure})
-    figures.git("init", "-q")
+    figures.run_git("init", "-q")
     commit_all(figures)
     return figures
 
 
 def commit_all(figures):
-    figures.git("add", "-A")
-    figures.git("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false", "commit", "-qm", "x")
+    figures.run_git("add", "-A")
+    figures.run_git("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false", "commit", "-qm", "x")
     return figures.current_commit()
 
 
 def record(figures, commit, processor="EPYC", rate=2e9):
     about = {"device": "cpu", "processor": processor, "cores": 2, "vectors": "AVX2", "jax": "0.10.1",
              "python": "3.11.7", "date": "2026-11-26"}  # fmt: skip
-    return figures.record("speed", "speed.py --fast", commit, [{"case": "hover", "rate": rate} | about])
+    return figures.make_record("speed", "speed.py --fast", commit, [{"case": "hover", "rate": rate} | about])
 
 
 def test_each_figure_has_a_script_and_a_place_on_its_page(figures):

@@ -215,7 +215,7 @@ class View:
         return config
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
-        """Return the aim of the camera of the k-th world: ``aim`` with first-order lag, or without lag after a reset."""
+        """Return the aim of the camera of the k-th world: ``aim`` with first-order lag, without lag after a reset."""
         last_time, value = self._aim.get(k, (np.inf, aim))
         weight = 1.0 if time < last_time or self.lag == 0 else 1 - np.exp(-(time - last_time) / self.lag)
         if np.isfinite(aim).all():
