@@ -11,9 +11,9 @@ and kd are the gains per inertia on attitude and body rate, the characteristic p
 
     kd = 0.6 a,   kp = 0.12 a^2,   and at most half of the rate of roll and pitch about yaw,
 
-body rates follow with a damping ratio of 0.65, which overshoots a step by 7%, and attitudes with a pole at 0.31 a and
-a pair of damping ratio 0.55, without overshoot. The attitude loop delays a slow command by kd / kp = 5 / a, from which
-the gains of the position loop follow.
+body rates follow with a damping ratio of 0.65, which overshoots a step by 7%. Attitudes follow with a pole at -0.31 a
+and a pair of poles with a damping ratio of 0.55, without overshoot. The attitude loop delays a slow command by
+kd / kp = 5 / a, from which the gains of the position loop follow.
 
 The rate has two limits. The first limit is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their
 speeds, plus 1.5 periods of the controller. The second limit is the authority of the rotors. A large error e turns the
@@ -255,7 +255,7 @@ class Auto(Controller):
             cast(AutoTarget, memory.target),
         )
         specific_thrust, position = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
-        # The desired attitude is constant for a period, so the setpoint's acceleration in the middle of it is used.
+        # The desired attitude is constant for a period, so the setpoint's acceleration half a period later is used.
         specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
         # The quaternion of a state command gives its heading without trigonometric functions.

@@ -38,7 +38,7 @@ class AttitudeMemory(PyTree):
 
 
 class CrazyflowState(Controller):
-    """State controller of Crazyflow (``state2attitude``), which precedes ``Crazyflow`` at the level ``state``."""
+    """State controller of Crazyflow (``state2attitude``), for the level ``state``."""
 
     name: ClassVar[str] = "crazyflow"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -66,11 +66,11 @@ class CrazyflowState(Controller):
 
 
 class Crazyflow(Controller):
-    """Cascade of Crazyflow, with gains from the airframe's table ``[controller]``, at every command level.
+    """Cascade of Crazyflow, with gains from the airframe's table ``[controller]``.
 
     It follows attitudes (``attitude2force_torque``) and body rates (``body_rate2force_torque``). At the level
-    ``state``, ``CrazyflowState`` precedes it, or replaces it with fitted dynamics. Levels below ``body_rate``, and
-    attitude commands with fitted dynamics, need no controller.
+    ``state``, ``CrazyflowState`` is used, with this controller as ``inner`` unless the dynamics are fitted. Levels
+    below ``body_rate``, and attitude commands with fitted dynamics, need no controller.
     """
 
     name: ClassVar[str] = "crazyflow"

@@ -146,9 +146,9 @@ def indi_control(
 
     The acceleration a is the rate of change of the velocity over one tick. ``J w'`` is the rate of change of the
     angular momentum of body and rotors, so that the reaction to accelerating rotors is no disturbance. Force and torque
-    of the rotors follow from measured rotor speeds. The same low-pass filter is applied to all four, so that their
-    delays cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass, appear in a and w', and
-    are compensated. The returned speed is the current speed plus ``params.lead`` times the difference to the desired
+    of the rotors follow from measured rotor speeds. The same low-pass filter is applied to all four signals, so that
+    their delays cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass, change a and w',
+    and are compensated. The result is the current speed plus ``params.lead`` times the difference to the desired
     speed, which makes the rotors faster than their lag.
 
     Args:

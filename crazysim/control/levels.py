@@ -12,7 +12,7 @@ from crazysim.drones import Airframe
 
 
 class Control(StrEnum):
-    """Command level: the kind of command that the user sends. The simulation has all lower levels of the cascade."""
+    """Command level: the kind of command that the user sends. Controllers compute the commands of the lower levels."""
 
     state = "state"
     """Position, velocity, acceleration, quaternion (only its yaw is used) and body rates: 16 numbers."""

@@ -193,7 +193,7 @@ def state_error(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         reference: Reference.
-        yaw: Heading, rad, to return the errors of position and velocity in its frame; None for the world frame.
+        yaw: Yaw of the frame in which errors of position and velocity are returned, rad; None for the world frame.
             (..., 1)
     """
     matrix = rotation.matrix(quat)

@@ -163,7 +163,7 @@ class Mellinger(Controller):
     levels: ClassVar[tuple[Control, ...]] = (Control.state, Control.attitude)
     output: ClassVar[Control] = Control.rotor_vel
     freq: int = 500
-    """Rate, Hz (``ATTITUDE_RATE``)."""
+    """Rate of the controller, Hz (``ATTITUDE_RATE``)."""
     whole_numbers: bool = False
     """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 

@@ -58,7 +58,7 @@ class PIDLoop(PyTree):
 
 
 class PIDLoopMemory(PyTree):
-    """Memory of three PID loops. Fields of integral, derivative or filter are None if the loops do not have it."""
+    """Memory of three PID loops. A field is None if the loops have no integral, no derivative or no filter."""
 
     integral: Any = leaf("drone", 1)
     """Integrals of the error, input s. (n_worlds, n_drones, 3)"""

@@ -32,7 +32,7 @@ class Actions:
     """Map from actions to commands: ``command = centre + scale * action``, with the action clipped to [-1, 1].
 
     By default (``actions_of``), a zero action is the command under which the nominal drone hovers, level and at yaw
-    zero. At the state level, it hovers 1 m above the origin.
+    zero. At the state level, the drone hovers 1 m above the origin.
 
     | Level | Action | Command at -1, 0, 1 |
     | --- | --- | --- |

@@ -1,4 +1,4 @@
-"""Hooks: functions that wrappers add to resets and environment steps. Most receive the state of one world."""
+"""Hooks: functions that wrappers add to resets and environment steps. Most hooks receive the state of one world."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class EnvState(PyTree):
 
     @property
     def data(self) -> SimData:
-        """The simulation, without the environment's record."""
+        """Data of the simulation, without the environment's record."""
         return self.full_data.replace(plugins={k: x for k, x in self.full_data.plugins.items() if k != ENV_RECORD_NAME})
 
     @property

@@ -29,9 +29,9 @@ from crazysim.sim.sim import Sim
 SPACING = 6.0
 """Distance along y between the cars of several drones at the start, m; a drone follows its own car."""
 FOLLOW_DISTANCE, FOLLOW_HEIGHT = 0.8, 0.7
-"""Distance behind and height above a car's centre of mass of the point at which the drone should be, m."""
+"""Point at which the drone should be: distance behind a car's centre of mass, and height above it, m."""
 MAX_DISTANCE, MIN_HEIGHT = 2.0, 0.25
-"""Largest distance of a drone from this point, and smallest height of a drone, m; cars are lower."""
+"""Largest distance of a drone from this point, and smallest height of a drone, m. Cars are lower than this height."""
 SPEED_RANGE = (0.2, 0.8)
 """Smallest and largest mean speed of a car, as fractions of ``speed``."""
 SPEED_AMPLITUDE = 0.2

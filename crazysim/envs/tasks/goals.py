@@ -160,7 +160,7 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     """Return the entries with the smallest distances, nearest first.
 
     Args:
-        distance: Distances, m. (..., m)
+        distance: Distances, or other numbers in the same order, such as their squares. (..., m)
         x: Entries. (..., m, k)
         n: Number of entries to return, at most m.
 
@@ -218,9 +218,9 @@ def nearest_drones(data: SimData, n: int, is_visible: Array | None = None) -> tu
 
     Args:
         data: The data of one world.
-        n: Largest number of other drones to return, n.
-        is_visible: True where a drone may be returned; None for all drones. Entries of drones that may not are zero.
-            (n_drones,)
+        n: Largest number of other drones to return.
+        is_visible: True for drones that may be returned; None for all drones. If too few drones are visible, the other
+            entries are zero. (n_drones,)
 
     Returns:
         (n_drones, min(n, n_drones - 1), 3) each

@@ -133,7 +133,7 @@ class Race(Task):
         install_rules(sim, record, update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight, and gates and obstacles with the displacements and inertias of the level."""
+        """Return drones in flight, and gates and obstacles, with the randomness of the level."""
         course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
         sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:

@@ -56,7 +56,7 @@ class RaceByCamera(Race):
         return flying(data, s.pos, rotation.multiply(yaw_quat, s.quat), s.vel)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return attitude, velocity and angular velocity in the body frame, height, and the number of the next gate.
+        """Return attitude, velocity and angular velocity in the body frame, height, and the next gate.
 
         ``next_gate`` has 1 at the index of the next gate and 0 elsewhere; all entries are 0 where all gates are passed.
         """

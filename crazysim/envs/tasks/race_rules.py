@@ -88,7 +88,7 @@ def obstacles_of(data: SimData) -> Array:
 
 
 def next_gate(data: SimData) -> tuple[Array, Array]:
-    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's next gate; the last after finishing."""
+    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's next gate, or of the last gate."""
     pos, quat = gates_of(data)
     index = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
     return pick_entry(pos, index), pick_entry(quat, index)

@@ -99,7 +99,7 @@ class TrackTrajectory(Task):
         return [x[..., :3] for x in evaluate(t)]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and vectors to its target, m, to the target velocity, m/s, and to samples, m."""
+        """Return the drone's state, differences to target position and velocity, and vectors to samples, m and m/s."""
         t, s = self.time(data), data.states
         times = t[..., None] + (self.spacing * np.arange(1 + self.n_samples)).astype(t.dtype)
         pos, vel = self.motion(times)  # at the current time and at the samples

@@ -19,7 +19,7 @@ from crazysim.pytree import scopes
 
 
 class RandomizeWith(Wrapper):
-    """Wrapper that changes the data at the start of every episode with a function: masses, motors or other fields.
+    """Wrapper that changes masses, motors or other fields of the data with a function at the start of every episode.
 
     ``fn(data, key) -> data`` receives the data of one world and the random key of its episode. Parameters that it
     changes must have one value per drone. Name these parameters in ``params``: shared values are then repeated for
