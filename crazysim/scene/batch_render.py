@@ -52,7 +52,7 @@ class BatchRenderer:
             raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")
         import warp as wp
 
-        wp.config.log_level = wp.LOG_WARNING  # before MuJoCo Warp starts Warp
+        wp.config.log_level = wp.LOG_WARNING  # must be set before MuJoCo Warp starts Warp
         import mujoco.mjx.third_party.mujoco_warp as mjw
 
         self._wp, self._mjw, self._shape = wp, mjw, (n_worlds, height, width)
@@ -90,8 +90,8 @@ class BatchRenderer:
                 if x.size:
                     x = jax.block_until_ready(jnp.asarray(x, jnp.float32))
                     wp.copy(target, wp.from_jax(x, dtype=dtype))
-            for stage in (mjw.kinematics, mjw.com_pos, mjw.camlight):
-                stage(self._model, d)
+            for update in (mjw.kinematics, mjw.com_pos, mjw.camlight):
+                update(self._model, d)
             mjw.refit_bvh(self._model, d, self._context)
             mjw.render(self._model, d, self._context)
             wp.synchronize_device(self._device)
@@ -99,7 +99,7 @@ class BatchRenderer:
 
 
 def _unpack_colors(pixels: Array, shape: tuple[int, int, int]) -> Array:
-    """Return packed pixels as red, green and blue; a copy, because the next call writes to the same buffer."""
+    """Return a copy of packed pixels as red, green and blue; the next call overwrites the packed pixels."""
     return _color_bytes(pixels).reshape(*shape, 3)
 
 

@@ -18,6 +18,7 @@ from crazysim.errors import ConfigError
 from crazysim.scene import mjx
 
 SCENE_FILE = Path(__file__).parents[1] / "scene.xml"
+"""MJCF file of the default scene: floor, light and sky."""
 
 DRONES_PER_CHUNK = 128
 """Largest number of drones that are added to a spec one by one."""
@@ -29,7 +30,7 @@ def build_spec(
     """Return the scene as an editable spec, with the drones ``drone:0``, ``drone:1``, ... in it.
 
     Args:
-        xml_path: MJCF scene without drones, or its spec; None for the package's own floor, light and sky.
+        xml_path: MJCF scene without drones, or its spec; None for the default scene.
         airframes: Airframe of each drone. (n_drones,)
         freq: Physics steps per second, Hz.
         max_geom_pairs: Largest number of pairs that MJX checks per kind of collision; -1 for all.
@@ -50,13 +51,13 @@ def build_spec(
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
     dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
     dummy.add_joint(name="_dummy_joint", type=mujoco.mjtJoint.mjJNT_SLIDE)
-    # So that one body of a user's spec can be attached several times.
+    # A body of a user's spec can then be attached several times.
     spec.copy_during_attach = True
     return spec
 
 
 def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
-    """Return the spec of an MJCF file; None for the package's own floor, light and sky.
+    """Return the spec of an MJCF file; None for the default scene: floor, light and sky.
 
     Raises:
         ConfigError: If the file does not exist or cannot be read.
@@ -73,10 +74,10 @@ def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
 
 
 def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
-    """Add the drones' bodies element by element, large swarms in chunks.
+    """Add the bodies of the drones to a spec, in chunks if there are many.
 
-    MuJoCo goes through the whole spec for every geom that is added and every body that is attached: 4,096 drones
-    take 30 s one by one, 2 s in chunks that are filled separately.
+    MuJoCo goes through the whole spec for every geom that is added and every body that is attached. 4,096 drones
+    take 30 s one by one, and 2 s in chunks that are filled separately.
     """
     n_drones = len(airframes)
     for name, rgba in MATERIALS.items():
@@ -96,7 +97,7 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
 
 @contextlib.contextmanager
 def _suppress_attach_warnings() -> Iterator[None]:
-    """Suppress MuJoCo's warning, on the terminal and in MUJOCO_LOG.TXT, that attached names have no prefix."""
+    """Suppress MuJoCo's warning that attached names have no prefix, on the terminal and in ``MUJOCO_LOG.TXT``."""
     previous_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -140,7 +141,7 @@ def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
 
 
 def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
-    """Make the boxes or the spheres of drones collide, once the spec is compiled again."""
+    """Make the boxes of drones collide, or their spheres if ``enable`` is False, from the next compilation on."""
     for i in range(n_drones):
         for kind in ("col_sphere", "col_box"):
             geom = spec.geom(f"{kind}:{i}")
@@ -148,7 +149,7 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
 
 
 def _set_collision_bits(geom: mujoco.MjsGeom, collides: bool) -> None:
-    """Make a geom of a drone touch the scene, other drones, and geoms that only drones touch (bit 2), or no geom."""
+    """Make a geom of a drone collide with the scene, other drones and ``DRONE_TOUCH_BITS``, or with nothing."""
     geom.contype, geom.conaffinity = (3, 1) if collides else (0, 0)
 
 
@@ -197,7 +198,7 @@ def _explain_mjx_errors() -> Iterator[None]:
 
 
 def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> mjx.Data:
-    """Return MJX data that a user has written poses into, with the poses checked and converted to floats."""
+    """Return MJX data into which a user has written poses, with the poses checked and converted to floats."""
     changes = {}
     for name, size in (("mocap_pos", 3), ("mocap_quat", 4)):
         value, shape = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
@@ -215,7 +216,7 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
 def spec_mocap_ids(spec: mujoco.MjSpec) -> dict[str, int]:
     """Return the mocap ids that bodies will have once the spec is compiled, by name.
 
-    MuJoCo numbers mocap bodies, which are children of the world, in their order there.
+    MuJoCo numbers mocap bodies in the order of the children of the world body.
     """
     return {body.name: k for k, body in enumerate(b for b in spec.worldbody.bodies if b.mocap)}
 

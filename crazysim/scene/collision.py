@@ -19,13 +19,14 @@ GEOM_KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for k
 DRONE_BITS = (3, 1)
 """``contype`` and ``conaffinity`` of the geoms with which drones collide."""
 VISIBLE_GROUPS = range(3)
-"""Groups of geoms that are drawn, as in MuJoCo's own pictures."""
+"""Groups of geoms that are drawn, as by MuJoCo's renderer."""
 MIN_ALPHA = 0.5
 """Smallest alpha of geoms that rays hit."""
 
 DroneGroups = Sequence[tuple[int, ...] | None]
 """Indices of the drones of each airframe; None in place of the indices of all drones."""
 Matrix = tuple[tuple[float, float, float], ...]
+"""Rows of a 3 x 3 matrix."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +45,12 @@ class CollisionGeom:
 
 @dataclasses.dataclass(frozen=True)
 class CollisionBody:
-    """An object: a body below the world, with all that is attached to it."""
+    """An object: a child of the world body, with everything that is attached to it."""
 
     name: str
     """Name of the body."""
     row: int | None
-    """Row of its pose in ``data.objects``, as ``with_mocap_bodies`` extends it; None for a body that cannot move."""
+    """Row of its pose in ``data.objects`` after ``with_mocap_bodies``; None for a body that cannot move."""
     geoms: tuple[CollisionGeom, ...]
     """Geoms in the frame of the body; in the world frame where ``row`` is None."""
     initial_pos: tuple[float, ...] = dataclasses.field(default=(0.0, 0.0, 0.0), compare=False)
@@ -66,7 +67,7 @@ class DroneGeoms:
     """Indices of the drones; None for all."""
 
     def drone_mask(self, drone_id: Array) -> Array | None:
-        """Return True where an index belongs to one of these drones; None if all drones have these geoms. (...)"""
+        """Return True where an index is in ``drones``; None if all drones have these geoms. (...)"""
         if self.drones is None:
             return None
         return functools.reduce(
@@ -87,28 +88,29 @@ def _consecutive_runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 @dataclasses.dataclass(frozen=True)
 class CollisionModel:
-    """Geoms of a scene that drones touch, or that cameras see."""
+    """Geoms of a scene that drones can touch, or that cameras see."""
 
     floor: tuple[CollisionGeom, ...]
     """Planes and height fields of the world body."""
     objects: tuple[CollisionBody, ...]
-    """Objects with at least one geom; other geoms of the world body are an object ``world``."""
+    """Objects with at least one geom; geoms of the world body that are not floor form the object ``world``."""
     drones: tuple[DroneGeoms, ...]
     """Geoms of the drones, one entry per airframe."""
     mocap_bodies: tuple[str, ...]
-    """Mocap bodies without a handle, with poses in ``mjx_data`` only; they follow the rows of ``data.objects``."""
+    """Mocap bodies without a handle. Only ``mjx_data`` has their poses; ``with_mocap_bodies`` appends them to the
+    data."""
     mocap_ids: tuple[int, ...]
-    """Mocap ids of those bodies."""
+    """Mocap ids of ``mocap_bodies``."""
 
     def without_mocap_bodies(self) -> CollisionModel:
-        """Return the model for data that ``with_mocap_bodies`` has extended by the poses of those bodies."""
+        """Return the model for data to which ``with_mocap_bodies`` has appended the poses of ``mocap_bodies``."""
         return dataclasses.replace(self, mocap_bodies=(), mocap_ids=())
 
 
 def collision_model(
     model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)
 ) -> CollisionModel:
-    """Return the geoms that drones touch.
+    """Return the geoms that drones can touch.
 
     Args:
         model: Compiled scene.
@@ -119,10 +121,10 @@ def collision_model(
     def can_touch(geom: int) -> bool:
         return bool(DRONE_BITS[0] & model.geom_conaffinity[geom] or DRONE_BITS[1] & model.geom_contype[geom])
 
-    def touches_drones(geom: int) -> bool:
+    def can_collide(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _build_model(model, handles, drone_groups, can_touch, touches_drones)
+    return _build_model(model, handles, drone_groups, can_touch, can_collide)
 
 
 def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)) -> CollisionModel:
@@ -149,7 +151,7 @@ def _build_model(
     is_included: Callable[[int], bool],
     is_drone_geom: Callable[[int], bool],
 ) -> CollisionModel:
-    """Return the geoms of the scene, and of the first drone of each airframe, for which the predicates hold."""
+    """Return geoms of the scene if ``is_included``; of the first drone of each airframe if ``is_drone_geom``."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     floor = []
@@ -204,7 +206,7 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
-    """Return a geom in the frame of a body, or of the world."""
+    """Return a geom in the frame of a body, or in the world frame if ``body`` is None."""
     pos, rot = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     if body is not None:
         to_body = data.xmat[body].reshape(3, 3).T
@@ -230,7 +232,7 @@ def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
 
 
 def _read_hull(model: mujoco.MjModel, mesh: int) -> Shape:
-    """Return the convex hull of a mesh, which MuJoCo uses for contacts, too.
+    """Return the convex hull of a mesh, which MuJoCo also uses for contacts.
 
     MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
     of the vertices in the mesh, edges, and three vertices for each face.

@@ -38,16 +38,17 @@ from crazysim.scene.objects import Handle
 MAX_UNROLLED_GEOMS = 16
 """Largest number of fixed geoms of one shape whose distances are computed one by one."""
 MAX_LISTED_GEOMS = 64
-"""Largest number of such geoms of one body for which code of one drone computes all distances, without a search."""
+"""Largest number of fixed geoms of one shape in a body whose distances are all computed for one drone; more geoms are
+searched in a hierarchy."""
 DRONES_PER_CHUNK = 64
-"""Drones whose distances to all others of their world are computed at a time."""
+"""Number of drones whose distances to all other drones of their world are computed at a time."""
 
 
 class ContactReport(PyTree):
-    """Contacts of every drone, and signed distances: negative where two bodies overlap, by the depth of the overlap.
+    """Contacts of every drone, and signed distances. Where two bodies overlap, the distance is minus the depth.
 
-    In a stage of one world the arrays lack the axis ``n_worlds``, in a stage of one drone ``n_drones`` too. Fields that
-    were not requested are None.
+    In a stage of one world the arrays have no axis ``n_worlds``; in a stage of one drone, also no axis ``n_drones``.
+    Fields that were not requested are None.
     """
 
     floor: Array | None
@@ -65,7 +66,8 @@ class ContactReport(PyTree):
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Index of that drone; the drone's own for a single drone. None in a stage of one drone. (n_worlds, n_drones)"""
+    """Index of the nearest other drone; its own for a single drone. None in a stage of one drone. (n_worlds,
+    n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
@@ -103,11 +105,12 @@ def build_contact_fn(
         model: Collision model of the scene.
         objects: Handles or names of the objects to report; None for all, () for none.
         floor: True to report the floor.
-        drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
-        plugins: Function that returns the plugins of the simulation, which move their objects first.
+        drones: True to report other drones. With data of one drone this works only in a stage, and ``nearest_drone``
+            is None.
+        plugins: Function that returns the plugins of the simulation, whose objects are moved first.
     """
     floor, drones = check_flag("floor", floor), check_flag("drones", drones)
-    bodies = select_bodies(model, objects, in_data=False)
+    bodies = select_bodies(model, objects, require_data=False)
     names = tuple(body.name for body in bodies)
     if not (bodies or floor or drones):
         raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
@@ -152,7 +155,7 @@ def build_contact_fn(
 
 
 def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
-    """Return selected objects as a tuple, after checking their types; None, for all, stays None."""
+    """Return selected objects as a tuple after a check of their types; None (all objects) stays None."""
     if objects is None:
         return None
     if isinstance(objects, (Handle, str)):
@@ -165,13 +168,13 @@ def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
     return listed
 
 
-def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
+def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data: bool = True) -> list[CollisionBody]:
     """Return the selected objects of a model.
 
     Args:
         model: Collision model of the scene.
         objects: Handles or names; None for all, () for none.
-        in_data: True to refuse bodies whose poses are not part of the data, for use in a step.
+        require_data: True to refuse bodies whose poses are not part of the data, for use in a step.
     """
     by_name = {body.name: body for body in model.objects}
     listed = list_objects(objects)
@@ -185,7 +188,7 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool
                 f"expected an object that drones can touch, {', '.join(by_name) or 'but the scene has none'}, got "
                 f"{name!r}"
             )
-        if in_data and name in model.mocap_bodies:
+        if require_data and name in model.mocap_bodies:
             raise ConfigError(
                 f"expected objects whose poses are in the data, got body {name!r}, which is moved through "
                 f"sim.mjx_data. Add it with sim.scene.add, or leave it out with objects=."
@@ -203,12 +206,12 @@ def _group_key(body: CollisionBody) -> tuple[Any, ...]:
 
 
 def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
-    """Return a measure of the length of a contact kernel: the number of geoms, with movable ones counted four times.
+    """Return a measure of the length of a contact kernel: the number of fixed geoms plus four times the movable geoms.
 
-    Of the fixed geoms of one shape in a body, at most ``MAX_LISTED_GEOMS`` count, since a kernel searches a hierarchy
-    of more geoms.
+    More than ``MAX_LISTED_GEOMS`` fixed geoms of one shape in a body count as ``MAX_LISTED_GEOMS``, since the kernel
+    searches them in a hierarchy.
     """
-    bodies = select_bodies(model, objects, in_data=False)
+    bodies = select_bodies(model, objects, require_data=False)
     return sum(
         sum(min(len(geoms), MAX_LISTED_GEOMS) for geoms in _geoms_by_kind(body.geoms))
         if body.row is None
@@ -218,7 +221,7 @@ def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
 
 
 DroneParts = Sequence[tuple[CollisionGeom, Array, Array | None]]
-"""Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
+"""Geoms of drones; positions, world frame, m (..., 3); True for drones that have the geom (...), None if all do."""
 
 
 def _mask_absent(is_present: Array | None, gap: Array) -> Array:
@@ -256,7 +259,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
 
 
 def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
-    """Return the distance to the nearest of some geoms in the world frame, m. (...)
+    """Return the distance to the nearest of several geoms in the world frame, m. (...)
 
     Distances to many geoms of one shape, or to many boxes, are computed together.
     """
@@ -281,7 +284,7 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
 
 
 def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
-    """Return geoms in groups of one shape, or of boxes. In a group, all geoms are rotated or none is."""
+    """Return geoms in groups of one shape, or of boxes. In each group either all geoms are rotated or none."""
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:
         kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
@@ -292,17 +295,17 @@ class StackedGeoms(NamedTuple):
     """Geoms of one shape, or boxes, at different poses."""
 
     shape: Shape
-    """Shape of all, in its own frame; of boxes that differ, the shape of the first."""
+    """Shape of all geoms, in its own frame; if sizes of boxes differ, the shape of the first box."""
     pos: NDArray | Array
     """Origins, m. (n, 3)"""
     rot: NDArray | Array | None
     """Rotation matrices; None for the identity. (n, 3, 3)"""
     box_sizes: NDArray | Array | None
-    """Half lengths of boxes that differ, m; None for equal shapes. (n, 3)"""
+    """Half lengths of boxes, m; None if all shapes are equal. (n, 3)"""
 
     @staticmethod
     def from_geoms(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
-        """Return the stack of geoms of one shape, or of boxes, of which all are rotated or none is."""
+        """Return the stack of geoms of one shape, or of boxes; either all of them are rotated or none."""
         rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
         sizes = None
         if any(geom.shape != geoms[0].shape for geom in geoms):
@@ -322,7 +325,7 @@ def _stacked_distances(
 
 
 def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms) -> Array:
-    """Return the distance of a geom of one drone to the nearest of stacked geoms, m. ()"""
+    """Return the distance of a geom of one drone to the nearest stacked geom, m. ()"""
     n, dtype = len(geoms.pos), part_pos.dtype
     offset, half = bounding_box(geoms.shape)
     halves = np.broadcast_to(half, (n, 3)) if geoms.box_sizes is None else geoms.box_sizes
@@ -355,17 +358,17 @@ def _geom_distance(
 
     Args:
         part: Geom of the drone.
-        part_pos: Its position in the frame in which the other geom is given, m. (..., 3)
-        drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
-        geom: The other geom, or several along the last batch axis.
+        part_pos: Position of that geom in the frame of ``geom.pos``, m. (..., 3)
+        drone_rot: Attitude of the drone in the same frame; None if all geoms of drones are spheres. (..., 3, 3)
+        geom: The other geom, or several geoms along the last batch axis.
     """
     local_pos = part_pos - jnp.asarray(geom.pos, part_pos.dtype)
     rot = drone_rot
     if geom.rot is not None:
-        columns = jnp.asarray(geom.rot, part_pos.dtype)
-        x, y, z = (local_pos[..., k, None] * columns[..., k, :] for k in range(3))
+        geom_rot = jnp.asarray(geom.rot, part_pos.dtype)
+        x, y, z = (local_pos[..., k, None] * geom_rot[..., k, :] for k in range(3))
         local_pos = x + y + z
-        rot = None if drone_rot is None else _matrix_product(jnp.swapaxes(columns, -1, -2), drone_rot)
+        rot = None if drone_rot is None else _matrix_product(jnp.swapaxes(geom_rot, -1, -2), drone_rot)
     if rot is not None and part.rot is not None:
         rot = _matrix_product(rot, jnp.asarray(part.rot, part_pos.dtype))
     shape: Shape | SizedShapes = geom.shape
@@ -380,14 +383,14 @@ def _matrix_product(a: Array, b: Array) -> Array:
 
 
 def _minimum(gaps: list[Array], pos: Array) -> Array:
-    """Return the smallest distance, infinite without any. (...)"""
+    """Return the smallest distance, infinite if there is none. (...)"""
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
 def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
-    """Return the distance of one drone to the nearest other of its world, m. ()"""
+    """Return the distance of one drone to the nearest other drone of its world, m. ()"""
 
     def pair_distance(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
         positions, presences, rot = other

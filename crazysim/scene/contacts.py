@@ -1,4 +1,4 @@
-"""Contact slots of a synced scene. The only module that reads MJX's private contact record."""
+"""Contact slots of a synced scene: the rows of MJX's contact arrays. Only this module reads these private arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def contact_flags(mjx_data: mjx.Data) -> Array:
 
 
 def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
-    """Return a mask of the contact slots in which a geom of the body touches another geom. (n_worlds, n_slots)"""
+    """Return True for every contact slot in which a geom of a body touches another geom. (n_worlds, n_slots)"""
     belongs_to_body = mj_model.geom_bodyid == body_id(mj_model, body)
     contact = mjx_data._impl.contact
     return _slot_flags(contact.dist, contact.geom1, contact.geom2, belongs_to_body)
@@ -25,7 +25,7 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
 
 @jit_eager_calls()
 def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array) -> Array:
-    """Return True for every slot that touches and has a geom where ``belongs_to_body``. (n_worlds, n_slots)"""
+    """Return True for every slot with contact and a geom for which ``belongs_to_body`` is True. (n_worlds, n_slots)"""
     belongs_to_body = jnp.asarray(belongs_to_body)
     return (dist < 0) & ((geom1 >= 0) & belongs_to_body[geom1] | (geom2 >= 0) & belongs_to_body[geom2])
 

@@ -1,4 +1,4 @@
-"""Depth cameras: a ray for each pixel, for all worlds in one call."""
+"""Depth cameras: one ray per pixel, for all worlds in one call."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_RAYS = 1 << 22
 """Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
 
 MAX_RAYS_OF_KERNEL = 1 << 28
-"""Largest number of rays in a kernel, whose indices of rays and of entries of tables are int32."""
+"""Largest number of rays in a kernel, in which indices of rays and of table entries are int32."""
 
 TILE_SIDE = 4
 """Height and width of tiles, pixels. Rays are ordered tile by tile, so that neighbouring lanes of a kernel meet similar
@@ -38,7 +38,7 @@ Along = Literal["axis", "ray"]
 """Direction of distances: along the axis of the camera, or along the ray."""
 
 BYTES_PER_RAY = 16
-"""Smallest memory of a ray, bytes: distance and index of the geom, and a pixel for each of them, four bytes each."""
+"""Lower bound of the memory of a ray, bytes: distance and index of the geom, and a pixel of each, four bytes each."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,19 +66,19 @@ class CarriedCamera:
     """A camera and its pose in the frame of the body that carries it."""
 
     carrier: Literal["world", "drone", "object"]
-    """Kind of that body."""
+    """Kind of the carrying body."""
     body: str
-    """Name of that body."""
+    """Name of the carrying body."""
     row: int
     """Index of the drone, or row of the object in ``data.objects``."""
     pos: tuple[float, ...]
-    """Position relative to that body, in its frame, m; along the world's axes if ``follows_rotation`` is False. (3,)"""
+    """Position relative to the body, m, in its frame; in the world's axes if ``follows_rotation`` is False. (3,)"""
     rot: tuple[tuple[float, ...], ...]
-    """Rotation matrix whose columns are the camera's right, up and back along the same axes. (3, 3)"""
+    """Rotation matrix with the columns right, up and back of the camera, in the axes of ``pos``. (3, 3)"""
     follows_rotation: bool
-    """True if the camera turns with that body; False if it only follows the body's position."""
+    """True if the camera turns with the body; False if it only follows the body's position."""
     fovy: float
-    """Vertical field of view, degrees; 0 for a ``DroneCamera``, which has directions of its own."""
+    """Vertical field of view, degrees; 0 for a ``DroneCamera``, which has its own directions."""
 
     @classmethod
     def on_drone(cls, camera: DroneCamera, drone: int) -> CarriedCamera:
@@ -139,8 +139,8 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
 
     Args:
         fovy: Vertical field of view, degrees.
-        width: Pixels.
-        height: Pixels.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
     """
     half_height = np.tan(np.deg2rad(fovy) / 2)
     y = half_height * (1 - (2 * np.arange(height) + 1) / height)
@@ -156,9 +156,9 @@ def check_image_memory(
 
     Args:
         n_images: Number of images in all worlds together.
-        width: Pixels.
-        height: Pixels.
-        bytes_per_pixel: Smallest memory of a pixel, bytes.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
+        bytes_per_pixel: Lower bound of the memory of a pixel, bytes.
         device: Device of the images, or one of several.
         n_devices: Number of devices among which the images are divided.
     """
@@ -207,14 +207,15 @@ def build_depth_fn(
         hide_own: True for a drone to be invisible to its own camera.
         along: ``"axis"`` or ``"ray"``.
         plugins: Function that returns the plugins of the simulation.
-        kernels: Kernels that may cast the rays.
+        kernels: Kernels that cast the rays if possible.
     """
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     height, width = rays[0].shape[:2]
-    h, w = (math.gcd(n, TILE_SIDE) for n in (height, width))
-    tile_order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
+    tile_height, tile_width = (math.gcd(n, TILE_SIDE) for n in (height, width))
+    tile_shape = height // tile_height, tile_height, width // tile_width, tile_width
+    tile_order = np.arange(height * width).reshape(tile_shape).swapaxes(1, 2).reshape(-1)
     directions = np.zeros((len(cameras), height * width, 4))
     for camera, pixels, pixel_rows in zip(cameras, rays, directions, strict=True):
         pixel_rows[:, :3] = pixels.reshape(-1, 3)[tile_order]
@@ -228,20 +229,22 @@ def build_depth_fn(
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
-                [_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
+                [_rotate_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
             )
             return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones))
         camera_poses = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
         return untile_results(cast_rays_in_worlds(model_without_mocap, data, camera_poses, directions, drones, kernels))
 
     def untile_results(hits: Hits) -> Hits:
-        """Return the results of rays, tile by tile, as images, row by row."""
+        """Return hits in the order of the tiles as images, with distances along the axis or along the rays."""
         cosine = jnp.asarray(-directions[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
 
-        def untile(x: Array, n_last: int) -> Array:
-            leading, last = x.shape[: x.ndim - n_last - 1], x.shape[x.ndim - n_last :]
-            x = x.reshape(*leading, len(cameras), height // h, width // w, h, w, *last)
-            return jnp.swapaxes(x, -3 - n_last, -2 - n_last).reshape(*leading, len(cameras), height, width, *last)
+        def untile(x: Array, n_trailing: int) -> Array:
+            leading, trailing = x.shape[: x.ndim - n_trailing - 1], x.shape[x.ndim - n_trailing :]
+            n_rows, n_columns = height // tile_height, width // tile_width
+            x = x.reshape(*leading, len(cameras), n_rows, n_columns, tile_height, tile_width, *trailing)
+            x = jnp.swapaxes(x, -3 - n_trailing, -2 - n_trailing)
+            return x.reshape(*leading, len(cameras), height, width, *trailing)
 
         return hits.replace(
             distance=untile(hits.distance * cosine, 0),
@@ -282,8 +285,8 @@ def build_depth_fn(
     return depth
 
 
-def _directions(rot: Array, rays: np.ndarray) -> Array:
-    """Return the directions of rays of one camera, world frame. (n_rays, 3)
+def _rotate_directions(rot: Array, rays: np.ndarray) -> Array:
+    """Return the directions of the rays of one camera, world frame. (n_rays, 3)
 
     Args:
         rot: Axes of the camera as columns. (3, 3)
@@ -295,7 +298,7 @@ def _directions(rot: Array, rays: np.ndarray) -> Array:
 
 
 def camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
-    """Return the camera's position, m (..., 3), and its axes as columns (..., 3, 3), in all worlds or in one."""
+    """Return the camera's position, m (..., 3), and axes as columns (..., 3, 3), world frame, in all worlds or one."""
     states = data.states
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))
     leading = states.pos.shape[:-2]

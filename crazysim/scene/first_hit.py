@@ -29,12 +29,12 @@ from crazysim.scene.collision import CollisionGeom, CollisionModel
 IGNORES_NONE, NOT_A_DRONE = -1, -2
 """Drone index of rays that ignore no drone, and drone index of geoms that belong to no drone."""
 
-FAR_FROM_OBJECTS = 1e4
-"""Offset between drones and objects while the hierarchy of movable geoms is built, so that drones form a branch of
-their own, m."""
+DRONE_OFFSET = 1e4
+"""Offset of the drones from the objects while the hierarchy of movable geoms is built, m. Drones then form a separate
+branch."""
 
 Surface = Shape | str
-"""A mesh or height field, or the kind of shapes that their sizes describe."""
+"""Shape of a mesh or height field; for other shapes only the kind, since kind and size describe them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Target:
     geom: CollisionGeom
     """The geom, in the frame of its body."""
     carrier: Literal["world", "object", "drone"]
-    """Kind of its body; geoms of the world do not move."""
+    """Kind of the body; geoms of the world do not move."""
     row: int
     """Row of the body among the objects or drones."""
     body_index: int
@@ -72,7 +72,7 @@ class Target:
 
 
 class Hierarchy(NamedTuple):
-    """Geoms that do not move, as tables in memory."""
+    """Hierarchy of the geoms that do not move, as tables in memory."""
 
     codes: Array
     """Index of the surface, and the drone that a geom belongs to. (n, 2)"""
@@ -117,7 +117,7 @@ class Targets:
 
         Args:
             model: Model, without bodies whose poses are not part of the data.
-            n_drones: Drones of a world.
+            n_drones: Number of drones per world.
             drones: True for rays to meet drones.
             ignored_drone: Drone that all rays pass through; ``IGNORES_NONE`` for none.
         """
@@ -142,8 +142,8 @@ class Targets:
         self.codes = np.array(codes, np.int32).reshape(-1, 2)
         """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
 
-    def hierarchy(self, dtype: DTypeLike) -> Hierarchy:
-        """Return the fixed geoms; see ``build_hierarchy``."""
+    def build_fixed_hierarchy(self, dtype: DTypeLike) -> Hierarchy:
+        """Return the hierarchy of the fixed geoms; see ``build_hierarchy``."""
         low, high = np.zeros((2, len(self.fixed_geoms), 3))
         for k, target in enumerate(self.fixed_geoms):
             rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
@@ -156,26 +156,24 @@ class Targets:
         return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
 
     def movable_nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the nodes of the hierarchy of movable geoms, ordered by where the geoms are in the compiled scene.
+        """Return the nodes of the hierarchy of movable geoms, built from their positions in the compiled scene.
 
         Returns:
-            Index of the first leaf of each node, and of the one after its last leaf, in the first order. (n_nodes, 2)
+            Index of the first leaf of each node, and index after its last leaf, in the first order. (n_nodes, 2)
             Index of each leaf's geom among the movable geoms, in the first order. (n_movable,)
             As in ``Tables.movable_links``. (8, n_nodes, 3)
         """
         low, high = np.zeros((2, len(self.movable_geoms), 3))
         drone_pos = np.pad(grid_2d(1 + max([x.row for x in self.movable_geoms], default=0)), ((0, 0), (0, 1)))
         for k, target in enumerate(self.movable_geoms):
-            pos = (
-                drone_pos[target.row] + FAR_FROM_OBJECTS if target.carrier == "drone" else np.array(target.initial_pos)
-            )
+            pos = drone_pos[target.row] + DRONE_OFFSET if target.carrier == "drone" else np.array(target.initial_pos)
             middle, half = pos + np.array(target.geom.pos), bounding_box(target.geom.shape)[1]
             low[k], high[k] = middle - half, middle + half
         _, links = hierarchy.build_hierarchy(low, high)
         geoms = links[0, :, 1]
         leaves_before = np.concatenate([[0], np.cumsum(geoms >= 0)])
         ranges = np.stack([leaves_before[:-1], leaves_before[links[0, :, 0]]], axis=-1)
-        # A node has the same leaves in all orders, which identify it.
+        # The set of its leaves, which is the same in all orders, identifies a node.
         node_by_leaves = {_leaf_set(links[0], k): k for k in range(len(geoms))}
         indices = np.array(
             [[node_by_leaves[_leaf_set(order, k)] for k in range(len(geoms))] for order in links], np.int32
@@ -183,11 +181,11 @@ class Targets:
         return ranges.astype(np.int32), geoms[geoms >= 0], np.concatenate([links, indices[..., None]], axis=-1)
 
     def movable_rows(self, data: SimData) -> tuple[Array, Array]:
-        """Return boxes around the movable geoms, and the geoms, world frame.
+        """Return boxes around the movable geoms, and the rows of these geoms, world frame.
 
         Returns:
             Lower and upper corners, m. (n_worlds, n_movable, 6)
-            Geoms. (n_worlds, n_movable, 16)
+            Rows of the geoms; see ``Target.table_row``. (n_worlds, n_movable, 16)
         """
         states, dtype = data.states, data.states.pos.dtype
         n_worlds = states.pos.shape[0]
@@ -225,7 +223,7 @@ class Targets:
             camera_poses: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
-        fixed_hierarchy = self.hierarchy(camera_poses.dtype)
+        fixed_hierarchy = self.build_fixed_hierarchy(camera_poses.dtype)
         n_nodes = len(fixed_hierarchy.boxes) // hierarchy.N_ORDERS
         counts = np.array([[n_nodes, len(self.fixed_geoms), len(self.movable_geoms), links.shape[1]]], np.int32)
         tables = (
@@ -244,19 +242,19 @@ def _leaf_set(links: np.ndarray, node: int) -> frozenset[int]:
 
 
 def node_box(index: Array, counts: Array, ranges: Array, leaf_boxes: Array) -> list[Array]:
-    """Return the box around the leaves of a node in one world, as lower and upper corner. 6 of ()
+    """Return the box around the leaves of a node in one world: six coordinates of lower and upper corner. () each
 
     Args:
         index: Index of the node; nodes of the first world come first. ()
         counts: Number of nodes and number of leaves of a world. (1, 2)
-        ranges: Index of the first leaf of each node, and of the one after its last leaf. (n_nodes, 2)
+        ranges: Index of the first leaf of each node, and index after its last leaf. (n_nodes, 2)
         leaf_boxes: Boxes of the leaves of every world. (n_worlds * n_leaves, 6)
     """
     n_nodes, n_leaves = table_rows(counts, jnp.int32(0))
     world = lax.div(index, n_nodes)
     first_leaf, end_leaf = table_rows(ranges, index - world * n_nodes)
 
-    def include(carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
+    def include_leaf(carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
         leaf, box = carry
         box_of_leaf = table_rows(leaf_boxes, world * n_leaves + leaf)
         low = [_minimum(a, b) for a, b in zip(box[:3], box_of_leaf[:3], strict=True)]
@@ -264,7 +262,9 @@ def node_box(index: Array, counts: Array, ranges: Array, leaf_boxes: Array) -> l
         return leaf + 1, [*low, *high]
 
     infinite = jnp.asarray(jnp.inf, leaf_boxes.dtype)
-    return lax.while_loop(lambda carry: carry[0] < end_leaf, include, (first_leaf, [infinite] * 3 + [-infinite] * 3))[1]
+    return lax.while_loop(
+        lambda carry: carry[0] < end_leaf, include_leaf, (first_leaf, [infinite] * 3 + [-infinite] * 3)
+    )[1]
 
 
 class Ray(NamedTuple):
@@ -289,8 +289,8 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
 
     Args:
         surfaces: ``Targets.surfaces``.
-        n_pixels: Rays of a camera.
-        n_cameras: Cameras of a world.
+        n_pixels: Number of rays of a camera.
+        n_cameras: Number of cameras of a world.
         index: Index of the ray; pixels of the first camera of the first world come first. ()
         *tables: ``Tables``.
     """
@@ -331,8 +331,8 @@ def normal_at_hit(
 
     Args:
         surfaces: ``Targets.surfaces``.
-        n_pixels: Rays of a camera.
-        n_cameras: Cameras of a world.
+        n_pixels: Number of rays of a camera.
+        n_cameras: Number of cameras of a world.
         index: Index of the ray, as in ``first_hit``. ()
         *tables: ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
     """
@@ -372,7 +372,7 @@ def normal_at_hit(
 def _normal_in_frame(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> Components:
-    """Return the outward unit normal where a ray hits a geom at a distance, m, all in the geom's frame. 3 of ()"""
+    """Return the outward unit normal where a ray hits a geom at a distance, m, all in the geom's frame."""
     if isinstance(surface, Shape) and surface.kind == "hfield":
         return components(field_ray(surface, jnp.stack(origin), jnp.stack(direction))[1])
     if isinstance(surface, Shape):
@@ -480,8 +480,8 @@ def _meets_box(
         low: Lower corner of the box, m.
         high: Upper corner, m.
         scaled_origin: Origin of the ray times ``inverse_direction``.
-        inverse_direction: Inverses of the components of its direction.
-        best: Distance to its best hit, m.
+        inverse_direction: Inverses of the components of the ray's direction.
+        best: Distance to the best hit so far, m.
     """
     ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled_origin, inverse_direction, strict=True)]
     x, y, z = (_minimum(*pair) for pair in ends)
@@ -494,7 +494,7 @@ def _meets_box(
 def _nearer_hit(
     surfaces: Sequence[Surface], code: Array, geom: Array, row: Sequence[Array], ray: Ray, is_near: Array, best: BestHit
 ) -> BestHit:
-    """Return the best hit so far, or a nearer hit of a geom where ``is_near``."""
+    """Return the best hit so far, or the hit of one geom if it is nearer and ``is_near`` is True."""
     local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
     for surface_index, surface in enumerate(surfaces):
 
@@ -531,7 +531,7 @@ def _ray_length(surface: Surface, row: Sequence[Array], origin: Components, dire
 
 
 def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) -> Array:
-    """Return the distance along one ray to a mesh, in a loop over its planes; see ``hit_distance``. m, ()"""
+    """Return the distance along one ray to a mesh, m, in a loop over its planes; see ``hit_distance``. ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
     def cut_by_plane(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:

@@ -1,7 +1,7 @@
 """Bounding volume hierarchy of geoms, as a table that a ray walks without a stack.
 
-Nodes are in depth-first order, each with the index of the node after its subtree, where a ray that misses its box
-continues. Each of the eight octants of directions has a separate order, in which nearer boxes come first.
+Nodes are in depth-first order. Each node has the index of the node after its subtree; a ray that misses the box of the
+node continues there. Each of the eight octants of directions has its own order, in which nearer boxes come first.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from crazysim.geometry.shapes import UNBOUNDED_LENGTH
 
 N_ORDERS = 8
-"""Orders of the nodes: one for each octant of directions."""
+"""Number of orders of the nodes: one for each octant of directions."""
 BOX_PADDING = 1e-4
-"""Enlargement of boxes on all sides, m, so that rounding makes no ray miss the box of a geom that it meets: more
-than the spacing of numbers in float32 up to 1 km, which is 6e-5 m."""
+"""Enlargement of boxes on all sides, m, so that no ray misses the box of a geom because of rounding. It exceeds the
+spacing of float32 numbers up to 1 km, 6e-5 m."""
 
 
 @dataclasses.dataclass
@@ -28,9 +28,9 @@ class _Node:
     axis: int = 0
     """Axis along which the children are sorted."""
     children: tuple[_Node, _Node] | None = None
-    """Subtrees, the one at smaller coordinates first; None for a leaf."""
+    """Subtrees, in ascending order along ``axis``; None for a leaf."""
     geom: int = -1
-    """Index of the geom of a leaf; -1 for others."""
+    """Index of the geom of a leaf; -1 for other nodes."""
 
 
 def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,9 +56,10 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
-    """Return a tree of boxes, split so that surface area times number of boxes, summed over both parts, is smallest.
+    """Return a tree of boxes, built with the surface area heuristic.
 
-    Each part has more than an eighth of the boxes, which bounds the depth.
+    Each split minimises the sum over both parts of surface area times number of boxes. Each part has more than an
+    eighth of the boxes, which bounds the depth.
     """
     node = _Node(low[geoms].min(axis=0), high[geoms].max(axis=0), geom=int(geoms[0]))
     n = len(geoms)

@@ -15,7 +15,7 @@ N_DUMMY_JOINTS = 1
 
 
 def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Return MJX data with the poses of bodies, of their inertial frames, of geoms and of sites.
+    """Return MJX data with the world poses of bodies, inertial frames, geoms and sites.
 
     It equals ``mjx.kinematics`` for a scene that defines no joints, with three differences. It takes a quarter of the
     time to trace and compile. Children of a mocap body follow its pose in each world; MJX 3.17 places them by the pose
@@ -56,7 +56,7 @@ def _to_xyzw(quat: Array) -> Array:
 
 
 def _generations(parents: NDArray) -> list[NDArray]:
-    """Return the bodies whose parents are not the world, by depth: grandchildren of the world, their children, ..."""
+    """Return the bodies at each depth, from the grandchildren of the world on. (n_bodies,) each"""
     depth = np.zeros(len(parents), int)
     for body in range(1, len(parents)):  # a parent comes before its children
         depth[body] = depth[parents[body]] + 1

@@ -15,7 +15,7 @@ from crazysim.storage import read_bytes, wrap_read_errors
 MAX_FILE_BYTES = 2**32
 """Largest file, bytes. A scene of five million splats has 1.2 GB."""
 MAX_HEADER_BYTES = 2**16
-"""Largest header of a ``.ply`` or ``.pcd`` file, bytes; usual ones have less than 2,000."""
+"""Largest header of a ``.ply`` or ``.pcd`` file, bytes; usual headers have less than 2,000."""
 READ_REMEDY = "Save it again, as .ply, .pcd, .stl or .obj."
 """End of the message about a file that cannot be read."""
 
@@ -24,9 +24,11 @@ PLY_TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
+"""NumPy's name of each type of a ``.ply`` file."""
 Columns = dict[str, Any]
-"""Properties of the rows of an element, by their names: arrays, or lists of arrays."""
+"""Properties of an element by name: arrays with an entry per row, or lists with an array per row."""
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+"""NumPy's byte order of each binary ``.ply`` format."""
 
 
 class MapFile(NamedTuple):
@@ -71,7 +73,7 @@ def read_ply(content: bytes) -> dict[str, Columns]:
     A list property is an array (n, n_entries), or a list of arrays if its entries differ in number.
 
     Args:
-        content: The file.
+        content: Contents of the file.
 
     Raises:
         ValueError: If the file is damaged, cut off, or of another kind.
@@ -105,7 +107,7 @@ def _read_ply_map(content: bytes) -> tuple[NDArray, NDArray | None]:
 
 
 def _read_pcd(content: bytes) -> tuple[NDArray, None]:
-    """Return the points of a ``.pcd`` file without those that are not finite, which mark missing returns."""
+    """Return the finite points of a ``.pcd`` file; points that are not finite mark missing returns."""
     header, body = _split_header(content, b"DATA")
     table = {line[0]: line[1:] for line in header if not line[0].startswith("#")}
     n, layout = _parse_count(table["POINTS"][0]), table["DATA"][0]
@@ -120,8 +122,8 @@ def _read_pcd(content: bytes) -> tuple[NDArray, None]:
         points = np.stack([values[axis][:, 0] for axis in "xyz"], axis=-1)
     elif layout == "ascii":
         rows = _parse_numbers(body.split(), n * sum(counts)).reshape(n, -1)
-        first = dict(zip([name for name, *_ in fields], np.cumsum([0, *counts]), strict=False))
-        points = rows[:, [first[axis] for axis in "xyz"]]
+        first_columns = dict(zip([name for name, *_ in fields], np.cumsum([0, *counts]), strict=False))
+        points = rows[:, [first_columns[axis] for axis in "xyz"]]
     else:
         raise ConfigError(f"expected DATA ascii or binary in a .pcd file, got {layout[:30]!r}. Save it as binary.")
     return points[np.isfinite(points).all(axis=1)], None
@@ -164,7 +166,7 @@ MAP_READERS: dict[str, Callable[[bytes], tuple[NDArray, NDArray | None]]] = {
 
 
 def _split_header(content: bytes, last_keyword: bytes) -> tuple[list[list[str]], bytes]:
-    """Return the words of the lines up to the one that begins with ``last_keyword``, and the bytes after it."""
+    """Return the words of each line of the header, and the bytes after the line that begins with ``last_keyword``."""
     lines, start = [], 0
     while start < min(len(content), MAX_HEADER_BYTES):
         end = content.find(b"\n", start)
@@ -188,12 +190,12 @@ def _parse_count(number: str | int) -> int:
 
 
 def _number_padding_columns(names: list[str]) -> list[str]:
-    """Return names of columns with a number after each ``_``, the name of all padding columns."""
+    """Return names of columns with a number after each ``_``, which is the name of all padding columns."""
     return [f"{name}{k}" if name == "_" else name for k, name in enumerate(names)]
 
 
 def _parse_numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
-    """Return the first ``n`` words as numbers, after a check that there are as many."""
+    """Return the first ``n`` words as numbers, after a check that there are enough words."""
     if len(words) < n:
         raise ValueError(f"expected {n} numbers, got {len(words)}")
     return np.array(words[:n], np.float64)
@@ -211,7 +213,7 @@ def _triangulate(polygons: NDArray | list[NDArray]) -> NDArray[np.int64]:
 
 
 Property = tuple[str, ...]
-"""Name and type of a property; or, for a list, its name, the type of its length, and the type of its entries."""
+"""Name and type of a property; for a list, its name, the type of its length, and the type of its entries."""
 
 
 class _AsciiTable:
@@ -261,7 +263,7 @@ class _BinaryTable:
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def _read_lists(self, n: int, properties: list[Property]) -> Columns:
-        """Return the next ``n`` rows with lists: at once if the lists are as long in every row as in the first."""
+        """Return the next ``n`` rows with lists, all at once if each list has the same length in every row."""
         start, fields = self._position, []
         lengths = {p[0]: len(self._read_entry(p)) for p in properties}
         for p in properties:

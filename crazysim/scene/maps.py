@@ -18,15 +18,15 @@ from crazysim.tables import LENGTH, range_between, read_number, read_numbers
 MapSource = str | Path | ArrayLike
 """Path of a ``.ply``, ``.pcd``, ``.stl`` or ``.obj`` file, or the points of a cloud, m. (n_points, 3)"""
 MIN_EXTENT, MAX_EXTENT = 0.01, 10_000.0
-"""Smallest and largest extent of a map whose unit is taken to be a metre, m."""
+"""Smallest and largest extent of a map without ``scale``, m."""
 MAX_COORDINATE = 1e6
 """Largest coordinate of a map, m."""
 MAX_VOXELS = 20_000_000
-"""Largest number of voxels that are tested or merged; more would need several GB."""
+"""Largest number of voxels that are tested or merged; more would need several GB of memory."""
 MAX_BOXES = 10_000
 """Largest number of boxes of a map."""
 MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
-"""Colour of maps."""
+"""Default colour of maps, RGBA."""
 
 
 def map_spec(
@@ -38,7 +38,7 @@ def map_spec(
     min_points: int,
     rgba: ArrayLike,
 ) -> mujoco.MjSpec:
-    """Return a spec whose world body has the boxes of a map; see ``Scene.add_map``."""
+    """Return a spec with the boxes of a map in its world body; see ``Scene.add_map``."""
     resolution = read_number("resolution", resolution, LENGTH)
     min_points = positive_integer("min_points", min_points)
     points, triangles = _read_source(source)
@@ -79,8 +79,8 @@ def to_world_frame(points: NDArray, pos: ArrayLike, quat: ArrayLike, scale: floa
     Args:
         points: Finite points in the frame and unit of the file. (n, 3)
         pos: Origin of the file's frame, world frame, m. (3,)
-        quat: Its attitude, file to world, xyzw. (4,)
-        scale: Metres per unit of the file; None for a file in metres, whose extent must be plausible.
+        quat: Attitude of the file's frame, file to world, xyzw. (4,)
+        scale: Metres per unit of the file; None for 1, which requires a plausible extent.
     """
     pos, rot, scale = read_frame(points, pos, quat, scale)
     points = scale * points @ rot.T + pos

@@ -1,8 +1,9 @@
 """MJX, imported on first use, since only contact slots, ``mjx_model`` and ``mjx_data`` need it.
 
-It is imported without NVIDIA Warp: nothing here runs MJX on Warp, whose import would take two more seconds. A program
-that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls trimesh and
-``scipy.spatial`` only for scenes with meshes. Their import takes almost a second, so it is deferred to the first call.
+MJX is imported without NVIDIA Warp: nothing here runs MJX on Warp, and the import of Warp would take two more seconds.
+A program that runs MJX on Warp must import ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls
+trimesh and ``scipy.spatial`` only for scenes with meshes. Their import takes almost a second, so it is deferred to the
+first call.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def load_module() -> ModuleType:
 
 
 class _DeferredModule(ModuleType):
-    """Stand-in for a module, with functions that import it and call its functions and classes."""
+    """Placeholder of a module. Its attributes are functions that import the module and call its member of that name."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -39,7 +40,7 @@ class _DeferredModule(ModuleType):
 
 @contextlib.contextmanager
 def _defer_imports() -> Iterator[None]:
-    """Make imports of Warp fail, and defer imports of trimesh and SciPy's geometry, unless they have been imported."""
+    """Make imports of Warp fail, and defer imports of trimesh and ``scipy.spatial``, unless already imported."""
     replacements = {"warp": None, **{name: _DeferredModule(name) for name in ("trimesh", "scipy.spatial")}}
     replacements = (
         {} if "mujoco.mjx" in sys.modules else {k: x for k, x in replacements.items() if k not in sys.modules}

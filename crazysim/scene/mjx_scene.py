@@ -1,4 +1,4 @@
-"""The scene of every world on the device, as MJX holds it: allocated when first read."""
+"""MJX's model and data of the scene in every world, allocated when first read."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class MjxScene:
     """``mjx.Model`` and ``mjx.Data`` of one compiled scene."""
 
     def __init__(self, mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device, mesh: Mesh | None):
-        """Keep the compiled scene; nothing is allocated yet.
+        """Store the compiled scene; nothing is allocated yet.
 
         Args:
             mj_model: Compiled scene.
             n_worlds: Number of worlds.
             device: Device of all arrays.
-            mesh: Devices over which the worlds are spread instead; None for one device.
+            mesh: Devices over which the worlds are distributed; None for one device.
         """
         self._mj_model, self._n_worlds, self._device, self._mesh = mj_model, n_worlds, device, mesh
         self._model: mjx.Model | None = None
@@ -55,7 +55,7 @@ class MjxScene:
 
     @property
     def data(self) -> mjx.Data:
-        """State of the scene in every world; assigned poses are checked. (n_worlds, ...)"""
+        """State of the scene in every world; poses are checked when it is assigned. (n_worlds, ...)"""
         if self._data is None:
             self._data = self._to_device(build.make_data(self._mj_model, self._n_worlds, self._device))
         return self._data
@@ -77,10 +77,10 @@ class MjxScene:
         return data
 
     def poses(self, worlds: int | NDArray | None = None) -> tuple[Any, Any, Any]:
-        """Return poses of some worlds at the last sync, or as the model has them while nothing is allocated.
+        """Return poses of worlds at the last sync, or the model's initial poses if nothing is allocated yet.
 
         Args:
-            worlds: Index or indices; None for all.
+            worlds: Index or indices of worlds; None for all worlds.
 
         Returns:
             Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), and joint positions (n, n_qpos).
@@ -109,7 +109,7 @@ class MjxScene:
         return contacts.body_contact_flags(self.data, self._mj_model, body)
 
     def shard(self, mesh: Mesh) -> None:
-        """Spread the worlds over devices."""
+        """Distribute the worlds over devices."""
         self._mesh, self._model, self._is_synced = mesh, None, False
         if self._data is not None:
             self._data = self._to_device(self._data)

@@ -14,8 +14,8 @@ from crazysim.errors import ConfigError
 from crazysim.scene.collision import CollisionModel
 
 MocapPoses = Any
-"""``mjx_data``, or a pair ``(mocap_pos, mocap_quat)`` as it has them: m (n_worlds, n_mocap, 3) and wxyz (n_worlds,
-n_mocap, 4). In a function of one world both come without ``n_worlds``."""
+"""``mjx_data``, or its pair ``(mocap_pos, mocap_quat)``: m (n_worlds, n_mocap, 3), and wxyz (n_worlds, n_mocap, 4). In
+a function of one world, both have no axis ``n_worlds``."""
 
 
 def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -> SimData:
@@ -24,16 +24,16 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
     Args:
         model: Model that is queried.
         data: Simulation, one world of it, or one drone.
-        mocap: Poses of all mocap bodies; None to leave them unchanged.
+        mocap: Poses of all mocap bodies; None to return the data unchanged.
     """
     if mocap is None or not model.mocap_bodies:
         return data
-    batched = data.states.pos.ndim == 3
+    has_worlds = data.states.pos.ndim == 3
     dtype, ids = data.states.pos.dtype, np.array(model.mocap_ids)
-    pos, quat = (jnp.take(x, ids, axis=-2).astype(dtype) for x in _pose_pair(mocap, data if batched else None))
+    pos, quat = (jnp.take(x, ids, axis=-2).astype(dtype) for x in _pose_pair(mocap, data if has_worlds else None))
     quat = jnp.roll(quat, -1, axis=-1)
     quat = quat / jnp.linalg.norm(quat, axis=-1, keepdims=True)
-    if batched:
+    if has_worlds:
         pos, quat = pos[:, None], quat[:, None]
     names: tuple[str, ...] = ()
     if data.objects is not None:
@@ -54,6 +54,7 @@ def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses
 
 
 def _pose_pair(mocap: MocapPoses, data: SimData | None) -> tuple[Array, Array]:
+    """Return positions and attitudes of mocap bodies after a check; ``data`` is None for those of one world."""
     pos, quat = mocap if isinstance(mocap, (tuple, list)) else (mocap.mocap_pos, mocap.mocap_quat)
     pos, quat = jnp.asarray(pos), jnp.asarray(quat)
     n = None if data is None else data.states.pos.shape[0]

@@ -1,4 +1,4 @@
-"""The nearest of many geoms that do not move: a search in their hierarchy, for one drone in a stage of a step."""
+"""Search for the nearest of many geoms that do not move, in their hierarchy, for one drone in a stage."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ def nearest_geom(
 ) -> Array:
     """Return the index of the geom with the smallest distance, int32, without a derivative. ()
 
-    Nodes are visited in one order. A node whose box is no nearer than the best geom so far is left out with its
-    subtree.
+    Nodes are visited in one order. If the box of a node is no nearer than the best geom so far, its subtree is skipped.
 
     Args:
         low: Lower corners of boxes around the geoms, m. (n, 3)
         high: Upper corners, m. (n, 3)
-        point: Position of a body, m. 3 of ()
+        point: Coordinates of the position of a body, m. () each
         reach: Radius of the ball around the position that contains the body, m.
-        distance: Returns the signed distance of the body to the geom with an index, m. () -> ()
+        distance: Function from the index of a geom to the signed distance of the body to it, m. () -> ()
     """
     dtype = point[0].dtype
     node_boxes, node_links = build_hierarchy(low, high)
@@ -38,13 +37,13 @@ def nearest_geom(
         (next_node, geom), box = table_rows(links, node), table_rows(boxes, node)
         is_near = _box_distance(box[:3], box[3:], point) - reach < best[0]
 
-        def compare(best: tuple[Array, Array]) -> tuple[Array, Array]:
+        def compare_geom(best: tuple[Array, Array]) -> tuple[Array, Array]:
             gap = lax.stop_gradient(distance(geom))
             is_nearer = gap < best[0]
             return jnp.where(is_nearer, gap, best[0]), jnp.where(is_nearer, geom, best[1])
 
         def descend(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
-            return node + 1, compute_where(geom >= 0, compare, carry[1])
+            return node + 1, compute_where(geom >= 0, compare_geom, carry[1])
 
         return compute_where(any_lane(is_near), descend, (next_node, best))
 

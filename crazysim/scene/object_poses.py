@@ -1,4 +1,4 @@
-"""Poses of objects that follow from the records of plugins, such as loads, in queries of the scene."""
+"""Poses of the objects of plugins, such as loads, which queries compute from the records of the plugins."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ListPlugins = Callable[[], Iterable[Plugin]]
 
 
 def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plugin]:
-    """Return the plugin that moves each object, by the name of the object, without objects that no plugin moves."""
+    """Return the plugin that moves each object, by the name of the object; only objects that a plugin moves."""
     owners = {}
     for plugin in plugins:
         kinds = plugin.moved_kinds
@@ -25,9 +25,9 @@ def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str,
 
 
 def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
-    """Return the data of all worlds, or of one world, with the poses of objects that plugins move.
+    """Return the data of all worlds, or of one world, with the present poses of objects that plugins move.
 
-    Recorded poses stay.
+    If ``data.objects.recorded`` is True, the data is returned unchanged.
     """
     if not plugins or data.objects is None or data.objects.recorded:
         return data

@@ -26,19 +26,19 @@ MAX_OBJECTS = 100_000
 IDENTITY_QUAT = (0.0, 0.0, 0.0, 1.0)
 """Identity attitude, xyzw."""
 Source = str | Path | mujoco.MjSpec | mujoco.MjsBody
-"""Name of a primitive, path of an MJCF file, MJCF text, a spec, or a body of one."""
+"""Name of a primitive, path of an MJCF file, MJCF text, a spec, or a body of a spec."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Handle:
-    """Objects of one kind in the scene. It stays valid when more are added."""
+    """Objects of one kind in the scene. A handle stays valid when more objects are added."""
 
     name: str
     """Prefix of the bodies' names ``name:0``, ``name:1``, ..."""
     numbers: tuple[int, ...]
     """Indices of these objects within their kind."""
     rows: tuple[int, ...]
-    """Rows of their poses in ``data.objects``; empty if they cannot be moved."""
+    """Rows of these objects in ``data.objects``; empty if they cannot be moved."""
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -47,14 +47,14 @@ class Handle:
 
     @property
     def movable(self) -> bool:
-        """True if their poses can differ between worlds."""
+        """True if the objects can be moved, independently in each world."""
         return bool(self.rows)
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __getitem__(self, k: int | slice) -> Handle:
-        """Return a handle of some of the objects."""
+        """Return the handle of the objects at an index or slice."""
         select = (lambda x: x[k]) if isinstance(k, slice) else (lambda x: (x[k],))
         return Handle(self.name, select(self.numbers), select(self.rows) if self.movable else ())
 
@@ -66,14 +66,15 @@ class Handle:
         vel: ArrayLike | None = None,
         mask: ArrayLike | None = None,
     ) -> SimData:
-        """Return the data with these objects moved. Pure: for jit, rollouts, and stages of one world.
+        """Return the data with these objects moved; works in ``jax.jit``, rollouts, and stages of one world.
 
         Args:
             data: Simulation, or one world of it in a stage.
-            pos: Positions of the bodies' frames, world frame, m; None to keep. (3,), (n, 3) or (n_worlds, n, 3)
-            quat: Attitudes, body to world, xyzw, normalised here; None to keep. The same shapes with 4
-            vel: Velocities for contact response, world frame, m/s; they do not move the objects. Shapes as ``pos``;
-                zero if ``pos`` is set without them.
+            pos: Positions of the bodies' frames, world frame, m. None keeps them. (3,), (n, 3) or (n_worlds, n, 3)
+            quat: Attitudes, body to world, xyzw, which are normalised. None keeps them. (4,), (n, 4) or (n_worlds, n,
+                4)
+            vel: Velocities for contact response, world frame, m/s; they do not move the objects. None sets zero if
+                ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         objects = self._objects(data)
@@ -112,7 +113,7 @@ class Handle:
 def _replace_rows(
     old: Array, value: Array | NDArray, mask: Array | None, row_indices: tuple[int, ...], is_quat: bool
 ) -> Array:
-    """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
+    """Return positions, attitudes (normalised) or velocities of all objects with the selected rows replaced."""
     n, size = len(row_indices), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:
@@ -131,12 +132,12 @@ def _replace_rows(
 
 @jit_eager_calls("row_indices")
 def _select_rows(poses: Array, row_indices: tuple[int, ...]) -> Array:
-    """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
+    """Return positions or attitudes of the selected objects. (n, k), or (n_worlds, n, k) for all worlds"""
     return (poses if poses.ndim == 2 else poses[:, 0])[..., np.array(row_indices), :]
 
 
 def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
-    """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)"""
+    """Return positions, attitudes or velocities of ``n`` objects after a check of their shape and values."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
@@ -144,8 +145,8 @@ def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds
     shapes = [(size,), (n, size)] + ([] if n_worlds is None else [(n_worlds, n, size)])
     if array.shape not in shapes:
         raise ConfigError(f"expected {field} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
-    on_host = isinstance(array, np.ndarray)
-    if on_host and (not np.isfinite(array).all() or (field == "quat" and not array.any(axis=-1).all())):
+    is_on_host = isinstance(array, np.ndarray)
+    if is_on_host and (not np.isfinite(array).all() or (field == "quat" and not array.any(axis=-1).all())):
         raise ConfigError(
             f"expected finite numbers for {field}, not all zero in a quaternion, got "
             f"{np.array2string(array, threshold=8)}"
@@ -154,7 +155,7 @@ def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds
 
 
 class SceneSnapshot(NamedTuple):
-    """Contents of a scene at some time, to which ``restore_snapshot`` returns."""
+    """Contents of a scene, which ``restore_snapshot`` restores."""
 
     names: list[set[str]]
     """Names of the elements of the spec, in the order of ``_elements``."""
@@ -232,7 +233,7 @@ class SceneObjects:
         self._handles, self._initial_poses = snapshot.handles, snapshot.initial_poses
         return bool(added)
 
-    def record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
+    def build_record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects.
 
         Args:
@@ -254,7 +255,7 @@ class SceneObjects:
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
-    """Return the elements that attached specs add, in the order of deletion: users before the elements they use."""
+    """Return the elements that attached specs add, in the order of deletion: bodies before what they use."""
     return spec.worldbody.bodies, spec.materials, spec.textures, spec.meshes, spec.hfields
 
 
@@ -265,12 +266,12 @@ def add_bodies(
 
     Args:
         spec: Scene.
-        source: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of
-            these, but no primitives, with one for each body.
+        source: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list with one of
+            these for each body, except primitives.
         names: Names of the bodies.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)
-        mocap: True if they can be moved.
+        mocap: True for bodies that can be moved.
         options: Settings of the primitive.
     """
     poses = [{"pos": p, "quat": np.roll(q, 1)} for p, q in zip(pos, quat, strict=True)]
@@ -294,7 +295,7 @@ def add_bodies(
 
 
 def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
-    """Return a spec or body to attach; it is read for every body, because attaching may consume it."""
+    """Return a spec or body to attach. It is loaded for every new body, because attaching may consume it."""
     if isinstance(source, mujoco.MjsBody):
         return source
     kinds = f"{', '.join(PRIMITIVES)}, an MJCF file, MJCF text, an MjSpec or a body of one"
@@ -318,7 +319,7 @@ def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
 
 
 def _default_name(source: Source) -> str:
-    """Return the name of objects that are added without one."""
+    """Return the name of objects that are added without a name."""
     if isinstance(source, mujoco.MjsBody):
         return source.name or "object"
     if isinstance(source, mujoco.MjSpec):

@@ -12,7 +12,7 @@ from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError, UnknownNameError
 
 DEFAULT_COLOR = (1.0, 0.0, 0.0, 1.0)
-"""Default colour, rgba."""
+"""Default colour of overlays, RGBA."""
 
 IMAGE_CORNERS = {
     "top left": mujoco.mjtGridPos.mjGRID_TOPLEFT,
@@ -22,7 +22,7 @@ IMAGE_CORNERS = {
 }
 """Corners of an image for text."""
 MAX_LABEL_LENGTH = 99
-"""Largest number of characters of a label; MuJoCo cuts off longer ones."""
+"""Largest number of characters of a label; MuJoCo cuts off longer labels."""
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Overlays:
 
         Args:
             points: World frame, m. (n, 3)
-            rgba: Colour, one or one per segment. (4,) or (n - 1, 4)
+            rgba: Colour of all segments, or one colour per segment. (4,) or (n - 1, 4)
             start_size: Width at the first point, pixels.
             end_size: Width at the last point, pixels.
         """
@@ -83,7 +83,7 @@ class Overlays:
         self._geoms += [(*geom, color, emission) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:
-        """Append the geoms to a scene that is about to be drawn."""
+        """Append the geoms to MuJoCo's scene before it is drawn."""
         for kind, size, a, b, rgba, emission in self._geoms:
             if scene.ngeom >= scene.maxgeom:
                 raise ValueError(
@@ -104,7 +104,7 @@ class Overlays:
         return bool(self._texts)
 
     def write_text(self, pixels: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
-        """Write the text of the corners over an image that has just been drawn."""
+        """Draw the text of the corners over an image that has been drawn."""
         for corner, text in self._texts.items():
             mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, IMAGE_CORNERS[corner], pixels, text, "", context)
 
@@ -123,7 +123,7 @@ class Overlays:
 
 
 def _printable_text(text: str, max_length: int | None = None) -> str:
-    """Return text that MuJoCo's font can show."""
+    """Return a text after a check that MuJoCo's font can show it."""
     if not isinstance(text, str) or not text:
         raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
     unprintable = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})

@@ -15,7 +15,7 @@ from crazysim.errors import ConfigError
 from crazysim.tables import LENGTH, range_between, read_numbers
 
 DRONE_TOUCH_BITS = {"contype": 0, "conaffinity": 2}
-"""Bits of geoms that touch drones only, so that no object is in contact with the floor it stands on."""
+"""Collision bits of geoms that touch only drones, so that no object touches the floor on which it stands."""
 
 Geoms = list[dict[str, Any]]
 """Geoms in the frame of an object, as keyword arguments of MuJoCo's ``add_geom``."""
@@ -28,7 +28,7 @@ def gate(width: float = 0.45, height: float = 0.45, bar: float = 0.05, stand: fl
         width: Width of the opening, along y, m.
         height: Height of the opening, along z, m.
         bar: Thickness of the frame, m.
-        stand: Height of the origin over the floor for a gate on a post, m; None for a gate without one.
+        stand: Height of the origin above the floor for a gate on a post, m; None for a gate without a post.
     """
     y, z, b = width / 2, height / 2, bar / 2
     geoms = [_box((0, side * (y + b), 0), (b, b, z + bar)) for side in (-1, 1)]
@@ -45,7 +45,7 @@ def gate(width: float = 0.45, height: float = 0.45, bar: float = 0.05, stand: fl
 
 
 def box(size: ArrayLike = (0.2, 0.2, 0.2)) -> Geoms:
-    """Return a box around its origin; ``size`` gives its full lengths along x, y and z, m."""
+    """Return a box around its origin, with full lengths ``size`` along x, y and z, m."""
     return [_box((0, 0, 0), np.asarray(size, float) / 2)]
 
 
@@ -90,7 +90,7 @@ PRIMITIVES: dict[str, tuple[Callable[..., Geoms], tuple[float, ...]]] = {
     "wall": (wall, (0.70, 0.70, 0.68, 1)),
     "landing_pad": (landing_pad, (0.25, 0.55, 0.40, 1)),
 }
-"""Function and colour, rgba, of each primitive."""
+"""Function and default colour, RGBA, of each primitive."""
 
 
 def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
@@ -98,7 +98,7 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
 
     Args:
         name: Key of ``PRIMITIVES``.
-        options: Arguments of its function, and ``rgba``.
+        options: Arguments of the function of the primitive, and ``rgba``.
     """
     make, rgba = PRIMITIVES[name]
     settings = {"rgba": rgba} | options

@@ -1,4 +1,4 @@
-"""Compiled queries of a simulation to its scene: contact reports and depth of all worlds."""
+"""Compiled queries of the scene of a simulation: contact reports and depth of all worlds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from crazysim.scene.scene import Scene
 
 MAX_KERNEL_SIZE = 256
 """Largest ``kernel_size`` of a contact report that is computed by a kernel. A kernel for 64 movable boxes takes 20 s to
-compile. XLA compiles any number in 1 s, but takes 1.4 times as long in each call."""
+compile. XLA compiles any number of boxes in 1 s, but its programs take 1.4 times as long in each call."""
 
 
 class SceneQueries:
@@ -58,7 +58,7 @@ class SceneQueries:
     def _run(
         self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
     ) -> Any:
-        """Return the result of a query about poses, which is compiled once for its settings."""
+        """Return the result of a query of poses; it is compiled once for each set of settings."""
         compiled_model, compiled = self._compiled
         if compiled_model is not self._scene.mj_model:
             _, compiled = self._compiled = self._scene.mj_model, {}
@@ -66,7 +66,7 @@ class SceneQueries:
         if is_new:
             compiled[name, *settings] = jax.jit(_restrict_to_poses(build(), data))
         states, objects = data.states, data.objects
-        # Only the arrays that the query needs, since the cost of a compiled call grows with their number.
+        # Pass only the arrays that the query needs, since the cost of a compiled call grows with their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         with keep_programs(enabled=is_new):
@@ -105,7 +105,7 @@ class SceneQueries:
 
 
 def _restrict_to_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
-    """Return a function of poses that calls a function of data and mocap poses; all other data is None."""
+    """Return a function of poses that calls ``fn`` with data in which everything except the poses is None."""
     empty_data = jax.tree.map(lambda _: None, data)
 
     def query_poses(
@@ -114,7 +114,7 @@ def _restrict_to_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., A
         states, objects = empty_data.states.replace(pos=pos, quat=quat), empty_data.objects
         core = empty_data.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
-            # Plugins, whose records are not among the arguments, have moved their objects already.
+            # Plugins have already moved their objects, so their records are not needed.
             objects = objects.replace(pos=objects_pos, quat=objects_quat, recorded=True)
         return fn(empty_data.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 

@@ -41,7 +41,7 @@ from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 T = TypeVar("T")
 MAX_UNROLLED_GEOMS = 16
-"""Largest number of movable geoms of a world for which a stage should cast rays, since its program is unrolled."""
+"""Largest number of movable geoms of a world for which a stage should cast rays: its program is unrolled over them."""
 MAX_PAIRS = 36
 """Largest number of rays times fixed geoms of one world or drone for which the program is unrolled. The unrolled
 program is two to three times as fast as a hierarchy, and compiles in about the same time."""
@@ -61,7 +61,7 @@ class Hits(PyTree):
     body_index: Array
     """Index of the body in ``names``; -1 where the ray meets nothing."""
     names: tuple[str, ...] = static()
-    """Floor, objects and drones, in that order."""
+    """Names of floor, objects and drones, in the order of ``body_index``."""
 
 
 def body_names(model: CollisionModel, n_drones: int) -> tuple[str, ...]:
@@ -86,9 +86,10 @@ def cast_rays(
         model: Visual or collision model of the scene.
         data: Simulation, for the poses of objects and drones.
         origin: Origins of the rays, world frame, m. (n_worlds, n_rays, 3), without n_worlds in one world or drone
-        direction: Unit directions, world frame. The same shape
+        direction: Unit directions, world frame. Same shape as ``origin``
         ignored_drones: Index of the drone that a ray passes through; None for no drone. (n_rays,)
-        drones: True for rays to meet drones; must be False in a stage of one drone, which has no access to the others.
+        drones: True for rays to meet drones; must be False in a stage of one drone, which has no access to other
+            drones.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
         limit: Distance beyond which rays of one world or drone may miss fixed geoms, m.
@@ -152,16 +153,16 @@ def _hit_bodies(
     direction: Array,
     ignored_rows: np.ndarray | None,
 ) -> Hits:
-    """Return the nearer of earlier hits and hits of movable bodies with equal geoms.
+    """Return earlier hits, or hits of movable bodies with equal geoms where they are nearer.
 
     Args:
         best: Earlier hits.
         geoms: Geoms of each body, in its frame.
         pos: Positions of all movable bodies, m. (..., n, 3)
-        quat: Their attitudes, xyzw. (..., n, 4)
-        group: Row of each body of the group in ``pos``, and its index, as in ``Hits.body_index``. (k, 2)
+        quat: Attitudes of all movable bodies, xyzw. (..., n, 4)
+        group: Row in ``pos`` and ``Hits.body_index`` of each body with these geoms. (k, 2)
         origin: Origins of the rays. (..., n_rays, 3)
-        direction: Their directions. (..., n_rays, 3)
+        direction: Directions of the rays. (..., n_rays, 3)
         ignored_rows: Row of the body that a ray passes through. (n_rays,)
     """
 
@@ -180,7 +181,7 @@ def _hit_bodies(
 
 
 def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the length of rays to a geom, and the normal where they meet it; all in the frame of the geom's pose."""
+    """Return the lengths of rays to a geom, and the normals where they meet it; all in the frame of ``geom.pos``."""
     local_origin = origin - jnp.asarray(geom.pos, origin.dtype)
     if geom.rot is None:
         return ray_distance(geom.shape, local_origin, direction)
@@ -192,7 +193,7 @@ def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Arr
 
 
 def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
-    """Return a constant matrix times vectors, without products by zero. (..., 3)"""
+    """Return a constant matrix times vectors, without products with its zeros. (..., 3)"""
     x = [vectors[..., k] for k in range(3)]
     terms = [[float(m) * v for m, v in zip(row, x, strict=True) if m] for row in matrix]
     return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=-1)
@@ -212,8 +213,7 @@ def _hit_fixed_geoms(
 ) -> tuple[Array, Array, Array]:
     """Return the first fixed geoms that rays of one world or drone meet, in a hierarchy.
 
-    A loop over the rays finds the geoms without a derivative. The distance is to the geom that was found, with
-    its derivative.
+    A loop over the rays finds the nearest geoms without derivatives. The distances to these geoms have derivatives.
 
     Args:
         targets: The geoms.
@@ -226,7 +226,7 @@ def _hit_fixed_geoms(
         Unit normal, world frame; zero if it meets none. (n_rays, 3)
         Index of the body, as in ``Hits.body_index``. (n_rays,)
     """
-    tables = targets.hierarchy(origin.dtype)
+    tables = targets.build_fixed_hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed_geoms), 0].max()]
     origins, directions = jax.lax.stop_gradient((origin, direction))
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
@@ -254,7 +254,7 @@ def _hit_rows(
     """Return the distance along each ray to its geom, and a function from distances to unit normals, world frame.
 
     Args:
-        surfaces: ``Targets.surfaces``, or the first of them.
+        surfaces: ``Targets.surfaces``, at least those of the geoms.
         codes: Index of the surface of each geom in the first column. (n, 2)
         geom_index: Index of the geom of each ray, -1 for none. (...)
         rows: Rows of these geoms; see ``Target.table_row``. (..., 16)
@@ -346,34 +346,34 @@ def cast_rays_in_worlds(
 
 @dataclasses.dataclass
 class RayKernels:
-    """Kernels of the engine that cast rays, with XLA where they are not available."""
+    """Kernels of the engine that cast rays; XLA where kernels are not available."""
 
     platform: str | None = None
     """Platform of the kernels, ``"cpu"`` or ``"gpu"``; None for XLA."""
     strict: bool = False
     """True to raise an error where XLA would be used with an ``EngineWarning``."""
     mesh: Mesh | None = None
-    """Devices over which the worlds are distributed; None for kernels that cast the rays of one device."""
+    """Devices over which the worlds are distributed; None for one device."""
     last_used: str = ""
-    """Description of the kernels that cast the last rays, for ``Sim.explain``; empty before."""
+    """Description of how the last rays were cast, for ``Sim.explain``; empty before the first rays."""
     reported_warnings: set[str] = dataclasses.field(default_factory=set)
-    """Warnings that have been given."""
+    """Warnings that have already been given."""
 
     @classmethod
     def choose(cls, engine: str, device: jax.Device, mesh: Mesh | None, strict: bool) -> RayKernels:
         """Return the kernels for a simulation, or XLA if its engine or its device has no kernels.
 
         Args:
-            engine: Engine of its steps, one of ``crazysim.engine.ENGINES``.
+            engine: Engine of the simulation, one of ``crazysim.engine.ENGINES``.
             device: Device of its data.
-            mesh: Devices over which its worlds are distributed instead; None for one.
+            mesh: Devices over which its worlds are distributed; None for one device.
             strict: True to raise an error where XLA would be used with an ``EngineWarning``.
         """
         has_kernels = engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict, mesh)
 
     def run_on_each_device(self, fn: Callable[[SimData, RayKernels], T], data: SimData) -> T:
-        """Return the results of a function of data and kernels, which each device computes for its own worlds.
+        """Return the results of a function of data and kernels; each device computes them for its own worlds.
 
         Args:
             fn: Function whose results have a leading axis over worlds.
@@ -433,7 +433,7 @@ class RayKernels:
 
 @jax.custom_jvp
 def _replace_derivative(value: Array, differentiable: Array) -> Array:
-    """Return a value with the derivative of another one."""
+    """Return ``value`` with the derivative of ``differentiable``."""
     del differentiable
     return value
 

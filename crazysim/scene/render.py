@@ -17,7 +17,7 @@ from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
 
 MAX_SIZES = 4
-"""Largest number of image sizes whose contexts are kept."""
+"""Largest number of image sizes for which contexts are kept."""
 
 FREE_CAMERA_SHAPES = {"lookat": (3,), "distance": (), "azimuth": (), "elevation": ()}
 """Shapes of the settings of the free camera, which ``cam_config`` may contain."""
@@ -100,7 +100,7 @@ class ModelRenderer:
                 f"Use {{'lookat': (0, 0, 1), 'distance': 3.0}}."
             )
         for key, value in (cam_config or {}).items():
-            if key not in FREE_CAMERA_SHAPES:  # wrong values of others can make MuJoCo end the process
+            if key not in FREE_CAMERA_SHAPES:  # wrong values of other fields can make MuJoCo end the process
                 names = ", ".join(FREE_CAMERA_SHAPES)
                 raise UnknownNameError(f"expected names among {names} in cam_config, got {short_repr(key)}")
             try:
@@ -116,7 +116,7 @@ class ModelRenderer:
     def _renderer(self, width: int, height: int) -> mujoco.Renderer:
         if (width, height) not in self._renderers:
             buffers = self._model.vis.global_
-            # Buffers are made once per context; a larger image than any before needs a new context.
+            # A context's buffers have a fixed size; an image larger than all previous images needs a new context.
             sizes_before = buffers.offwidth, buffers.offheight
             buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
             try:
@@ -158,7 +158,7 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
 
 
 def font_scale(height: int) -> mujoco.mjtFontScale:
-    """Return the size of MuJoCo's font for an image height, pixels."""
+    """Return the scale of MuJoCo's font for an image height, pixels."""
     return mujoco.mjtFontScale(int(np.clip(50 * (height // 240), 50, 300)))
 
 
@@ -181,8 +181,8 @@ def _close_all(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[
 def _release_context() -> None:
     """Release the OpenGL context that is current in this thread.
 
-    While a context is current in one thread, and even after that thread has ended, no other thread can use or free it.
-    Renderers are freed by the garbage collector, which runs in any thread.
+    While a context is current in one thread, even after that thread has ended, no other thread can use or free it. The
+    garbage collector, which runs in any thread, must be able to free renderers.
     """
     backend = gl_context.GLContext.__module__
     if backend == "mujoco.egl":

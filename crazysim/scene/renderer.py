@@ -1,4 +1,4 @@
-"""Images of a compiled scene: of one world by MuJoCo's renderer, of many at once by MuJoCo Warp."""
+"""Images of a compiled scene: of one world by MuJoCo's renderer, of many worlds at once by MuJoCo Warp."""
 
 from __future__ import annotations
 

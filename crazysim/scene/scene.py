@@ -31,15 +31,15 @@ from crazysim.scene.splats import SplatScene
 from crazysim.scene.sync import sync_one_world, with_data_poses
 
 LARGE_SWARM = 64
-"""Drones per world from which on MJX checks two pairs per drone instead of every pair."""
+"""Smallest number of drones per world for which MJX checks two pairs per drone instead of all pairs."""
 
 
 class Scene:
     """The MuJoCo scene of a simulation.
 
-    The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and the data's flag is
-    clear, ``sync_one`` for the world of an image. MJX allocates nothing per world before the first ``contacts`` or use
-    of ``mjx_data``.
+    The scene is updated lazily. If contacts are requested and ``core.mjx_synced`` is not set, ``sync`` updates all
+    worlds. For an image, ``sync_one`` updates one world. MJX allocates nothing per world before the first ``contacts``
+    or use of ``mjx_data``.
     """
 
     spec: mujoco.MjSpec
@@ -55,10 +55,10 @@ class Scene:
     ray_kernels: RayKernels
     """Kernels that cast rays and answer contact reports."""
     splats: SplatScene | None
-    """Scene of splats for the functions that have Crazyflow's names; None if none is attached."""
+    """Splats that the functions with Crazyflow's names draw; None if none are attached."""
     revision: int
-    """Number of edits of the spec so far. The compiled model, and the objects and mocap ids in the data, each
-    correspond to one revision, and are updated when it is no longer the present one."""
+    """Number of edits of the spec so far. The compiled model, and the objects and mocap ids in the data, each have the
+    revision at which they were made; they are updated when it differs from this number."""
 
     def __init__(
         self,
@@ -117,13 +117,14 @@ class Scene:
 
         Args:
             source: ``"gate"``, ``"box"``, ``"pole"``, ``"cylinder"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or
-                the path of an MJCF file, MJCF text, an ``MjSpec``, or a body of one.
+                the path of an MJCF file, MJCF text, an ``MjSpec``, or a body of an ``MjSpec``.
             name: Prefix of the bodies' names ``name:0``, ``name:1``, ...; None for the name of the primitive or file.
             count: Number of objects.
             pos: Initial positions in every world, world frame, m. (3,), (count, 3) or (n_worlds, count, 3)
-            quat: Initial attitudes, body to world, xyzw. The same shapes with 4
-            mocap: True for objects that can be moved, independently in each world; others stay at ``pos`` everywhere.
-            **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
+            quat: Initial attitudes, body to world, xyzw. (4,), (count, 4) or (n_worlds, count, 4)
+            mocap: True for objects that can be moved, independently in each world; False for objects that stay at
+                ``pos`` in all worlds.
+            **options: Settings of a primitive: lengths, m, and ``rgba``; see ``crazysim.scene.primitives``.
         """
         with self.restore_on_error():
             handle = self.added_objects.add(self.spec, source, name, count, pos, quat, mocap, options)
@@ -142,10 +143,10 @@ class Scene:
         min_points: int = 1,
         rgba: ArrayLike = MAP_RGBA,
     ) -> Handle:
-        """Add a point cloud or a triangle mesh as boxes that do not move, and return the handle of this one object.
+        """Add a point cloud or a triangle mesh as one object of boxes that do not move, and return its handle.
 
         Voxels that contain points, or that triangles meet, are merged into boxes along the axes of the world. A mesh
-        need not be convex or closed, and what it encloses is empty.
+        need not be convex or closed; its inside is empty.
 
         Args:
             source: Path of a ``.ply``, ``.pcd``, ``.stl`` or ``.obj`` file; or the points of a cloud, (n_points, 3).
@@ -153,14 +154,14 @@ class Scene:
             resolution: Edge of the voxels, m.
             pos: Origin of the file's frame, world frame, m. (3,)
             quat: Attitude of the file's frame, file to world, xyzw. (4,)
-            scale: Metres per unit of the file; None for one, if the map is then 1 cm to 10 km large.
-            min_points: Number of points from which on a voxel is occupied, to drop the noise of a scan.
+            scale: Metres per unit of the file; None for 1, which requires an extent of the map of 1 cm to 10 km.
+            min_points: Smallest number of points in an occupied voxel; more than 1 removes the noise of a scan.
             rgba: Colour.
 
         Raises:
             DamagedFileError: If the file is damaged, cut off, or of another kind.
-            ConfigError: If the file does not exist, has no points or some that are not finite, or has no plausible
-                scale; or if there are too many boxes.
+            ConfigError: If the file does not exist, has no points or non-finite points, or has no plausible scale; or
+                if there are too many boxes.
         """
         spec = map_spec(source, resolution, pos, quat, scale, min_points, rgba)
         if name is None:
@@ -170,7 +171,7 @@ class Scene:
     def add_once(self, source: Source, name: str, count: int, **options: Any) -> None:
         """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced.
 
-        ``options`` are those of ``add``.
+        ``options`` are passed to ``add``.
         """
         n_existing = self.added_objects.count_objects(name)
         if n_existing not in (0, count):
@@ -193,7 +194,7 @@ class Scene:
             raise
 
     def compile(self) -> None:
-        """Compile the spec; closes the window and returns bodies moved through ``mjx_data`` to their poses in the spec.
+        """Compile the spec, close the window, and reset bodies that are moved through ``mjx_data``.
 
         Raises:
             ConfigError: If the spec does not compile or lacks a drone; the scene is then unchanged.
@@ -203,7 +204,7 @@ class Scene:
         self._compiled_revision = self.revision
 
     def compile_if_edited(self) -> None:
-        """Compile the spec if it has another ``revision`` than the compiled model."""
+        """Compile the spec if it has been edited since the last compilation."""
         if self._is_edited:
             self._compile()
             self._compiled_revision = self.revision
@@ -232,13 +233,13 @@ class Scene:
 
     @property
     def mj_data(self) -> mujoco.MjData:
-        """State of the world that ``sync_one`` wrote last, such as for an image."""
+        """State of the world that ``sync_one`` wrote last, for example for an image."""
         self.compile_if_edited()
         return self._mj_data
 
     @property
     def drone_mocap_ids(self) -> list[int]:
-        """Mocap id of each drone's body, as in the next compiled model. (n_drones,)"""
+        """Mocap id of each drone's body in the next compiled model. (n_drones,)"""
         return (
             self._spec_mocap_ids([f"drone:{i}" for i in range(self.n_drones)]) if self._is_edited else self._drone_ids
         )
@@ -246,7 +247,7 @@ class Scene:
     def objects(self, previous: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
         movable = self.added_objects.movable
-        return self.added_objects.record(
+        return self.added_objects.build_record(
             previous, self._spec_mocap_ids(movable) if self._is_edited else self._object_ids
         )
 
@@ -256,7 +257,7 @@ class Scene:
         depth.check_image_memory(self.n_worlds * n_cameras, *size, bytes_per_pixel, self.device, n_devices)
 
     def _spec_mocap_ids(self, names: Sequence[str]) -> list[int]:
-        """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled."""
+        """Return the mocap ids of bodies in the next compiled model, without compiling it."""
         ids = build.spec_mocap_ids(self.spec)
         missing_names = [name for name in names if name not in ids]
         if missing_names:
@@ -269,7 +270,7 @@ class Scene:
 
     @property
     def collision_model(self) -> CollisionModel:
-        """Geoms that drones touch; read again after a compilation."""
+        """Geoms that drones can touch; rebuilt after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._collision_model is None:
             self._collision_model = collision.collision_model(model, self.added_objects.movable, self.drone_groups)
@@ -277,7 +278,7 @@ class Scene:
 
     @property
     def visual_model(self) -> CollisionModel:
-        """Geoms that cameras see; read again after a compilation."""
+        """Geoms that cameras see; rebuilt after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._visual_model is None:
             self._visual_model = collision.visual_model(model, self.added_objects.movable, self.drone_groups)
@@ -296,9 +297,10 @@ class Scene:
         The function takes all worlds or, in a stage, one world or one drone; in a stage of one drone ``nearest_drone``
         is None. Fields that were not requested are None and are not computed.
 
-        Bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data: for those
-        pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them. Objects of plugins,
-        such as loads, get their poses from the plugins' records in ``data``; they need the data of a world.
+        Poses of bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data. For
+        such bodies pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` of ``mjx_data``. Objects of
+        plugins, such as loads, get their poses from the plugins' records in ``data``; they need the data of a whole
+        world.
 
         Args:
             objects: Handles, or names of bodies; None for all, () for none.
@@ -321,14 +323,14 @@ class Scene:
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal``, ``point`` and
         ``body_index``, the index of the body that was hit. Inside jit, fields that are not used are not computed.
         Objects of plugins, such as loads, get their poses from the plugins' records in ``data``. In a function of one
-        world, such as the observations of a task, images have no axis n_worlds, and no separate kernel casts the
-        rays.
+        world, such as the observations of a task, images have no axis n_worlds, and the rays are cast without a
+        separate kernel.
 
         Args:
-            camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
-                or id of one camera; or the directions and the mounting of a camera that every drone carries.
-            width: Pixels; ignored if ``camera`` has directions of its own.
-            height: Pixels; ignored if ``camera`` has directions of its own.
+            camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); the name or
+                id of one camera; or a ``DroneCamera``.
+            width: Width of the images, pixels; ignored for a ``DroneCamera``.
+            height: Height of the images, pixels; ignored for a ``DroneCamera``.
             drones: True for drones to be visible.
             hide_own: True for a drone to be invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
@@ -370,8 +372,8 @@ class Scene:
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones, or names or ids of cameras.
-            width: Pixels.
-            height: Pixels.
+            width: Width of the images, pixels.
+            height: Height of the images, pixels.
             background: Colour behind the splats, red, green and blue from 0 to 1.
             min_coverage: Coverage of a pixel below which its depth is infinite.
             renderer: ``"splax"`` for kernels on NVIDIA GPUs, ``"plain"`` for JAX, in small scenes, or ``"auto"``.
@@ -456,7 +458,7 @@ class Scene:
         return self.renderer.render(self.mj_model, self.mj_data, mode, camera, cam_config, width, height)
 
     def render_worlds(self, data: SimData, worlds: NDArray, camera: int | str, width: int, height: int) -> Array:
-        """Return images of a camera in some worlds, rendered at once. (n, height, width, 3), uint8
+        """Return images of a camera in selected worlds, rendered in one call. (n, height, width, 3), uint8
 
         Raises:
             ImportError: If MuJoCo Warp is not installed.
@@ -471,7 +473,7 @@ class Scene:
 
 
 def _group_drones(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
-    """Return the indices of the drones of each airframe; None for all."""
+    """Return the indices of the drones of each airframe, or a single None if all drones have the same airframe."""
     groups: dict[int, list[int]] = {}
     for k, airframe in enumerate(airframes):
         groups.setdefault(id(airframe), []).append(k)

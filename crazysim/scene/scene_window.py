@@ -1,4 +1,4 @@
-"""A window that draws in the thread of its caller, with a view that the mouse moves."""
+"""A window that draws in the caller's thread, with a camera that the mouse moves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEY_NAMES = {
     "UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "SPACE": "space", "TAB": "tab", "ENTER": "enter",
     "BACKSPACE": "backspace", "ESCAPE": "escape", "EQUAL": "+", "KP_ADD": "+", "MINUS": "-", "KP_SUBTRACT": "-",
 }  # fmt: skip
-"""Names of keys that are not named by their character, by GLFW's names."""
+"""Names of keys that are not named after their character, by GLFW's names."""
 
 Tile = tuple[mujoco.MjData, Overlays]
 """State of one world, with its kinematics up to date, and its overlays."""
@@ -28,7 +28,7 @@ Tile = tuple[mujoco.MjData, Overlays]
 class SceneWindow:
     """A window that shows one model, in one or several states.
 
-    Unlike it, MuJoCo's passive viewer draws in another thread, and sometimes crashes the process when it is closed.
+    MuJoCo's passive viewer is not used: it draws in another thread, and closing it sometimes crashes the process.
     """
 
     def __init__(self, model: mujoco.MjModel, max_geom: int, width: int, height: int):
@@ -39,7 +39,7 @@ class SceneWindow:
         """
         self._model = model
         self._glfw = glfw = _load_glfw()
-        # One thread cannot use both an EGL context, for images in memory, and a context of another kind.
+        # One thread cannot use an EGL context, for images in memory, together with a context of another kind.
         egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
@@ -73,7 +73,7 @@ class SceneWindow:
         return self._window is not None
 
     def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
-        """Show ``data``; a camera or size that differs from the last call replaces the user's view or window size."""
+        """Show one state. A new camera replaces the view set by the mouse; a new size resizes the window."""
         self.draw_tiles(1, lambda _: (data, overlays), camera, width, height)
 
     def draw_tiles(
@@ -83,9 +83,10 @@ class SceneWindow:
 
         Args:
             n: Number of tiles.
-            tile: Returns the k-th tile; called right before it is drawn, so that all may share one ``MjData``.
-            camera: Camera; one that differs from the last call replaces the view that the mouse has set.
-            width: Width of the window, pixels; a size that differs from the last call replaces the user's.
+            tile: Function from k to the k-th tile. It is called right before the tile is drawn, so that all tiles may
+                share one ``MjData``.
+            camera: Camera. If it differs from the last call, it replaces the view set by the mouse.
+            width: Width of the window, pixels. If the size differs from the last call, the window is resized.
             height: Height of the window, pixels.
         """
         glfw = self._glfw
@@ -128,11 +129,11 @@ class SceneWindow:
         return glfw.get_mouse_button(self._window, number) == glfw.PRESS
 
     def pick(self, n: int, tile: Callable[[int], Tile]) -> tuple[int, int, NDArray] | None:
-        """Return tile, geom and point, world frame, m, below the cursor, or None.
+        """Return index of the tile, id of the geom, and point, world frame, m, at the cursor; None without a geom.
 
         Args:
             n: Number of tiles.
-            tile: Returns the k-th tile.
+            tile: Function from k to the k-th tile.
         """
         size = self._glfw.get_framebuffer_size(self._window)
         x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]

@@ -1,4 +1,4 @@
-"""Settings of images that a CPU draws, on machines whose OpenGL has no GPU."""
+"""Quality settings of images that a CPU draws, on machines without a GPU for OpenGL."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from mujoco.rendering.classic import gl_context
 from crazysim.errors import ConfigError
 
 QUALITY_VARIABLE = "CRAZYSIM_RENDERING"
-"""Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for the quality of CPUs."""
+"""Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for the lower quality of CPUs."""
 CPU_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
-"""Parts of the names of OpenGL renderers that run on CPUs, in lower case."""
+"""Substrings of the names of OpenGL renderers that run on CPUs, in lower case."""
 QUALITY_LIMITS = {"offsamples": 0, "shadowsize": 0, "numslices": 16, "numstacks": 8}
 """Largest values of MuJoCo's quality settings if a CPU draws.
 
@@ -53,7 +53,7 @@ def has_software_renderer() -> bool:
 
 @contextlib.contextmanager
 def rendering_quality(model: mujoco.MjModel) -> Iterator[None]:
-    """Apply the settings for this machine to a model while a context is created, which reads them only then."""
+    """Apply the quality of this machine to a model while a context is created: contexts read it only then."""
     if not uses_cpu_quality():
         yield
         return
@@ -69,5 +69,5 @@ def rendering_quality(model: mujoco.MjModel) -> Iterator[None]:
 
 
 def film_size(width: int, height: int) -> tuple[int, int]:
-    """Return the size of a film, pixels: as given, or about two thirds of it, in even numbers, if a CPU draws."""
+    """Return width and height of a film, pixels: as passed, or even numbers near two thirds of them if a CPU draws."""
     return (width // 3 * 2, height // 3 * 2) if uses_cpu_quality() else (width, height)

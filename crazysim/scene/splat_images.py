@@ -26,21 +26,21 @@ from crazysim.scene.splats import Gaussians, spherical_harmonics
 from crazysim.tables import range_between, read_number, read_numbers
 
 MIN_DEPTH = 0.01
-"""Distance along the camera's axis below which Gaussians are not drawn, m; splax has the same."""
+"""Distance along the camera's axis below which Gaussians are not drawn, m; as in splax."""
 BLUR_VARIANCE = 0.3
-"""Variance added to projected Gaussians, pixels^2, so that none is smaller than a pixel (Kerbl et al. 2023)."""
+"""Variance added to projected Gaussians, pixels^2, so that they are not smaller than a pixel (Kerbl et al. 2023)."""
 MAX_SLOPE = 1.3
-"""Largest slope of the direction to a Gaussian at which its projection is linearised, as a multiple of the image's."""
+"""Largest slope of a direction at which projections are linearised, as a multiple of the slope at the image's edge."""
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.999
-"""Alpha below which a Gaussian is left out of a pixel, and largest alpha; splax has the same."""
+"""Alpha below which a Gaussian is left out of a pixel, and largest alpha; as in splax."""
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance below which nothing more is drawn in a pixel (Kerbl et al. 2023)."""
 BLOCK_SIZE = 32
 """Number of Gaussians that are drawn at a time."""
 MAX_ALPHAS = 1 << 24
-"""Largest number of pixels times ``BLOCK_SIZE`` that are drawn at a time, over several images."""
+"""Largest number of alphas that are computed at a time: pixels of all images times ``BLOCK_SIZE``."""
 BYTES_PER_PIXEL = 20
-"""Smallest memory of a pixel, bytes: colour, depth and coverage."""
+"""Lower bound of the memory of a pixel, bytes: colour, depth and coverage."""
 RENDERERS = ("auto", "splax", "plain")
 """Renderers of splats."""
 
@@ -56,7 +56,7 @@ class SplatImage(PyTree):
     """Mean distance of the surface along the camera's axis, m; infinite where ``coverage`` is below ``min_coverage``.
     (n_worlds, n_cameras, height, width)"""
     coverage: Array
-    """Fraction of the light that comes from Gaussians, not from the background. (n_worlds, n_cameras, height, width)"""
+    """Fraction of the light from Gaussians instead of the background. (n_worlds, n_cameras, height, width)"""
 
 
 SplatFn = Callable[..., SplatImage]
@@ -127,7 +127,7 @@ def import_splax() -> ModuleType:
         import splax
     except ImportError as error:
         raise ImportError(not_installed("splats on a GPU need", "splax", "splats")) from error
-    except RuntimeError as error:  # splax sets an option of SciPy, which counts before SciPy is imported only
+    except RuntimeError as error:  # splax sets an option that SciPy only reads when it is imported
         raise ConfigError(
             f"expected to import splax, got: {error}. Set SCIPY_ARRAY_API=1 before Python starts."
         ) from error
@@ -148,7 +148,7 @@ def _draw_with_splax(
     background: np.ndarray,
     batch_size: int,
 ) -> tuple[Array, Array, Array]:
-    """Return colours, depths and coverages of images; ``batch_size`` is not used, since kernels have no arrays."""
+    """Return the same as ``_draw_with_jax``. ``batch_size`` is not used, since kernels store no alphas."""
     del batch_size
     parameters = (
         gaussians.pos, gaussians.log_scale, jnp.roll(gaussians.quat, 1, axis=-1), gaussians.color,
@@ -171,11 +171,11 @@ def _draw_with_splax(
 
 
 def view_matrices(pos: Array, rot: Array) -> Array:
-    """Return the matrices from the world to cameras with axes right, down and ahead. (..., 4, 4)
+    """Return the matrices from the world frame to the frames of cameras: right, down, ahead. (..., 4, 4)
 
     Args:
         pos: Positions of the cameras, m. (..., 3)
-        rot: Axes as columns: right, up and back, as MuJoCo has them. (..., 3, 3)
+        rot: Axes of the cameras as columns: right, up and back, as in MuJoCo. (..., 3, 3)
     """
     axes = jnp.swapaxes(rot, -1, -2) * np.array([[1.0], [-1.0], [-1.0]], np.float32)
     upper = jnp.concatenate([axes, -rotation.matvec(axes, pos)[..., None]], axis=-1)
@@ -202,7 +202,7 @@ def _draw_image(
 ) -> tuple[Array, Array, Array]:
     """Return colour (height, width, 3), depth and coverage (height, width) of an image (Kerbl et al. 2023).
 
-    Gaussians are projected to Gaussians of the image (Zwicker et al. 2001) and blended from near to far.
+    Gaussians are projected to Gaussians in the image plane (Zwicker et al. 2001) and blended from near to far.
     """
     pos, rot = camera_pose
     order = jnp.argsort(jnp.sum((gaussians.pos - pos) * -rot[:, 2], axis=-1))
@@ -222,7 +222,7 @@ def _draw_image(
         alpha = jnp.where(remaining > MIN_TRANSMITTANCE, alpha, 0.0)
         weight = jnp.concatenate([transmittance[None], remaining[:-1]]) * alpha
         gaussian_colors = _colors(block_gaussians, pos)
-        # A GPU may round products of matrices to 10 bits otherwise.
+        # With the default precision, a GPU may round matrix products to 10 bits.
         color = color + jnp.einsum("kyx,kc->yxc", weight, gaussian_colors, precision="highest")
         depth = depth + jnp.sum(weight * z[:, None, None], axis=0)
         return (color, depth, transmittance - jnp.sum(weight, axis=0)), None

@@ -1,4 +1,4 @@
-"""Gaussian splats: scenes of coloured Gaussians, made from photographs, in the frame of a simulation."""
+"""Gaussian splats: scenes of coloured Gaussians, made from photographs, in the world frame of a simulation."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from crazysim.tables import range_between, read_number
 N_COLORS = (1, 4, 9, 16)
 """Numbers of spherical harmonics up to degree 0, 1, 2 and 3."""
 CENTRAL_PERCENTILES = (5.0, 95.0)
-"""Percentiles of the coordinates between which the extent of splats is measured, since a few splats are far outside."""
+"""Percentiles of the coordinates between which the extent of splats is measured: a few splats are far outside."""
 
 
 class Gaussians(PyTree):
-    """Gaussians in the world frame, as unconstrained parameters, with respect to which images have gradients."""
+    """Gaussians in the world frame, as unconstrained parameters. Images have gradients with respect to them."""
 
     pos: Array
     """Centres, m. (n, 3)"""
     quat: Array
-    """Attitudes, xyzw, normalised where they are used. (n, 4)"""
+    """Attitudes, xyzw; normalised when they are used. (n, 4)"""
     log_scale: Array
     """Logarithms of the standard deviations along the axes of a Gaussian, m. (n, 3)"""
     color: Array
@@ -41,7 +41,7 @@ class Gaussians(PyTree):
 
 
 class SplatScene:
-    """A scene of Gaussian splats, at a pose and a scale in the world."""
+    """A scene of Gaussian splats that is read from a file and placed in the world."""
 
     gaussians: Gaussians
     """The Gaussians, in the world frame."""
@@ -60,11 +60,11 @@ class SplatScene:
             path: A ``.ply`` file as programs for 3D Gaussian splatting write it (Kerbl et al. 2023).
             pos: Origin of the file's frame, world frame, m. (3,)
             quat: Attitude of the file's frame, file to world, xyzw. (4,)
-            scale: Metres per unit of the file; None for one, if the scene is then 1 cm to 10 km large.
+            scale: Metres per unit of the file; None for 1, which requires an extent of the scene of 1 cm to 10 km.
 
         Raises:
             DamagedFileError: If the file is damaged, cut off, or of another kind.
-            ConfigError: If it does not exist, has no Gaussians or some that are not finite, or no plausible scale.
+            ConfigError: If it does not exist, has no Gaussians or non-finite Gaussians, or has no plausible scale.
         """
         values = _read_gaussians(path)
         points = values["pos"]
@@ -165,8 +165,8 @@ def _multiply(p: NDArray, q: NDArray) -> NDArray:
 def _rotate_colors(color: NDArray, rot: NDArray) -> NDArray:
     """Return coefficients of spherical harmonics in a frame that is turned by a rotation matrix. (n, n_colors, 3)
 
-    The colour seen along a direction d in the new frame is the one seen along ``rot.T @ d`` in the old frame. Both are
-    linear in the coefficients of a band, so directions that span the bands determine the new ones.
+    The colour seen along a direction d in the new frame equals the colour seen along ``rot.T @ d`` in the old frame.
+    Both are linear in the coefficients of a band, so directions that span the bands determine the new coefficients.
     """
     n = color.shape[1]
     directions = np.random.default_rng(0).normal(size=(4 * n, 3))

@@ -1,4 +1,4 @@
-"""Copies of poses from the data to the scene: for every world at once with MJX, or for one world to be drawn."""
+"""Functions that copy poses from the data to the scene: for all worlds with MJX, or for one world to be drawn."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from crazysim.scene import mjx
 from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
-"""Modes of cameras that follow a centre of mass. A sync of all worlds computes centres of mass only for these."""
+"""Modes of cameras that follow a centre of mass. A sync of all worlds computes centres of mass only for such
+cameras."""
 
 
 @jax.jit
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
-    """Return the data with ``core.mjx_synced`` set, and the scene brought up to date with the data.
+    """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data.
 
-    Writes the poses of drones and of objects with handles, and computes the transforms of all bodies, the cameras and
-    lights, and the contacts. Other mocap bodies stay where ``mjx_data`` has them.
+    Writes the poses of drones and of objects with handles; then computes the poses of all bodies, cameras and lights,
+    and the contacts. Other mocap bodies keep their poses in ``mjx_data``.
 
     Args:
         data: Simulation. Quaternions are xyzw here and wxyz in MuJoCo.
         mjx_data: State of the scene in every world.
         mjx_model: Compiled scene, shared by all worlds.
     """
-    for ids, pos, quat in _poses(data):
+    for ids, pos, quat in _data_poses(data):
         mjx_data = mjx_data.replace(
             mocap_pos=mjx_data.mocap_pos.at[:, ids].set(pos),
             mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
@@ -40,7 +41,7 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
     if not has_joints:
         mjx_data = update_kinematics(mjx_model, mjx_data)
 
-    def collide_in_world(world: mjx.Data) -> mjx.Data:
+    def update_world(world: mjx.Data) -> mjx.Data:
         if has_joints:
             world = mjx.kinematics(_model_with_mocap_poses(mjx_model, world), world)
         if np.isin(mjx_model.cam_mode, COM_CAMERAS).any():
@@ -48,11 +49,11 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
         world = mjx.camlight(mjx_model, world)
         return mjx.collision(mjx_model, world)
 
-    mjx_data = jax.vmap(collide_in_world)(mjx_data)
+    mjx_data = jax.vmap(update_world)(mjx_data)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 
 
-def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
+def _data_poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     poses = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
@@ -83,7 +84,7 @@ def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
 
 @jit_eager_calls()
 def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """Return poses of bodies and joints in some worlds, with the poses of drones and handles from the data.
+    """Return poses of bodies and joints in selected worlds, with the poses of drones and handles from the data.
 
     Args:
         data: Simulation.
@@ -91,7 +92,7 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
     mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
-    for ids, pos, quat in _poses(data):
+    for ids, pos, quat in _data_poses(data):
         mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
         mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
     return mocap_pos, mocap_quat, qpos
@@ -104,7 +105,7 @@ def sync_one_world(
     mj_model: mujoco.MjModel,
     mj_data: mujoco.MjData,
 ) -> None:
-    """Write one world into ``mj_data``, ready to be drawn, without work for the others.
+    """Write the poses of one world into ``mj_data``, ready to be drawn.
 
     Args:
         data: Simulation.

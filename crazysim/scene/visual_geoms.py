@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from crazysim.scene.collision import VISIBLE_GROUPS
 
 GEOM_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
-"""Types of geoms, by MJCF's names."""
+"""Kinds of geoms, as named in MJCF."""
 DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)
-"""Colour that MuJoCo gives to geoms without a colour, rgba."""
+"""MuJoCo's colour of geoms without a colour, RGBA."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +25,17 @@ class VisualGeom:
     size: NDArray
     """Radii and half sizes, m, as in MJCF. (3,)"""
     rgba: NDArray
-    """Colour, 0 to 1. (4,)"""
+    """Colour, RGBA, 0 to 1. (4,)"""
     mocap: int
-    """Mocap id of the body; -1 for a geom that does not move."""
+    """Mocap id of the body that carries the geom; -1 for a geom that does not move."""
     pos: NDArray
-    """Position in the frame of the body, or world frame, m. (3,)"""
+    """Position in the frame of that body or the world, m. (3,)"""
     quat: NDArray
-    """Attitude in the frame of the body, or world frame, xyzw. (4,)"""
+    """Attitude in the frame of that body or the world, xyzw. (4,)"""
     vertices: NDArray
-    """Vertices of a mesh, m. (n, 3)"""
+    """Vertices of a mesh, m; empty for other kinds. (n, 3)"""
     faces: NDArray
-    """Indices of the vertices of each triangle of a mesh. (n, 3)"""
+    """Indices of the vertices of each triangle of a mesh; empty for other kinds. (n, 3)"""
 
 
 def visual_geoms(model: mujoco.MjModel, data: mujoco.MjData) -> list[VisualGeom]:
@@ -82,7 +82,7 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualG
 
 
 def _geom_color(model: mujoco.MjModel, geom: int) -> NDArray:
-    """Return a geom's own colour, or its material's times the mean colour of its texture. (4,)"""
+    """Return the colour of a geom, or of its material multiplied by the mean colour of the texture. (4,)"""
     material = int(model.geom_matid[geom])
     if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
         return model.geom_rgba[geom].astype(float)

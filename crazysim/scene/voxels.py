@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_CANDIDATES = 1 << 20
-"""Largest number of pairs of a triangle and a voxel that are tested at a time."""
+"""Largest number of pairs of triangle and voxel that are tested at a time."""
 TOLERANCE = 1e-6
 """Length by which voxels are enlarged for triangles, as a fraction of their edge."""
 
@@ -41,8 +41,8 @@ def _voxel_range(corners: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]
 def voxels_of_triangles(corners: NDArray, resolution: float) -> NDArray[np.int64]:
     """Return the voxels that triangles meet. (n, 3)
 
-    A triangle meets a cube unless one of 13 axes separates them: the normals of both, and the cross products of their
-    edges (Akenine-Möller 2001, Fast 3D triangle-box overlap testing).
+    A triangle meets a cube unless one of 13 axes separates them: the normals of both, and the cross products of edges
+    of the triangle and edges of the cube (Akenine-Möller 2001, Fast 3D triangle-box overlap testing).
 
     Args:
         corners: Corners of the triangles, m. (n_triangles, 3, 3)
@@ -80,10 +80,11 @@ def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
 
 
 def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return boxes that fill the same space as voxels, without overlap: first and last voxel of each. (n, 6)
+    """Return boxes that fill the same space as voxels without overlap: first and last voxel of each box. (n, 6)
 
-    Voxels in a row along a first axis are joined into bars, bars with the same ends along a second axis into plates,
-    and plates with the same outline into boxes. Of the six orders of axes, the one with the fewest boxes is chosen.
+    Neighbouring voxels along a first axis are joined to bars. Neighbouring bars with the same ends are joined along a
+    second axis to plates, and neighbouring plates with the same outline to boxes. Of the six orders of axes, the order
+    with the fewest boxes is chosen.
 
     Args:
         voxels: Distinct voxels. (n_voxels, 3)
@@ -100,7 +101,7 @@ def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _merge_along(boxes: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
-    """Return boxes after joining boxes that continue each other along an axis. (n, 6) -> (m, 6)"""
+    """Return boxes after joining neighbours along an axis that have the same cross section. (n, 6) -> (m, 6)"""
     other_columns = [k for k in range(6) if k % 3 != axis]
     order = np.lexsort((boxes[:, axis], *boxes[:, other_columns].T))
     boxes = boxes[order]
