@@ -56,7 +56,7 @@ def caches_folder() -> Path:
         ) from None
 
 
-def default_cache() -> Path | None:
+def default_folder() -> Path | None:
     """Return the folder that is used by default; None where ``CRAZYSIM_CACHE`` is ``off``.
 
     XLA's programs are machine code, but their names do not depend on the features of the CPU. Therefore each kind of
@@ -114,7 +114,7 @@ def _prepared_default_folder(*environment: str | None) -> Path | None:
     """Make and return the default folder; None if the cache is off or the folder cannot be used."""
     del environment  # the key under which the result is cached
     try:
-        path = default_cache()
+        path = default_folder()
         if path is not None:
             _prepare_folder(path.parent, path)
     except ConfigError as error:
@@ -231,7 +231,7 @@ def enable_for_command() -> None:
     if jaxcompat.cache_folder() is not None:
         return
     try:
-        path = default_cache()
+        path = default_folder()
         is_new = path is not None and not path.exists()
     except ConfigError:
         is_new = False

@@ -69,9 +69,9 @@ __all__ = [
     "JaxprEqn",
     "Literal",
     "Parameters",
+    "add_vmap_rule",
     "as_function",
     "batched_primitive",
-    "batched_rule",
     "bind",
     "bits_generator",
     "broadcast_from_first",
@@ -417,7 +417,7 @@ def bits_generator(dtype: Any) -> str:
 # Transformations ------------------------------------------------------------------------------------------------
 
 
-def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:
+def add_vmap_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function with a rule of its own for ``vmap``.
 
     Args:

@@ -16,7 +16,7 @@ from crazysim import cache
 from crazysim.cache import (
     announce,
     announce_if_slow,
-    default_cache,
+    default_folder,
     enable_cache,
     enable_for_command,
     keep_programs,
@@ -51,15 +51,15 @@ def settings(monkeypatch):
 
 def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert default_cache().parent == tmp_path / ".cache" / "crazysim" / "jax"
+    assert default_folder().parent == tmp_path / ".cache" / "crazysim" / "jax"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # ignored, as the specification of XDG says
-    assert default_cache().parent == tmp_path / ".cache" / "crazysim" / "jax"
+    assert default_folder().parent == tmp_path / ".cache" / "crazysim" / "jax"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert default_cache().parent == tmp_path / "xdg" / "crazysim" / "jax"
+    assert default_folder().parent == tmp_path / "xdg" / "crazysim" / "jax"
     monkeypatch.setenv(cache.CACHE_VARIABLE, "~/mine")
-    assert enable_cache() == default_cache()
-    assert default_cache().parent == tmp_path / "mine"
-    assert jax.config.jax_compilation_cache_dir == str(default_cache())
+    assert enable_cache() == default_folder()
+    assert default_folder().parent == tmp_path / "mine"
+    assert jax.config.jax_compilation_cache_dir == str(default_folder())
 
 
 def test_a_relative_folder_does_not_follow_the_working_directory(settings, monkeypatch, tmp_path):
@@ -81,7 +81,7 @@ def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_pat
     folders = set()
     for features in ("fpu avx512f", "fpu avx2", "fpu avx512f"):
         info.write_text(f"flags : {features}\n")
-        folders.add(default_cache())
+        folders.add(default_folder())
     assert len(folders) == 2
 
 
@@ -91,7 +91,7 @@ def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkey
     before = [getattr(jax.config, name) for name in names]
 
     def kept():
-        return {path.name.split("-")[0] for path in default_cache().glob("*-cache")}
+        return {path.name.split("-")[0] for path in default_folder().glob("*-cache")}
 
     with keep_programs():
         with keep_programs():
@@ -230,7 +230,7 @@ def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, mo
     assert "1 GB" in printed
     jax.config.update("jax_compilation_cache_dir", None)
     enable_for_command()
-    kept = str(default_cache())
+    kept = str(default_folder())
     assert jax.config.jax_compilation_cache_dir == kept
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "other"))
     enable_for_command()

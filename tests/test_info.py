@@ -11,7 +11,7 @@ import pytest
 
 import crazysim
 from crazysim.__main__ import main
-from crazysim.cache import default_cache
+from crazysim.cache import default_folder
 from crazysim.commands.info import OPTIONAL_PACKAGES, REQUIRED_PACKAGES, VARIABLES
 
 
@@ -47,7 +47,7 @@ def test_missing_parts_are_lines_with_the_reason(tmp_path):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
     found = lines(done.stdout)
     assert found["C++ compiler"].startswith("none")
-    assert found["cache"] == f"~/.cache/crazysim/jax/{default_cache().name}: not there yet"
+    assert found["cache"] == f"~/.cache/crazysim/jax/{default_folder().name}: not there yet"
     assert found["rendering"].startswith("disable, fails: ")
     assert "JAX_PLATFORMS=cpu" in found["variables"]
 

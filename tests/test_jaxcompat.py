@@ -264,7 +264,7 @@ def test_a_function_has_a_rule_of_its_own_for_vmap():
         seen.append((size, in_batched))
         return x + y + 100, True
 
-    call = jaxcompat.batched_rule(lambda x, y: x + y, rule)
+    call = jaxcompat.add_vmap_rule(lambda x, y: x + y, rule)
     assert call(1.0, 2.0) == 3.0
     np.testing.assert_array_equal(jax.vmap(call, (0, None))(jnp.arange(3.0), 1.0), [101, 102, 103])
     assert seen == [(3, [True, False])]

@@ -118,11 +118,11 @@ def _nvrtc() -> str:
 
 def _cache() -> str:
     from crazysim import jaxcompat
-    from crazysim.cache import default_cache
+    from crazysim.cache import default_folder
     from crazysim.storage import untrusted_reason
 
     configured = jaxcompat.cache_folder()
-    folder = default_cache() if configured is None else Path(configured)
+    folder = default_folder() if configured is None else Path(configured)
     if folder is None:
         return "off"
     reason = untrusted_reason(folder / "crazysim") if (folder / "crazysim").is_dir() else ""

@@ -95,7 +95,7 @@ def map_indices(
         ]
         return jax.lax.map(run, broadcast_tables), [True] * len(kernels.result_shapes(n))
 
-    return jaxcompat.batched_rule(run, batching_rule)(list(tables))
+    return jaxcompat.add_vmap_rule(run, batching_rule)(list(tables))
 
 
 def lower_map(fn: Function, tables: Sequence[Any]) -> Block:

@@ -16,7 +16,7 @@ import pytest
 from cases import shared_sim
 from waiting import wait_for
 
-from crazysim.cache import default_cache
+from crazysim.cache import default_folder
 from crazysim.engine import Step
 from crazysim.engine.backends import fused, kernel, kernel_cache, native
 from crazysim.engine.errors import KernelError
@@ -229,7 +229,7 @@ def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatc
     monkeypatch.setenv("CRAZYSIM_CACHE", "off")
     assert kernel_cache.folder() == kernel_cache.temporary_folder()
     monkeypatch.setenv("CRAZYSIM_CACHE", str(tmp_path / "kept"))
-    assert kernel_cache.folder() == default_cache() / "crazysim"
+    assert kernel_cache.folder() == default_folder() / "crazysim"
 
 
 def test_boundaries_between_the_parts_of_a_key_count():

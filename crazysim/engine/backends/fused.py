@@ -198,7 +198,7 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
             split_batches(flagged, False),
         ), out_batched
 
-    return jaxcompat.batched_rule(run, batching_rule)
+    return jaxcompat.add_vmap_rule(run, batching_rule)
 
 
 def _run_without_rows(program: Program, unpacked_program: Program, location: Location) -> Run:
