@@ -223,12 +223,8 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         if members is not None and scope != "drone":
             n, kind, kinds = members.n_members, "member", members.population
         member_shape = (n_worlds, n)
-        shape, batch, core_ndim, core = (
-            jnp.shape(x),
-            batches.get(scope, member_shape),
-            metadata[CORE_NDIM_KEY],
-            metadata["core"],
-        )
+        shape, batch = jnp.shape(x), batches.get(scope, member_shape)
+        core_ndim, core = metadata[CORE_NDIM_KEY], metadata["core"]
         n_axes = len(shape) if core_ndim is None else len(batch) + core_ndim
         has_axes = shape[: len(batch)] == batch and len(shape) == n_axes
         if not has_axes or core not in (None, shape[len(batch) :]):
@@ -249,7 +245,10 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
 def _map_leaves(
     fn: Callable[[Any, Any, str, Members | None], Any], node: Any, metadata: Any, name: str, members: Members | None
 ) -> Any:
-    """Return the tree with ``fn(leaf, metadata of its field, its name, record of its population)`` for every leaf."""
+    """Return the tree with ``fn(leaf, metadata, name, members)`` in place of every leaf.
+
+    The function receives the metadata of the leaf's field, its name for messages, and the record of its population.
+    """
     if isinstance(node, PyTree):
         members = node if isinstance(node, Members) else members
         changes = {
@@ -272,7 +271,7 @@ def _map_leaves(
 def _map_foreign(
     fn: Callable[[Any, Any, str, Members | None], Any], record: Any, name: str, members: Members | None
 ) -> Any:
-    """Return a record of another library, such as ``flax.struct``, mapped like ``_map_leaves``."""
+    """Return a record of another library, such as ``flax.struct``, with ``fn`` applied as by ``_map_leaves``."""
     children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
     leaves = []
@@ -326,7 +325,7 @@ def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
     """Return ``new`` in the worlds of a mask and ``old`` elsewhere, both broadcast to a common shape.
 
     Args:
-        mask: True in worlds that take ``new``; None for all. (n_worlds,), (n_worlds, 1), or () for one world
+        mask: True in worlds with new values; None for all worlds. (n_worlds,), (n_worlds, 1), or () for one world
         new: New values. (n_worlds, ...)
         old: Old values. (n_worlds, ...)
     """

@@ -165,10 +165,8 @@ class Objects(PyTree):
         pos, quat = self.pos, self.quat
         for kind, (kind_pos, kind_quat) in poses.items():
             indices = np.array([self.names.index(f"{kind}:{k}") for k in range(kind_pos.shape[0])])
-            pos, quat = (
-                pos.at[indices].set(kind_pos.astype(pos.dtype)),
-                quat.at[indices].set(kind_quat.astype(quat.dtype)),
-            )
+            pos = pos.at[indices].set(kind_pos.astype(pos.dtype))
+            quat = quat.at[indices].set(kind_quat.astype(quat.dtype))
         return self.replace(pos=pos, quat=quat)
 
 

@@ -124,10 +124,8 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
         x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
         for rise_x, rise_y, triangle_side in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
             # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
-            origin_height, descent_rate = (
-                origin.z - a - rise_x * x - rise_y * y,
-                rise_x * du + rise_y * dv - direction.z,
-            )
+            origin_height = origin.z - a - rise_x * x - rise_y * y
+            descent_rate = rise_x * du + rise_y * dv - direction.z
             is_crossing = jnp.abs(descent_rate) > MIN_COMPONENT
             t = origin_height / jnp.where(is_crossing, descent_rate, 1.0)
             hit_x, hit_y = x + t * du, y + t * dv
