@@ -27,6 +27,7 @@ PARAMETER_UNITS = {
     "acc_coef": "N", "cmd_f_coef": "1", "thrust_dyn_coef": "1/s", "drag_coefficients": "N s/m",
     "rpy_coef": "1/s^2", "rpy_rates_coef": "1/s", "cmd_rpy_coef": "1/s^2",
 }  # fmt: skip
+"""Unit of each fitted parameter."""
 
 
 class FittedModel(PyTree):
@@ -42,7 +43,7 @@ class FittedModel(PyTree):
         Args:
             airframe: Airframe.
             dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
-            mass: Mass, kg; None for the airframe's.
+            mass: Mass, kg; None for the mass of the airframe.
         """
         params = fitted.Params.create(airframe, Dynamics(dynamics))
         return FittedModel(params if mass is None else params.replace(mass=jnp.asarray([mass], jnp.float32)))
@@ -52,10 +53,10 @@ class FittedModel(PyTree):
 
         The thrust is lagged if the model has ``thrust_dyn_coef``.
         """
-        columns = _columns(log)
+        columns = _to_crazyflow_columns(log)
         thrust = columns["cmd_f"]
         if self.params.thrust_dyn_coef is not None:
-            from scipy.signal import lfilter  # a fifth of a second to import
+            from scipy.signal import lfilter  # takes 0.2 s to import
 
             decay = np.exp(-float(self.params.thrust_dyn_coef[0]) * log.dt)
             thrust, _ = lfilter([0.0, 1 - decay], [1.0, -decay], thrust, zi=thrust[:1])
@@ -80,7 +81,7 @@ class FittedModel(PyTree):
         return vel, ang_vel, acc, ang_acc, rate
 
 
-def _columns(log: Log) -> dict[str, NDArray]:
+def _to_crazyflow_columns(log: Log) -> dict[str, NDArray]:
     """Return the columns of a log by Crazyflow's names."""
     cmd = log.attitude_command
     if cmd is None:
@@ -108,7 +109,7 @@ def identify_attitude(
         airframe: Name or path of the airframe to start from.
         dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
         source: Description of the logs, with date.
-        mass: Mass in the flights, kg; None for the airframe's.
+        mass: Mass in the flights, kg; None for the mass of the airframe.
 
     Raises:
         ConfigError: If a log has no attitude commands or has gaps, or the fitted numbers are not valid.
@@ -117,7 +118,7 @@ def identify_attitude(
     base_mass = float(base.value("rigid_body.mass"))
     flight_mass = base_mass if mass is None else float(mass)
     check_turning(logs)
-    data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
+    data = [derivatives_svf(preprocessing(_to_crazyflow_columns(log))) for log in logs]
     force, force_spread = fit_translation(dynamics, flight_mass, data)
     rotation_params, rotation_spread = fit_rotation(data)
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}

@@ -41,7 +41,7 @@ class _BagFile(io.BufferedReader):
     """File whose ``read`` allocates at most the remaining bytes, even if a damaged record states a larger size."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return at most ``size`` bytes; all that are left by default."""
+        """Return at most ``size`` bytes; by default all remaining bytes."""
         if size is None or size < 0:
             return super().read()
         return super().read(min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0)))
@@ -73,8 +73,8 @@ def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None =
     Without such names, topics are chosen by message type, and the columns are named as in crazysim's logs:
 
     - Position and attitude come from the topic of the first type in ``POSE_FIELDS`` that the bag has. Odometry also
-      gives velocity and angular velocity. They are in the body frame (nav_msgs/Odometry), and the velocity is rotated
-      to the world frame.
+      gives velocity and angular velocity. Both are in the body frame (nav_msgs/Odometry); the velocity is rotated to
+      the world frame.
     - The angular velocity of an Imu replaces the angular velocity of Odometry.
     - Rotor speeds come from Actuators, rad/s (actuator_msgs, mav_msgs), and are converted to rpm.
 
@@ -84,7 +84,7 @@ def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None =
     Args:
         path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.
         repairs: List that descriptions of repairs are appended to.
-        requested_columns: Names of the columns; None for the default ones.
+        requested_columns: Names of the columns; None for the default names.
 
     Raises:
         ConfigError: If a topic or a field is missing, or topics are ambiguous.
@@ -116,10 +116,10 @@ def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, 
     """Return the topic and the field of a column."""
     matches = [topic for topic in topics if column.startswith(f"{topic}/")]
     if not matches:
-        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+        topic_list = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
         raise ConfigError(
             f"{name}: expected a topic and a field, such as /odom/pose/pose/position/x, got {column!r}. "
-            f"The bag has {listed}."
+            f"The bag has {topic_list}."
         )
     topic = max(matches, key=len)
     return topic, column[len(topic) + 1 :]
@@ -140,7 +140,7 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
                 return matches[0], kind
         return None
 
-    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+    topic_list = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
     columns = {}
     pose, imu, rotors = (
         find_topic(list(POSE_FIELDS)),
@@ -149,7 +149,7 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
     )
     if pose is None:
         raise ConfigError(
-            f"{name}: expected a topic of {', '.join(POSE_FIELDS)}, got {listed}. Name the columns, such as "
+            f"{name}: expected a topic of {', '.join(POSE_FIELDS)}, got {topic_list}. Name the columns, such as "
             "pos=/topic/x,/topic/y,/topic/z."
         )
     topic, kind = pose

@@ -40,8 +40,8 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 
     Units are as in the Blackbox Explorer (betaflight/blackbox-log-viewer, flightlog_fields_presenter.js): degrees/s
     for ``gyroADC``, or 0.1 degrees/s with ``blackbox_high_resolution``; 100 electrical rpm for ``eRPM``; 0.01 V for
-    ``vbatLatest``; microseconds for the time. Units that blackbox_decode names in the header take precedence. Axes
-    follow from Betaflight's src/main/flight/imu.c, whose yaw is negative where the rotation about body z is positive.
+    ``vbatLatest``; microseconds for the time. Units that blackbox_decode names in the header take precedence. Axes are
+    as in Betaflight's src/main/flight/imu.c, where a positive rotation about body z gives a negative yaw.
 
     Args:
         path: File.

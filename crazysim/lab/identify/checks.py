@@ -26,8 +26,8 @@ public benchmarks, delays between streams, drag and noise give 0.6 to 1.3."""
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
 """Units of positions, in m. Velocities have these units per second."""
 DIVERGED_ERROR = 10.0
-"""Ratio of error to motion above which a rate counts as diverged. In the logs of those benchmarks it is below 4 or
-above 30."""
+"""Ratio of error to motion above which a rate counts as diverged. In the logs of those benchmarks the ratio is below 4
+or above 30."""
 MIN_TURN_RATE = 0.01
 """Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
 (BMI088, 0.014 degrees/s/sqrt(Hz)) gives 0.003 rad/s at 250 Hz."""
@@ -52,8 +52,8 @@ class Pair(NamedTuple):
     def sizes(self) -> NDArray:
         """Return the medians of measured and expected changes on each axis, zero for axes that do not move. (3, 2)
 
-        Only the quarter of the windows with the largest expected changes counts. Both changes of a window are
-        multiplied by the sign of the expected one.
+        Only the quarter of the windows with the largest expected changes is used. Both changes of a window are
+        multiplied by the sign of the expected change.
         """
         sizes = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
@@ -159,23 +159,22 @@ class Law(NamedTuple):
 
 def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> list[Law]:
     """Check the laws that the columns must obey."""
-    upward_share, problem = (
-        float(np.median(_thrust_axis(data["quat"])[:, 2])),
-        "a thrust that points up in most samples, got",
-    )
-    laws = [Law("" if upward_share > 0 else f"{problem} {upward_share:.2f} as the median of its z component", True)]
+    upward = float(np.median(_thrust_axis(data["quat"])[:, 2]))
+    fault = f"a thrust that points up in most samples, got {upward:.2f} as the median of its z component"
+    laws = [Law("" if upward > 0 else fault, True)]
     for pair in (*(pair for pair, _ in _rate_pairs(t, data, derived_keys)), _thrust_pair(t, data)):
         ratios = pair.ratios()
-        listed = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
-        text = (
-            f"{pair.requirement}, got ratios of measured to expected changes of {listed} on x, y, z, where 1 is right"
+        ratio_list = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
+        fault = (
+            f"{pair.requirement}, got ratios of measured to expected changes of {ratio_list} on x, y, z, where 1 is "
+            "right"
         )
-        laws.append(Law("" if pair.agrees() else text, not np.all(np.isnan(ratios))))
+        laws.append(Law("" if pair.agrees() else fault, not np.all(np.isnan(ratios))))
     return laws
 
 
 def _rate_pairs(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
-    """Yield a pair of changes for each measured rate, and the samples per window."""
+    """Yield a pair of changes for each measured rate, and the number of samples per window."""
     if "vel" not in derived_keys:
         width, (change, expected) = _window_changes(t, 0.2, data["pos"], integrate(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
@@ -187,7 +186,7 @@ def _rate_pairs(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
 
 
 def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
-    """Return measured changes of the acceleration, and expected ones from attitude, rotor speeds and gravity.
+    """Return measured changes of the acceleration, and changes expected from attitude, rotor speeds and gravity.
 
     The thrust is proportional to the sum of the squared rotor speeds, scaled so that the median of its vertical
     component is the weight. Without rotor speeds, its vertical component is the weight, unless the tilt is large.
@@ -196,15 +195,15 @@ def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     axis = _thrust_axis(data["quat"])
     if data["rotor_vel"].shape[1]:
         squares = np.sum(data["rotor_vel"] ** 2, axis=1)
-        middle = float(np.median(squares * axis[:, 2]))
-        thrust = GRAVITY_MAGNITUDE * squares / middle if middle > 0 else np.zeros(len(t))
-        flying = squares > np.median(squares) / 2
+        median_lift = float(np.median(squares * axis[:, 2]))
+        thrust = GRAVITY_MAGNITUDE * squares / median_lift if median_lift > 0 else np.zeros(len(t))
+        is_flying = squares > np.median(squares) / 2
     else:
-        thrust, flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
+        thrust, is_flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
     expected = integrate(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
-    ground = np.cumsum(~flying)[:, None] * np.ones(3)
-    width, (measured, expected, ground) = _window_changes(t, 0.25, data["vel"], expected, ground)
-    is_airborne = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
+    n_on_ground = np.cumsum(~is_flying)[:, None] * np.ones(3)
+    width, (measured, expected, n_on_ground) = _window_changes(t, 0.25, data["vel"], expected, n_on_ground)
+    is_airborne = (n_on_ground[width:, 0] == 0) & (n_on_ground[:-width, 0] == 0)
     if not np.any(is_airborne):
         return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
     measured, expected = ((x[width:] - x[:-width])[is_airborne] for x in (measured, expected))
@@ -214,7 +213,7 @@ def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
 
 
 def _window_changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
-    """Return the samples per window, and the changes of series over all windows; zero for windows across a gap."""
+    """Return the number of samples per window, and the changes of series over all windows, zero across a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)
     has_no_gap = t[width:] - t[:-width] < 1.5 * width * dt

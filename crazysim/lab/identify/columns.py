@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 
 NAME_COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
-"""Allowed numbers of column names of a field; the last one is required if the field is present."""
+"""Allowed numbers of column names of a field; the last number is required if the field is present."""
 NAME_ORDERS = {
     "quat": "x, y, z, w, in this order",
     "rpy": "roll, pitch and yaw",
     "attitude_command": "roll, pitch, yaw and thrust",
 }
+"""Order of the column names of a field, for messages; x, y, z for other fields."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ KNOWN_COLUMNS = {
 """Columns of known logs: the default names; IDSIA's benchmark, also with the names in its repository's ``.csv`` files;
 and NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
 MAX_NUMBER = 1e20
-"""Largest number of a log; times in ns since 1970 are 2e18."""
+"""Largest magnitude of a number in a log; times in ns since 1970 are 2e18."""
 OPTIONAL_FIELDS = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
 """Fields whose columns a log may lack."""
 
@@ -153,7 +154,7 @@ def _as_numbers(name: str, key: str, values: NDArray) -> NDArray:
 
 
 def without_huge_numbers(x: NDArray) -> NDArray:
-    """Return numbers as float64, NaN instead of any above ``MAX_NUMBER``, whose squares and products would overflow."""
+    """Return numbers as float64, with NaN for numbers above ``MAX_NUMBER``, as their products could overflow."""
     with np.errstate(invalid="ignore"):  # bytes of a damaged log may be a signalling NaN
         x = x.astype(np.float64)
     return np.where(np.abs(x) <= MAX_NUMBER, x, np.nan)

@@ -14,9 +14,9 @@ from crazysim.errors import ConfigError
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 
 MAX_COLUMNS = 10_000
-"""Most columns of a file."""
+"""Largest number of columns of a file."""
 MAX_TEXT = 40
-"""Most characters that are kept from a cell without a number."""
+"""Largest number of characters that are kept from a cell without a number."""
 
 
 def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
@@ -59,7 +59,7 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 def split_rows(
     name: str, lines: Iterable[str], width: int, first_line: int, repairs: list[str], remedy: str
 ) -> list[list[str]]:
-    """Return the cells of the rows with as many cells as the header; up to ``MAX_REPAIRED_SHARE`` others are dropped.
+    """Return the cells of the rows with as many cells as the header; drop up to ``MAX_REPAIRED_SHARE`` other rows.
 
     Args:
         name: Name of the file, for messages.
@@ -97,7 +97,7 @@ def parse_number(text: str) -> float:
 
 
 def _parse_column(cells: Sequence[str]) -> NDArray:
-    """Return the numbers of a column, NaN where a cell has none; its text unless most cells have finite numbers."""
+    """Return a column as numbers, NaN for cells without a number; as text unless most cells have finite numbers."""
     try:
         return np.array(cells, np.float64)
     except ValueError:

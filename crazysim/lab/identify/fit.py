@@ -21,7 +21,7 @@ from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.motion import integrate
 from crazysim.lab.identify.motors import motor_lag, with_speeds
-from crazysim.lab.identify.prediction import Model, windows
+from crazysim.lab.identify.prediction import Model, cut_windows
 from crazysim.lab.identify.rotation import (
     BLOCK_DURATION,
     MIN_BLOCKS,
@@ -40,8 +40,8 @@ SLOW_TORQUE_DELAY_STD = 0.2
 """Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
 samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would cause, for an unknown reason."""
 MAX_FACTOR = 10.0
-"""Largest factor of the airframe's curves and moments; a fit with a larger one is an error. Rotor speeds are checked to
-be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
+"""Largest factor of the airframe's curves and moments; a fit with a larger factor is an error. Rotor speeds are checked
+to be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
 MIN_FACTORS = {"rotor inertia": 0.0}
 """Least values of factors that may be below ``1 / MAX_FACTOR``: flights that hardly yaw do not show the inertia of the
 rotors."""
@@ -64,7 +64,7 @@ PARAMETER_UNITS = dict(
         strict=True,
     )
 )
-"""Units of these parameters; empty for factors."""
+"""Units of the parameters of force and torque; empty for factors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +81,9 @@ class Identification:
     """Identified parameters by name, see ``FACTOR_NAMES``, ``FORCE_TERMS`` and ``TORQUE_TERMS``, and ``motor lag``,
     1/s, for logs with commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between blocks of 10 s; NaN for fewer than three blocks.
-    They are larger if there are few blocks, so that an interval of three deviations contains the truth as often as with
-    many blocks. In simulated flights it does for at least 99% of the parameters."""
+    """Standard deviations of the parameters, from the scatter between 10 s blocks of the logs; NaN for fewer than three
+    blocks. They are larger if there are few blocks, so that an interval of three deviations contains the truth as often
+    as with many blocks. In simulated flights the interval contains the truth for at least 99% of the parameters."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -95,7 +95,7 @@ class Identification:
         for key in ("linear", "hidden", "output"):
             if (x := getattr(residual, key)) is not None:
                 changes[f"residual.{key}"] = np.asarray(x, np.float64)
-        airframe = load_airframe(_nested_tables(self.base, self.airframe.name.removesuffix("_identified"), changes))
+        airframe = load_airframe(_nest_tables(self.base, self.airframe.name.removesuffix("_identified"), changes))
         return replace(self, airframe=airframe, model=Model.create(airframe), changes=changes)
 
     def describe(self) -> list[str]:
@@ -106,7 +106,7 @@ class Identification:
 
     @property
     def doubtful(self) -> list[str]:
-        """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly physical."""
+        """Names of factors below 1/3 or above 3: they help to predict the logs, but are hardly physical."""
         return [name for name in FACTOR_NAMES if not 1 / 3 < self.values[name] < 3]
 
     def toml(self, source: str) -> str:
@@ -133,8 +133,8 @@ class Identification:
             if owner != table:
                 table = owner
                 lines += ["", f"[{table}]"]
-            text = [float(f"{x:.6g}") for x in value.ravel()]
-            numbers = np.reshape(text, value.shape).tolist()
+            rounded_values = [float(f"{x:.6g}") for x in value.ravel()]
+            numbers = np.reshape(rounded_values, value.shape).tolist()
             lines.append(f'{key} = {{ value = {numbers}, unit = "{units[path]}", source = "flights" }}')
         lines += ["", "# Every parameter with its standard deviation."]
         lines += [f"# {line}" for line in self.describe()]
@@ -152,14 +152,14 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     Args:
         logs: Logs of the same sample time.
         airframe: Name or path of the airframe to start from.
-        mass: Mass in the flights, kg; None for the airframe's.
+        mass: Mass in the flights, kg; None for the mass of the airframe.
     """
     base = load_airframe(airframe)
     if mass is not None and not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     logs = [with_speeds(log, base) for log in logs]
     _check_logs(logs, base)
-    windows(logs, WINDOW_DURATION, WINDOW_DURATION)
+    cut_windows(logs, WINDOW_DURATION, WINDOW_DURATION)
     check_turning(logs)
     if base.n_rotors <= 4:
         _check_rotor_order(logs, base)
@@ -174,10 +174,10 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     torque_spread = np.hypot(
         torque_spread, _fit_torques(delayed_logs, params, float(force[0]), rotation_fit.values)[0] - torque
     )
-    for k, step in enumerate(rotation_fit.deviations):
-        if math.isfinite(step):
+    for k, deviation in enumerate(rotation_fit.deviations):
+        if math.isfinite(deviation):
             shifted_torque = _fit_torques(
-                logs, params, float(force[0]), rotation_fit.values + step * (np.arange(5) == k)
+                logs, params, float(force[0]), rotation_fit.values + deviation * (np.arange(5) == k)
             )[0]
             torque_spread = np.hypot(torque_spread, shifted_torque - torque)
 
@@ -204,7 +204,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         values["motor lag"], deviations["motor lag"] = weighted_median(rates, np.ones(len(rates)))
         changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
-        new_airframe = load_airframe(_nested_tables(str(airframe), base.name, changes))
+        new_airframe = load_airframe(_nest_tables(str(airframe), base.name, changes))
     except ConfigError as error:
         raise ConfigError(f"the fitted numbers are not valid: {error} Add flights that turn and climb more.") from error
     return Identification(
@@ -273,7 +273,7 @@ def _fit_regression(
 
     Args:
         logs: Logs.
-        terms: From a log to the rate of momentum per coefficient, (n, 3, k), and the momentum, (n, 3).
+        terms: Function that returns the rate of momentum per coefficient in a log, (n, 3, k), and the momentum, (n, 3).
         is_nonpositive: True for coefficients that are at most zero. (k,)
     """
     rates, changes, blocks = [], [], []
@@ -281,7 +281,7 @@ def _fit_regression(
         x, momentum = terms(log)
         total, size = integrate(x, log.t), round(WINDOW_DURATION / log.dt)
         starts = np.arange(0, len(log.t) - size, max(1, size // 5))
-        starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
+        starts = starts[[not np.any((log.gaps > start) & (log.gaps <= start + size)) for start in starts]]
         rates.append(total[starts + size] - total[starts])
         changes.append(momentum[starts + size] - momentum[starts])
         blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK_DURATION)
@@ -319,12 +319,15 @@ def _fit_regression(
 
 
 def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:
+    """Return columns after averaging over ``size`` samples with the weights of a Hann window."""
     kernel = np.hanning(size + 2)[1:-1]
     return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
 
 def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return smoothed accelerations without gravity, angular accelerations, body velocities, and thrusts."""
+    """Return smoothed accelerations without gravity, angular accelerations, velocities, all in the body frame, and
+    thrusts.
+    """
     interior = slice(10, -10)
     acc = np.gradient(_smooth_columns(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
     ang_acc = np.gradient(_smooth_columns(log.ang_vel), log.t, axis=0)
@@ -334,7 +337,7 @@ def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArr
 
 
 def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
-    """Check that logs and airframe fit: sample times, number and unit of rotors."""
+    """Check that the logs have equal sample times, and rotor speeds that fit the airframe in number and unit."""
     if not logs:
         raise ConfigError("expected at least one log, got none")
     params = first_principles.Params.create(airframe)
@@ -416,7 +419,7 @@ def _airframe_changes(base: Airframe, mass: float, values: dict[str, float]) -> 
     return changes
 
 
-def _nested_tables(base: str, name: str, changes: dict[str, NDArray]) -> dict:
+def _nest_tables(base: str, name: str, changes: dict[str, NDArray]) -> dict:
     """Return the tables of an airframe with a base and changes."""
     tables: dict = {"name": f"{name}_identified", "base": base}
     for path, value in changes.items():

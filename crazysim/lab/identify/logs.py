@@ -86,8 +86,8 @@ def read_log(
         path: File, or columns by name.
         columns: Names of the columns, or a key of ``KNOWN_COLUMNS``; by default the last of these keys whose
             columns the log has.
-        motion: Motion capture of the same flight, whose columns are added to the log. Its clock may differ: it is
-            shifted so that the angular velocities agree.
+        motion: Motion capture of the same flight, whose columns are added to the log. If its clock differs from the
+            clock of the log, its times are shifted so that the angular velocities agree.
         between: Start and end of the part that is read, s after the first sample.
 
     Raises:
@@ -111,10 +111,11 @@ def read_log(
         )
     columns = with_rotor_count(table, columns)
     if missing := missing_columns(table, columns):
-        slow = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
+        slow_streams = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
         raise ConfigError(
-            f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
-            "--columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the flight (--motion)."
+            f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}{slow_streams}. "
+            "Name them, as in --columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the "
+            "flight (--motion)."
         )
     factors = {
         "pos": columns.metres_per_unit,

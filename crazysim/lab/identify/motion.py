@@ -1,4 +1,4 @@
-"""Motion capture with another clock, added to a log."""
+"""Motion capture with another clock, added to a log; derivatives and integrals over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motors: rotor speeds modelled from commands and voltage where none were measured, and the lag of measured ones."""
+"""Motors: rotor speeds modelled from commands and voltage where none were measured, and the lag of measured speeds."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
 
     The voltage at a motor is its command times the battery's voltage. The airframe's ``battery.thrust_over_voltage``
     gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays the speed. Motors and propellers differ by a
-    few percent, which would cause a larger torque than most manoeuvres. Each rotor's thrusts are therefore scaled so
-    that all rotors have the same mean thrust over the flight, and offsets of the centre of mass and constant torques
+    few percent, which would cause a larger torque than most manoeuvres. The thrusts of each rotor are therefore scaled
+    so that all rotors have the same mean thrust over the flight. Offsets of the centre of mass and constant torques
     cannot be fitted to such logs. Samples before take-off and after landing are left out.
 
     Args:
@@ -63,8 +63,12 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     if not np.all(is_valid):
         repairs.append(f"interpolated {np.sum(~is_valid)} commands that were not from 0 to 1")
     speeds = _lagged_speeds(commanded, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
-    flying, margin = np.flatnonzero(total_thrust > 0.75 * np.median(total_thrust)), round(GROUND_MARGIN / log.dt)
-    airborne = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
+    flying_indices, margin = (
+        np.flatnonzero(total_thrust > 0.75 * np.median(total_thrust)),
+        round(GROUND_MARGIN / log.dt),
+    )
+    first_index = flying_indices[0] + margin
+    airborne = slice(first_index, max(flying_indices[-1] - margin, first_index))
     repairs.append(
         f"left out {airborne.start} samples at the start and {len(log.t) - airborne.stop} at the end, near the ground"
     )
@@ -79,9 +83,9 @@ def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
 
     def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         cmd, duration = x
-        gap = cmd - speed
-        rate = rotor_acceleration(cmd, speed, jnp.asarray(lag)) / jnp.where(gap == 0, 1.0, gap)
-        new_speed = speed - gap * jnp.expm1(-rate * duration)
+        speed_error = cmd - speed
+        rate = rotor_acceleration(cmd, speed, jnp.asarray(lag)) / jnp.where(speed_error == 0, 1.0, speed_error)
+        new_speed = speed - speed_error * jnp.expm1(-rate * duration)
         return new_speed, new_speed
 
     first_speed = jnp.asarray(commanded[0])
@@ -96,7 +100,7 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
     Rate and delay minimise the squared residuals, so that noise of the speeds does not bias them.
 
     Args:
-        logs: Logs with commands and measured speeds; others, and modelled speeds, are left out.
+        logs: Logs with commands and measured speeds; logs without them, or with modelled speeds, are left out.
 
     Returns:
         Rates, NaN where no rate from 2 to 200 1/s is best. (n_logs with both, n_rotors)

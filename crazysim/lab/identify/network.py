@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.identify.logs import Log
-from crazysim.lab.identify.prediction import Model, Windows, attitude_error, predict, windows
+from crazysim.lab.identify.prediction import Model, Windows, attitude_error, cut_windows, predict
 from crazysim.plugins.effects.residual import ResidualData, residual_inputs
 
 ERROR_SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
@@ -22,8 +22,8 @@ WINDOW_DURATION = 0.5
 WINDOW_STRIDE = 0.05
 """Time between the starts of training windows, s."""
 FORCE_SCALE, TORQUE_SCALE = 0.1, 0.03
-"""Scales of force and torque, as fractions of the drone's weight and of its weight times its arm. With them the trained
-weights are of order one."""
+"""Scales of force and torque, as fractions of the drone's weight, and of its weight times its arm. With these scales
+the trained weights are of order one."""
 
 
 def fit_residual(
@@ -41,7 +41,7 @@ def fit_residual(
     """Return the model with a trained residual: linear terms and a network that are added to force and torque.
 
     Adam minimises Huber's loss of open-loop predictions of 0.5 s, by gradients through the dynamics. The parameters of
-    the model stay as they are. With validation logs, their loss is computed every 100 iterations, and the result is the
+    the model are not changed. With validation logs, their loss is computed every 100 iterations, and the result is the
     residual with the least loss.
 
     Args:
@@ -67,8 +67,8 @@ def fit_residual(
             f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
             f"and {batch_size}. Leave them out for the defaults."
         )
-    data, dt, params = windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
-    validation_windows = windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
+    data, dt, params = cut_windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
+    validation_windows = cut_windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(
         data.quat[:, 0], data.vel[:, 0], data.ang_vel[:, 0], data.rotor_vel[:, 1]
     )
@@ -76,7 +76,7 @@ def fit_residual(
     weight = float(params.mass[0]) * float(jnp.linalg.norm(params.gravity_vec))
     scale = weight * jnp.repeat(jnp.array([FORCE_SCALE, TORQUE_SCALE * float(params.L[0])]), 3)
 
-    def residual(weights: dict[str, Array]) -> ResidualData:
+    def make_residual(weights: dict[str, Array]) -> ResidualData:
         """Return the residual from weights of order one."""
         linear = model.residual.linear + scale[:, None] * weights["linear"] / input_std
         if not n_hidden:
@@ -88,7 +88,7 @@ def fit_residual(
         )
 
     def loss(weights: dict[str, Array], batch: Windows) -> Array:
-        candidate = Model(params=params, residual=residual(weights))
+        candidate = Model(params=params, residual=make_residual(weights))
         return jnp.mean(huber(jax.vmap(lambda w: scaled_errors(candidate, w, dt))(batch)))
 
     optimizer: Any = optax.chain(
@@ -119,7 +119,7 @@ def fit_residual(
             validation_loss = float(validation_loss_fn(weights, validation_windows))
             if validation_loss < least_loss:
                 best_weights, least_loss = weights, validation_loss
-    return Model(params=params, residual=residual(weights if validation_windows is None else best_weights))
+    return Model(params=params, residual=make_residual(weights if validation_windows is None else best_weights))
 
 
 def scaled_errors(model: Model, window: Windows, dt: float) -> Array:

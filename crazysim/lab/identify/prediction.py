@@ -28,7 +28,7 @@ HORIZONS = (0.1, 0.25, 0.5)
 
 
 class Windows(PyTree):
-    """Pieces of logs, all of the same length. A prediction starts at the first sample of each."""
+    """Pieces of logs, all of the same length. A prediction starts at the first sample of each window."""
 
     pos: Array
     """Position, world frame, m. (n_windows, n, 3)"""
@@ -46,7 +46,7 @@ class Windows(PyTree):
 
 
 PADDING = 1
-"""Samples of rotor speeds before and after a window, for their accelerations at its ends."""
+"""Number of samples of rotor speeds before and after a window, for the rotor accelerations at its ends."""
 
 
 State = tuple[Array, Array, Array, Array, Array]
@@ -61,7 +61,7 @@ class Predictor(Protocol):
         ...
 
     def start(self, window: Windows) -> Array:
-        """Return the further states at the first sample of a window. (k,)"""
+        """Return the further states of the model at the first sample of a window. (k,)"""
         ...
 
     def inputs(self, window: Windows, dt: float) -> Array:
@@ -69,7 +69,7 @@ class Predictor(Protocol):
         ...
 
     def derivative(self, state: State, inputs: Array) -> State:
-        """Return the time derivatives of a state under inputs; the angular velocity for the attitude."""
+        """Return the time derivatives of a state under inputs; the angular velocity in place of the attitude's."""
         ...
 
 
@@ -87,7 +87,7 @@ class Model(PyTree):
 
         Args:
             airframe: Airframe.
-            mass: Mass, kg; None for the airframe's.
+            mass: Mass, kg; None for the mass of the airframe.
         """
         params = first_principles.Params.create(airframe)
         if mass is not None:
@@ -126,7 +126,7 @@ class Model(PyTree):
         return vel, ang_vel, acc, ang_acc, no_states
 
 
-def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
+def cut_windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
     """Return the windows of logs of equal sample times that do not cross a gap.
 
     Args:
@@ -160,7 +160,7 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
 def predict(
     model: Predictor, window: Windows, dt: float, constant_rates: bool = False
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the predicted states of one window, which begin at its first sample: pos, quat, vel, ang_vel.
+    """Return the states of one window, predicted from its first sample: pos, quat, vel, ang_vel. (n, ...) each
 
     Each sample is one Runge-Kutta step of order 4.
 
@@ -227,11 +227,11 @@ def prediction_errors(
 
     Returns:
         RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
-        name: ``position``, ``attitude``, both ``... at constant body rates`` (forces of the model alone),
-        ``position at constant velocity``, ``attitude unchanged``. The same names with `` (mean)`` appended have the
-        mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
+        name: ``position`` and ``attitude``; the same with `` at constant body rates`` appended (only forces are
+        modelled); ``position at constant velocity``; ``attitude unchanged``. These names with `` (mean)`` appended have
+        the mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
     """
-    batch, dt = windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
+    batch, dt = cut_windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat = _predict_all(model, batch, dt)
     constant_rate_pos, constant_rate_quat = _predict_all(model, batch, dt, constant_rates=True)
     samples = np.asarray([round(h / dt) for h in horizons])
@@ -260,7 +260,7 @@ def prediction_errors(
 
 
 def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
-    """Return errors as a table of text."""
+    """Return errors from ``prediction_errors`` as a table of text."""
     head = f"{'RMSE, or mean error, after':48}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
     unit = {"p": "m", "a": "degrees"}
     return "\n".join(

@@ -18,7 +18,7 @@ from crazysim.lab.identify.columns import Columns, unsigned_name, without_huge_n
 from crazysim.lab.identify.repairs import PERIOD_RANGE, align_signs, unwrap_angles
 
 MAX_HOLD = 3.0
-"""Longest pause of a stream that is interpolated, in intervals of the stream; a longer one is a gap."""
+"""Longest pause of a stream that is interpolated, in intervals of the stream; a longer pause is a gap."""
 VARIABLE_PATTERN = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
 """Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
 MAX_RATE = 250.0
@@ -46,7 +46,7 @@ def resample(
         name: Name of the file, for messages.
         streams: Streams by name.
         repairs: List that descriptions of repairs are appended to.
-        columns: Names of the columns, None for the default ones. Attitudes are made continuous before they are
+        columns: Names of the columns; None for the default names. Attitudes are made continuous before they are
             interpolated.
 
     Raises:
@@ -127,7 +127,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
-        columns: Names of the columns. Events that have none of them are left out, unless all have none.
+        columns: Names of the columns. Events without these columns are left out, unless no event has any of them.
 
     Raises:
         ConfigError: If the file is not a log of this format.
@@ -190,9 +190,9 @@ def _are_uint32(x: NDArray) -> bool:
 def decompress_quat(packed: NDArray) -> NDArray:
     """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
 
-    The lowest 30 bits hold the components other than the largest, the last one in the lowest bits. Each takes nine bits
-    for its magnitude, in units of 1 / (511 sqrt(2)), and above them a bit that is set if it is negative. The highest
-    two bits hold the index of the largest component.
+    The lowest 30 bits hold the three smaller components, the last of them in the lowest bits. Each component takes nine
+    bits for its magnitude, in units of 1 / (511 sqrt(2)), and above them a bit that is set if it is negative. The
+    highest two bits hold the index of the largest component.
     """
     largest, quat = packed >> 30, np.zeros((len(packed), 4))
     for k in (3, 2, 1, 0):

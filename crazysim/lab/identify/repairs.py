@@ -26,8 +26,8 @@ MIN_SAMPLES = 20
 GROUND_DURATION = 1.0
 """Shortest stay on the ground that is left out of a log, and the time left out before and after it, s."""
 CARRIED_SHARE, IDLE_SHARE = 0.75, 0.4
-"""Shares of the typical thrust. A drone is on the ground where its thrust is below the first for longer than
-``GROUND_DURATION`` and falls below the second: flight controllers raise the thrust slowly before they take off."""
+"""Shares of the typical thrust. A drone is on the ground where its thrust is below the first share for longer than
+``GROUND_DURATION`` and falls below the second share: flight controllers raise the thrust slowly before take-off."""
 N_NEIGHBOURS = 10
 """Number of samples on each side of an interval from which lost time and jitter are distinguished."""
 
@@ -84,7 +84,7 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
 
 
 def _longest_increasing_sequence(t: NDArray) -> NDArray:
-    """Return True for the samples of the longest increasing sequence: patience sorting. (n,)"""
+    """Return True for the samples of the longest increasing sequence, found by patience sorting. (n,)"""
     end_times: list[float] = []
     last_indices: list[int] = []
     predecessors = np.full(len(t), -1)
@@ -116,8 +116,8 @@ def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     if len(late_samples) > len(gaps):
         longest = float(np.max(steps[late_samples - 1]))
         repairs.append(
-            f"kept {len(late_samples) - len(gaps)} intervals of the time of up to {longest:.3g} s that the next ones "
-            "make up for, as jitter"
+            f"kept {len(late_samples) - len(gaps)} intervals of up to {longest:.3g} s as jitter, since shorter "
+            "intervals follow"
         )
     if len(gaps):
         longest = float(np.max(steps[gaps - 1]))
@@ -134,8 +134,8 @@ def interpolate_missing(
 ) -> tuple[NDArray, dict[str, NDArray]]:
     """Return time and data with missing values interpolated over up to ``MAX_INTERPOLATION``, without longer gaps.
 
-    A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
-    for a lost body.
+    A value is missing where it is not finite. An attitude is also missing where its quaternion is zero, which some
+    motion capture systems send for a lost body.
     """
     is_kept, lost_keys, columns = np.ones(len(t), bool), [], {}
     for key, x in data.items():
@@ -192,7 +192,7 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
         thrust: Sum of the squares of the rotor speeds, or the commanded thrust, in any unit. (n,)
         repairs: List that descriptions of repairs are appended to.
     """
-    from scipy.ndimage import median_filter  # a fifth of a second to import
+    from scipy.ndimage import median_filter  # takes 0.2 s to import
 
     smoothed = median_filter(
         np.maximum(thrust, 0.0), size=2 * max(1, round(0.1 / float(np.median(np.diff(t))))) + 1, mode="nearest"
@@ -264,7 +264,7 @@ def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
 
 
 def unwrap_angles(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
-    """Return angles that do not jump by a period, as interpolation needs; missing ones stay NaN. (n,)"""
+    """Return angles without jumps by a period, for interpolation; missing angles stay NaN. (n,)"""
     is_valid = np.isfinite(angles)
     angles = np.where(is_valid, angles, np.nan)
     angles[is_valid] = np.unwrap(angles[is_valid], period=period)
@@ -272,5 +272,5 @@ def unwrap_angles(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
 
 
 def align_signs(quat: NDArray) -> NDArray:
-    """Return quaternions whose neighbours have one sign, as interpolation needs: q and -q are one attitude. (n, 4)"""
+    """Return the same attitudes as quaternions that do not flip from q to -q, for interpolation. (n, 4)"""
     return quat * np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])[:, None]

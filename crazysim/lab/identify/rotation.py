@@ -7,7 +7,7 @@ not have this problem: above a few hertz, the torque of the rotors turns the bod
 are therefore band-passed.
 
 Telemetry of rotor speeds is held, quantised and late, which biases coefficients towards zero (errors in variables).
-Commands are free of that: where a log has them, they are the instruments of two-stage least squares.
+Commands have no such errors. If a log has commands, they are the instruments of two-stage least squares.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     Args:
         logs: Logs of the same sample time.
         params: Parameters of the airframe.
-        thrust_factor: Factor of its thrust curve.
+        thrust_factor: Factor of the airframe's thrust curve.
 
     Raises:
-        ConfigError: If the rotors do not turn the drone as the airframe says, or the logs are too short.
+        ConfigError: If the rotors turn the drone against their torque, or the logs are too short.
     """
     moments = np.diag(np.asarray(params.J, np.float64))
     values, blocks = np.ones(5), []
@@ -162,7 +162,7 @@ class _LogTerms(NamedTuple):
         curves = [np.atleast_2d(np.asarray(c, np.float64)) for c in (params.rpm2thrust, params.rpm2torque)]
         rotor_inertia = np.asarray(params.prop_inertia, np.float64) * RPM_TO_RAD_S
 
-        def rotors(speed: NDArray) -> _Rotors:
+        def make_rotors(speed: NDArray) -> _Rotors:
             thrust, drag = [c[:, 0] + speed * (c[:, 1] + speed * c[:, 2]) for c in curves]
             thrust = thrust_factor * thrust
             torque = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
@@ -179,14 +179,14 @@ class _LogTerms(NamedTuple):
         spin = np.zeros_like(w)
         spin[:, 2] = -values[4] * (rotor_inertia * log.rotor_vel) @ mixing[2]
         gyro = np.linalg.solve(inertia, np.cross(w, w @ inertia + spin).T).T
-        speeds = log.rotor_vel if log.command is None else _speeds_of_commands(log)
+        speeds = log.rotor_vel if log.command is None else _fit_speeds(log)
         return _LogTerms(
             dt,
             log.gaps,
             _centred_change(w) + _two_interval_integral(gyro, dt),
             _two_interval_integral(w, dt),
-            rotors(log.rotor_vel),
-            rotors(speeds),
+            make_rotors(log.rotor_vel),
+            make_rotors(speeds),
         )
 
 
@@ -196,14 +196,14 @@ class _Rotors(NamedTuple):
     impulse: NDArray
     """Integral of the torque of the thrusts about x and y, and of the drag about z, N m s. (n, 3)"""
     swing: NDArray
-    """Change of these torques, N m. (n, 3)"""
+    """Change of the torques whose integral is ``impulse``, N m. (n, 3)"""
     reaction: NDArray
     """Integral of the torque about z of the rotors' acceleration, N m s. (n,)"""
     lift: NDArray
     """Integral of the collective thrust, N s. (n,)"""
 
 
-def _speeds_of_commands(log: Log) -> NDArray:
+def _fit_speeds(log: Log) -> NDArray:
     """Return the rotor speeds fitted by finite impulse responses to commands and their squares. (n, n_rotors)"""
     n, count = len(log.t), round(RESPONSE_DURATION / log.dt)
     index = np.clip(np.arange(n)[:, None] - np.arange(-1, count)[None], 0, n - 1)
@@ -228,7 +228,7 @@ def _two_interval_integral(x: NDArray, dt: float) -> NDArray:
     return total
 
 
-def _band_pass(x: NDArray, dt: float, slow: float) -> NDArray:
+def _band_pass(x: NDArray, dt: float, slow_width: float) -> NDArray:
     """Return the band-passed signal. (n, k)"""
 
     def smooth_columns(width: float) -> NDArray:
@@ -236,7 +236,7 @@ def _band_pass(x: NDArray, dt: float, slow: float) -> NDArray:
         kernel = np.hanning(size + 2)[1:-1]
         return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
-    return smooth_columns(FAST_WIDTH) - smooth_columns(slow)
+    return smooth_columns(FAST_WIDTH) - smooth_columns(slow_width)
 
 
 def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
@@ -272,7 +272,8 @@ def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -
     """Return the coefficients of the regressors and their variances, fitted at ``samples``.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
-    the drag torque and the reaction of the rotors. The last one is the angular velocity.
+    the drag torque and the reaction of the rotors; about each axis also the angular velocity, as the last regressor.
+    All are integrated over the two intervals around each sample.
     """
 
     def terms(rotors: _Rotors) -> NDArray:
@@ -282,9 +283,9 @@ def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -
             columns = rotors.impulse[:, axis], rotors.swing[:, axis], rotors.lift
         return np.c_[shift_series(np.stack(columns, axis=-1), delay / data.dt), data.angle[:, axis]]
 
-    slow = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
+    slow_width = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, ang_vel_change = (
-        _band_pass(x, data.dt, slow)[samples]
+        _band_pass(x, data.dt, slow_width)[samples]
         for x in (terms(data.rotors), terms(data.instruments), data.ang_vel_change[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
@@ -294,7 +295,7 @@ def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -
 
 
 def shift_series(x: NDArray, samples: float) -> NDArray:
-    """Return series that are later by a number of samples, by Lagrange's polynomials through six of them. (n, k)
+    """Return series delayed by a number of samples, by Lagrange's polynomials through six samples. (n, k)
 
     A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.
     """

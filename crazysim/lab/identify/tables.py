@@ -27,12 +27,12 @@ MAX_LOG_BYTES = 2**31
 def read_table(
     source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
 ) -> tuple[str, Mapping[str, NDArray]]:
-    """Return the name of a log and its columns, with the time in s, and a quaternion where it has angles.
+    """Return the name of a log and its columns, with the time in s, and angles converted to a quaternion.
 
     Args:
         source: File, or columns by name.
         repairs: List that descriptions of repairs are appended to.
-        columns: Names of the columns, None for the default ones.
+        columns: Names of the columns; None for the default names.
 
     Raises:
         ConfigError: If the file cannot be read, or its samples are too close or too far apart for a flight.

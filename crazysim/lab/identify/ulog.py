@@ -1,7 +1,7 @@
 """Logs of PX4, in its ULog format.
 
-The format is described at https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data,
-which PX4 writes after a crash, follow the others without a mark.
+The format is described at https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data, which PX4 writes
+after a crash, follow the other data without a mark.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ SYNC_BYTES = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 HEADER_SIZE = 16
 """Bytes before the first message."""
 MESSAGE_LETTERS = b"ABCDFILMOPQRS"
-"""Letters of the messages."""
+"""Letters that state the kinds of messages."""
 SCALAR_TYPES = {
     "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
     "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "<i1", "char": "<i1",
 }  # fmt: skip
-"""Types of fields, as NumPy names them."""
+"""NumPy's name of each type of a field."""
 MAX_MESSAGE_BYTES = 2**16 - 1
-"""Largest message, bytes, which its 16 bits of length can state."""
+"""Largest message, bytes; its length has 16 bits."""
 MAX_DEPTH = 8
 """Largest depth of nested formats; PX4 has two."""
 FIELD_PATTERN = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
@@ -49,7 +49,7 @@ FIELD_PATTERN = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
 def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """Return the columns of a PX4 ULog by the names of crazysim's logs.
 
-    World axes are north, west, up, and body axes forward, left, up: PX4's, rotated by 180 degrees about the first axis.
+    World axes are north, west, up, and body axes forward, left, up: PX4's axes rotated by 180 degrees about the first.
     Rotor speeds come from ``esc_status`` and commands from ``actuator_motors``, or else from ``actuator_outputs``, in
     PX4's order. Commanded attitudes come from ``vehicle_attitude_setpoint``, with its thrust from 0 to 1. Logs
     before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
@@ -94,8 +94,8 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         columns["esc_status"] = {f"rpm{k + 1}": x for k, x in enumerate(speeds)}
     if "actuator_motors" in topics:
         outputs = [topics["actuator_motors"][f"control[{k}]"] for k in range(12)]
-        active = [x for x in outputs if np.any(np.isfinite(x))]
-        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(active)}
+        used_outputs = [x for x in outputs if np.any(np.isfinite(x))]
+        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(used_outputs)}
     elif "actuator_outputs" in topics and n_rotors:
         outputs = [topics["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
         columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
@@ -133,7 +133,7 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
 
     Args:
         path: File.
-        topics: Names of the topics; those without messages are left out.
+        topics: Names of the topics; topics without messages are left out.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:

@@ -42,10 +42,11 @@ class Browser(Viewer[Live]):
         print(browser.url)
 
     A click on a drone selects it; a click on a vehicle, load or object makes the viewer follow it. The panel plots any
-    array of the data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
+    array of the data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may connect and
+    disconnect at any time.
 
-    The address has a new token every time. Whoever has it can watch and command the simulation; others are refused, and
-    so are requests from pages of other sites.
+    The address has a new token every time. Whoever has the token can watch and command the simulation. Requests without
+    the token and requests from pages of other sites are refused.
     """
 
     def __init__(
@@ -66,10 +67,10 @@ class Browser(Viewer[Live]):
             port: Port; 0 for any free one.
             host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
             worlds: Indices of the worlds, shown side by side; None for all, up to ``MAX_WORLDS``.
-            spacing: Distance between their origins, m; None for the largest horizontal extent of the drones of a world
-                in the first picture, plus a margin.
-            trail: Duration of trails, s; 0 for none.
-            contacts: True to mark drones that touch something, which is computed for every picture.
+            spacing: Distance between the origins of shown worlds, m; None for the largest horizontal extent of the
+                drones of a world in the first picture, plus a margin.
+            trail: Duration of the motion that trails show, s; 0 for none.
+            contacts: True to mark drones that touch something; contacts are then computed for every picture.
             wind: True to draw the wind at every drone.
             follow: True to keep the followed body in the middle at first.
             plot: Quantity that is plotted at first.
@@ -163,10 +164,10 @@ class Browser(Viewer[Live]):
 
 
 def _require_free_port(host: str, port: int) -> int:
-    """Return a port that is free, or any free one for 0; viser itself would silently take another.
+    """Return ``port`` if it is free, and any free port for 0; viser itself would silently use another port.
 
     Raises:
-        RenderError: If it is in use or does not exist.
+        RenderError: If the port is in use or does not exist.
     """
     if port == 0:
         return free_port()

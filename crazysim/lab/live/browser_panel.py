@@ -16,7 +16,7 @@ from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
 from crazysim.lab.live.viewer import Slider, Widget
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
-"""Speeds to choose from."""
+"""Speeds that the panel offers."""
 TEXT_PERIOD, PLOT_PERIOD = 0.2, 0.1
 """Time between updates of the text and of the plot, s."""
 PLOT_SAMPLE_PERIOD = 0.02
@@ -28,17 +28,17 @@ LINE_COLORS = ("#d6452f", "#2a7fd9", "#37a35a", "#d99a1c", "#8a4fbf", "#444444")
 MAX_LINES = 16
 """Largest number of lines of a plot."""
 KEY_HOLD_TIME = 0.25
-"""Time for which a button or key of the browser holds a key of the loop, s: browsers report presses only."""
+"""Time for which a hotkey of the browser holds a key of the loop, s; browsers report no releases."""
 MOVEMENT_KEYS = {
     "forward": ("up", "arrowup"), "back": ("down", "arrowdown"), "left": ("left", "arrowleft"),
     "right": ("right", "arrowright"), "climb": ("w", "W"), "sink": ("s", "S"), "turn left": ("a", "A"),
     "turn right": ("d", "D"),
 }  # fmt: skip
-"""Keys of the loop and hotkeys of viser of each movement."""
+"""Key of the loop and hotkey of viser for each movement."""
 
 
 class BrowserPanel:
-    """Panel of one server, which all its browsers share."""
+    """Panel of a viser server; all browsers of the server share it."""
 
     follow: bool
     """True to keep the followed body in the middle."""
@@ -50,11 +50,11 @@ class BrowserPanel:
 
         Args:
             server: Server of viser.
-            live: Loop, whose buttons and sliders the panel shows.
-            scene: Scene, whose layers the panel switches.
+            live: Loop; the panel shows its buttons and sliders.
+            scene: Scene; the panel shows and hides its layers.
             bodies: Bodies that can be followed.
-            follow: Initial value.
-            plot: Initial value.
+            follow: Initial value of ``follow``.
+            plot: Initial value of ``plot``.
         """
         self._gui = gui = server.gui
         self._scene, self._live = scene, live
@@ -180,12 +180,12 @@ class BrowserPanel:
 
     def _add_body_choice(self, gui: Any, live: Live, world_input: Any, bodies: SceneBodies) -> None:
         """Add the choice of the followed body, which may be a vehicle, a load or an object."""
-        body_of_name = {body.name: body for body in bodies.items}
-        self._body_input = choice = gui.add_dropdown("body", ("", *body_of_name))
+        bodies_by_name = {body.name: body for body in bodies.items}
+        self._body_input = choice = gui.add_dropdown("body", ("", *bodies_by_name))
 
         @choice.on_update
         def _(event: Any) -> None:
-            body = body_of_name.get(choice.value)
+            body = bodies_by_name.get(choice.value)
             if event.client is not None and body is not None:  # a change by a user
                 world = int(world_input.value)
                 live.post(lambda live: live.follow(world, body.kind, body.index))

@@ -19,7 +19,7 @@ from crazysim.scene.visual_geoms import VisualGeom
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
 CLICK_SIZE = 0.02
-"""Smallest half size of a body for clicks, as a multiple of the distance from the camera."""
+"""Smallest half size of the box in which a click hits a body, as a fraction of the distance from the camera."""
 HIDDEN_SCALE = 1e-6
 """Scale of a mark that is not shown."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
@@ -46,21 +46,21 @@ class BrowserScene:
             bodies: Bodies that can be picked.
             picture: First picture.
             spacing: Distance between the origins of neighbouring worlds, m.
-            trail: Duration of trails, s; 0 for none.
+            trail: Duration of the motion that trails show, s; 0 for no trails.
         """
         self._scene, self._bodies = server.scene, bodies
         scene = server.scene
         n_worlds, n_drones = picture.drone_pos.shape[:2]
         self.offsets = grid_offsets(n_worlds, spacing)
         self._root = scene.add_frame("/world", show_axes=False)
-        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
-        by_body: dict[int, list[VisualGeom]] = defaultdict(list)
+        shapes_by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        shapes_by_body: dict[int, list[VisualGeom]] = defaultdict(list)
         for shape in shapes:
             if shape.mocap < 0:
-                by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+                shapes_by_color[tuple(np.round(shape.rgba, 3))].append(shape)
             elif shape.kind != "plane":
-                by_body[shape.mocap].append(shape)
-        for k, (rgba, fixed_shapes) in enumerate(by_color.items()):
+                shapes_by_body[shape.mocap].append(shape)
+        for k, (rgba, fixed_shapes) in enumerate(shapes_by_color.items()):
             infinite_planes = [s for s in fixed_shapes if s.kind == "plane" and not s.size[:2].any()]
             finite_shapes = [s for s in fixed_shapes if not any(s is plane for plane in infinite_planes)]
             if infinite_planes:
@@ -69,8 +69,8 @@ class BrowserScene:
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
                 add_geoms(scene, node.name, finite_shapes, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
-        for equal_bodies in _group_equal_bodies(by_body):
-            self._add_bodies(np.array(equal_bodies), by_body[equal_bodies[0]], picture)
+        for equal_bodies in _group_equal_bodies(shapes_by_body):
+            self._add_bodies(np.array(equal_bodies), shapes_by_body[equal_bodies[0]], picture)
 
         colors = np.tile(choose_drone_colors(n_drones, None)[:, :3], (n_worlds, 1))
         drone_pos = self._to_grid(picture.drone_pos).reshape(-1, 3)
@@ -123,10 +123,10 @@ class BrowserScene:
     def pick(
         self, picture: Picture, origin: ArrayLike, direction: ArrayLike
     ) -> tuple[int, SceneBody | None, NDArray | None]:
-        """Return what a ray from the camera hits: the index of a world, and a body or a point of its floor.
+        """Return what a ray from the camera hits: the index of a shown world, a body, and a point of the floor.
 
-        The point is in the frame of the world, m. (3,) Either the body or the point is None. If the ray hits nothing,
-        both are None and the index is 0.
+        If the ray hits a body, the point is None; if it hits the floor, the body is None. If it hits nothing, both are
+        None and the index is 0. The point is in the frame of the world, m. (3,)
 
         Args:
             picture: Picture that the user has seen.
@@ -146,10 +146,10 @@ class BrowserScene:
         return world, None, point - self.offsets[world]
 
     def _ray_distances(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
-        """Return the distance between a ray and the origin of each body whose box it enters, m. (n, n_mocap)
+        """Return the distance between a ray and the origin of each body in n shown worlds, m. (n, n_mocap)
 
-        The distance is infinite for other bodies. Boxes of small and distant bodies are enlarged, so that they are easy
-        to click.
+        The distance is infinite if the ray does not enter the box around the body. Boxes of small and distant bodies
+        are enlarged, so that these bodies are easy to click.
 
         Args:
             picture: Picture that the user has seen.
@@ -162,25 +162,24 @@ class BrowserScene:
         is_drone = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
         min_radius = np.maximum(np.where(is_drone, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * distance)
         to_body = picture.quat * (-1, -1, -1, 1)
-        local_start, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
+        local_start = rotate(to_body, start)
+        local_direction = rotate(to_body, np.broadcast_to(direction, start.shape))
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (
-                (np.minimum(low, -min_radius) - local_start) / ray,
-                (np.maximum(high, min_radius) - local_start) / ray,
-            )
-        entry_distance, exit_distance = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
+            to_low = (np.minimum(low, -min_radius) - local_start) / local_direction
+            to_high = (np.maximum(high, min_radius) - local_start) / local_direction
+        entry_distance, exit_distance = np.fmin(to_low, to_high).max(-1), np.fmax(to_low, to_high).min(-1)
         is_hit = (entry_distance > 0) & (entry_distance <= exit_distance) & (high > low).any(-1)
         ray_distance = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
         return np.where(is_hit, ray_distance, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
         """Add bodies that have the same geoms, as one batch for each colour."""
-        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        shapes_by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
         for shape in shapes:
-            by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+            shapes_by_color[tuple(np.round(shape.rgba, 3))].append(shape)
         pos = self._to_grid(picture.pos)[:, bodies].reshape(-1, 3)
         quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
-        for k, (rgba, same_color_shapes) in enumerate(by_color.items()):
+        for k, (rgba, same_color_shapes) in enumerate(shapes_by_color.items()):
             mesh = create_mesh(same_color_shapes)
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
@@ -220,7 +219,7 @@ class BrowserScene:
         """Show the LEDs of all drones; colours are sent only when they change.
 
         Args:
-            drone_pos: Positions, m. (n, 3)
+            drone_pos: Positions of the n shown drones, frame of the grid, m. (n, 3)
             colors: Colours, 0 to 1; zero for off. (n, 3)
         """
         if not np.array_equal(colors, self._led_colors):
@@ -231,15 +230,15 @@ class BrowserScene:
             self._lights.batched_positions = finite_rows(drone_pos)
 
     def _show_followed(self, body_pos: NDArray, picture: Picture, follow: bool) -> None:
-        k = None
+        shown_index = None
         if picture.followed is not None:
-            k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
-        self._followed_mark.visible = k is not None
-        if k is None or picture.followed is None:
+            shown_index = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
+        self._followed_mark.visible = shown_index is not None
+        if shown_index is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
-        pos = finite_rows(body_pos[k, picture.followed[1]])
-        radius = self._bodies.radius(picture.followed[1])
+        pos = finite_rows(body_pos[shown_index, picture.followed[1]])
+        radius = self._bodies.mark_radius(picture.followed[1])
         self._followed_mark.position = pos
         if radius != self._followed_mark.radius:  # only on a change, because browsers rebuild the sphere
             self._followed_mark.radius, self._label.position = radius, (0.0, 0.0, radius)
@@ -264,10 +263,10 @@ def to_rgb_bytes(colors: NDArray) -> NDArray:
     return np.round(255 * colors[:, :3]).astype(np.uint8)
 
 
-def _group_equal_bodies(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
-    """Return the bodies, grouped by equal geoms."""
+def _group_equal_bodies(shapes_by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
+    """Return lists of the mocap ids of bodies with equal geoms."""
     groups: dict[tuple, list[int]] = defaultdict(list)
-    for body, shapes in by_body.items():
+    for body, shapes in shapes_by_body.items():
         key = tuple(
             (s.kind, *(np.round(x, 6).tobytes() for x in (s.size, s.rgba, s.pos, s.quat)), s.vertices.tobytes())
             for s in shapes

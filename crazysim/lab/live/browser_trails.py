@@ -25,8 +25,8 @@ class Trails:
         Args:
             scene: Scene of viser.
             pos: Positions of all bodies, m. (n, 3)
-            colors: Their colours, 0 to 1. (n, 3)
-            seconds: Duration, s.
+            colors: Colours of the trails, 0 to 1. (n, 3)
+            seconds: Duration of the motion that the trails show, s.
         """
         self._length = max(round(seconds / TRAIL_PERIOD), 1)
         self._samples: deque[NDArray] = deque(maxlen=self._length)
@@ -36,7 +36,7 @@ class Trails:
         fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]
         shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
         self._handle = scene.add_line_segments(
-            "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
+            "/world/trails", self._make_segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
             thickness_units="screen",
         )  # fmt: skip
 
@@ -51,10 +51,10 @@ class Trails:
         self._samples.append(pos)
         self._last_time = time
         if visible:
-            self._handle.points = self._segments(pos)
+            self._handle.points = self._make_segments(pos)
 
-    def _segments(self, pos: NDArray) -> NDArray:
-        """Return segments, oldest first, padded at the beginning. (length * n, 2, 3)"""
+    def _make_segments(self, pos: NDArray) -> NDArray:
+        """Return the segments through the samples and ``pos``, oldest first, padded at the start. (length * n, 2, 3)"""
         path = [*self._samples, pos]
         path = [path[0]] * (self._length + 1 - len(path)) + path
         points = np.stack(path[-self._length - 1 :])

@@ -13,17 +13,17 @@ MAX_SAMPLES = 400
 MAX_LINES = 6
 """Largest number of lines."""
 PLOT_FRACTION = 0.3
-"""Width and height of the plot, as a fraction of the window's."""
+"""Width and height of the plot, as a fraction of the width and height of the window."""
 
 
 class Chart:
-    """Lines of the values of one quantity."""
+    """Plot of one quantity over time, with a line for each of its numbers."""
 
     def __init__(self, name: str):
         """Create an empty chart.
 
         Args:
-            name: Title; empty for no plot.
+            name: Title.
         """
         self._name, self._selected_drone = name, None
         self._times: list[float] = []

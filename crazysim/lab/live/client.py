@@ -50,7 +50,7 @@ class _Client(Closeable):
 
 
 class DroneClient(_Client):
-    """Control of one drone, which no other client can command until this one disconnects."""
+    """Control of one drone. No other client can command that drone until this client disconnects."""
 
     def __init__(self, drone: int, host: str = "127.0.0.1", port: int = DRONE_PORT, timeout: float = 5.0):
         """Connect and request the drone.
@@ -103,7 +103,7 @@ class DroneClient(_Client):
 
 
 class StreamClient(_Client):
-    """Client of the stream, which carries shows and the commands to any drone."""
+    """Client of the server's stream port, which accepts shows and commands to any drone."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = 5.0):
         """Connect.
@@ -119,11 +119,11 @@ class StreamClient(_Client):
         super().__init__(host, port, timeout)
 
     def command(self, drone: int, command: str, argument: str = "") -> None:
-        """Send a command such as ``takeoff`` with its argument to a drone, or to all for 0."""
+        """Send a command such as ``takeoff`` with its argument to the drone with an ID, or to all drones for 0."""
         self.send(f"{drone:02d}_CMDSTART_{command}_{argument}{'_' if argument else ''}EOF".encode())
 
     def upload(self, drone: int, trajectory: Trajectory, encoding: str = "COMPRESSED") -> None:
-        """Send a trajectory of one vehicle to a drone, or to all for 0, to be started later."""
+        """Send a trajectory of one vehicle to the drone with an ID, or to all drones for 0, to be started later."""
         text = json.dumps(format_trajectory(trajectory, encoding))
         self.send(f"{drone:02d}_CMDSTART_upload_{text}_EOF".encode())
 

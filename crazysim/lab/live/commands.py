@@ -70,9 +70,9 @@ class SetParameter:
     drone: int | None
     """ID of the drone; None for all."""
     name: str
-    """Name."""
+    """Name of the parameter."""
     value: float
-    """Value."""
+    """New value."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class StartShow:
 
 @dataclass(frozen=True, eq=False)
 class LoadShow:
-    """Receive the trajectories of a show, the first for the first drone."""
+    """Receive the trajectories of a show; the first trajectory is for the first drone."""
 
     show: Show
     """Show."""

@@ -20,6 +20,8 @@ MAX_SHOW = 64 * 2**20
 """Largest show, bytes."""
 
 ZIP_START, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
+ZIP_END_SIZE = 22
+"""Length of the record at the end of a zip archive without its comment, bytes."""
 MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP_START)
 HEAD_PATTERN = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
 TOKEN_PATTERN = re.compile(rb'["\\{}]')
@@ -61,7 +63,7 @@ class ShowFile:
 
 
 class MessageBuffer:
-    """Buffer of a stream, which returns the complete messages.
+    """Buffer that splits a stream of bytes into messages.
 
         buffer = MessageBuffer()
         for message in buffer.feed(received):
@@ -135,7 +137,7 @@ class MessageBuffer:
         return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest[10:]))
 
     def _read_message(self, head: re.Match[bytes]) -> Message | None:
-        """Return the text message at the front of the buffer."""
+        """Return the text message at the front of the buffer; None if it is incomplete."""
         buffer = self._buffer
         brace = buffer.find(b"{", head.end() - 1, MAX_TEXT)
         end = buffer.find(b"_EOF", head.end() - 1, MAX_TEXT)
@@ -150,7 +152,7 @@ class MessageBuffer:
         return message
 
     def _read_json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
-        """Return the message at the front of the buffer, whose JSON begins at ``brace``."""
+        """Return the message at the front of the buffer, with the JSON that begins at ``brace``."""
         buffer = self._buffer
         end = self._find_json_end(brace)
         if end is None:
@@ -197,10 +199,11 @@ class MessageBuffer:
         """Return the show at the front of the buffer: a zip archive, which ends with its directory, and then SKYC."""
         buffer = self._buffer
         while (zip_end := buffer.find(ZIP_END, self._scan_position)) >= 0:
-            if zip_end + 22 > len(buffer):
+            if zip_end + ZIP_END_SIZE > len(buffer):
                 self._scan_position = zip_end
                 break
-            end = zip_end + 22 + struct.unpack_from("<H", buffer, zip_end + 20)[0]
+            comment_length = struct.unpack_from("<H", buffer, zip_end + ZIP_END_SIZE - 2)[0]
+            end = zip_end + ZIP_END_SIZE + comment_length
             if buffer[end : end + 4] == b"SKYC":
                 content = bytes(buffer[:end])
                 self._discard_bytes(end + 4)

@@ -21,17 +21,17 @@ N_JOYSTICKS = 16
 class Gamepad:
     """Sticks of a gamepad, for ``Pilot(sticks=[Gamepad()])``.
 
-    The left stick climbs and turns, the right one flies forwards and sideways: mode 2 of model flying. Buttons call
-    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. The sticks of a gamepad that
-    is unplugged count as released until it is connected again.
+    The left stick climbs and turns, the right stick moves forwards and sideways: mode 2 of model flying. Buttons call
+    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. While the gamepad is unplugged, the
+    deflections are zero.
     """
 
     def __init__(self, number: int | None = None, glfw: Any = None):
         """Open a gamepad.
 
         Args:
-            number: Number of the GLFW joystick slot, 0 to 15; None for the first slot with a gamepad.
-            glfw: Module with the functions of GLFW; None for ``glfw``.
+            number: GLFW's number of the joystick, 0 to 15; None for the first joystick that is a gamepad.
+            glfw: Module to use in place of the package ``glfw``; None for that package.
 
         Raises:
             ConfigError: If no gamepad is connected.
@@ -82,13 +82,13 @@ class Gamepad:
 
 
 def remove_deadband(sticks: NDArray) -> NDArray:
-    """Return deflections without their dead band, stretched to -1 to 1 again; non-finite ones count as released."""
+    """Return deflections without their dead band, stretched to -1 to 1 again; non-finite deflections become zero."""
     finite_sticks = np.where(np.isfinite(sticks), sticks, 0.0)
     return np.sign(finite_sticks) * np.clip((np.abs(finite_sticks) - DEADBAND) / (1 - DEADBAND), 0.0, 1.0)
 
 
 def _import_glfw() -> Any:
-    import glfw  # comes with mujoco
+    import glfw  # is installed with mujoco
 
     with warnings.catch_warnings(action="ignore"):
         is_initialized = glfw.init()

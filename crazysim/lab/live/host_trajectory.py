@@ -27,7 +27,7 @@ class HostTrajectory(NamedTuple):
 
     @staticmethod
     def from_trajectory(trajectory: Trajectory) -> HostTrajectory:
-        """Return one trajectory on the host."""
+        """Return the trajectory in a record without leading axes."""
         ends, coefficients = (np.asarray(x, float) for x in (trajectory.ends, trajectory.coefficients))
         return HostTrajectory(ends, coefficients, bool(trajectory.repeats))
 
@@ -45,25 +45,28 @@ class HostTrajectory(NamedTuple):
         end = float(self.ends[-1])
         is_inside = t >= 0 and (self.repeats or t <= end)
         t = t % end if self.repeats and t > 0 else min(max(t, 0.0), end)
-        k = min(bisect_right(self.ends, t), len(self.ends) - 1)  # type: ignore[arg-type]
-        start = float(self.ends[k - 1]) if k else 0.0
-        length = float(self.ends[k]) - start
+        piece = min(bisect_right(self.ends, t), len(self.ends) - 1)  # type: ignore[arg-type]
+        start = float(self.ends[piece - 1]) if piece else 0.0
+        length = float(self.ends[piece]) - start
         u, rate = ((t - start) / length, 1 / length) if length > 0 else (1.0, 0.0)
         factors, exponents, orders = _derivative_terms(n, self.coefficients.shape[2])
         scale = (rate if is_inside else 0.0) ** orders
-        return (factors * u**exponents * scale[:, None]) @ self.coefficients[k].T
+        return (factors * u**exponents * scale[:, None]) @ self.coefficients[piece].T
 
 
 @lru_cache
 def _derivative_terms(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Return factors and exponents of the terms of a polynomial's derivatives, (n + 1, size) each, and their orders."""
+    """Return factors and exponents of the terms of a polynomial's derivatives, and the orders of these derivatives.
+
+    Factors and exponents have shape (n + 1, size), orders (n + 1,).
+    """
     orders, powers = np.arange(n + 1), np.arange(size)
     factors = np.array([[math.perm(k, j) for k in range(size)] for j in range(n + 1)], float)
     return factors, np.maximum(powers - orders[:, None], 0), orders
 
 
-def host_trajectories(trajectories: Trajectory | Sequence[Trajectory]) -> list[HostTrajectory]:
-    """Return the trajectories of a record, with or without a leading axis, or of a sequence of records, on the host."""
+def to_host_trajectories(trajectories: Trajectory | Sequence[Trajectory]) -> list[HostTrajectory]:
+    """Return the trajectories in a record, with or without a leading axis, or in a sequence of records, as a list."""
     if not isinstance(trajectories, Trajectory):
         return [HostTrajectory.from_trajectory(t) for t in trajectories]
     if np.ndim(trajectories.ends) == 1:

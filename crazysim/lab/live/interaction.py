@@ -23,7 +23,7 @@ class Interaction:
     sim: Sim
     """The simulation."""
     keyboard: Keyboard[Self]
-    """Keys that are held in a viewer."""
+    """Keys that are held in a viewer, and functions that keys call."""
     widgets: list[Widget]
     """Buttons and sliders that viewers show."""
     slider_values: dict[str, float]
@@ -35,7 +35,7 @@ class Interaction:
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""
     goals: NDArray | None
-    """Positions that viewers mark in place of those in state commands, m; None for none. (n_worlds, n_drones, 3)"""
+    """Positions that viewers mark, m; None to mark the positions in state commands. (n_worlds, n_drones, 3)"""
     quantities: dict[str, Callable[[Self], ArrayLike]]
     """Further quantities that viewers can plot, by name: functions of the loop that return numbers. (k,)"""
     on_click: Callable[[Self, int, NDArray], object] | None
@@ -133,7 +133,7 @@ class Interaction:
         Args:
             world: Index of the world.
             kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or a handle's name.
-            index: Number among the bodies of its kind.
+            index: Index of the body among the bodies of its kind.
         """
         if kind == DRONE:
             self.select(world, index)

@@ -19,7 +19,7 @@ KEY_NAMES = ("up", "down", "left", "right", "space", "tab", "backspace", "escape
 class Keyboard(Generic[L]):
     """Keys by name: a lower-case character, or one of ``KEY_NAMES``. Viewers press and release them from any thread.
 
-    ``L`` is the loop whose functions they call.
+    ``L`` is the type of the loop that the functions of keys are called with.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Keyboard(Generic[L]):
         self._pressed_keys.append(key)
 
     def hold(self, key: str, seconds: float) -> None:
-        """Hold a key for a while, s, for viewers that do not report its release; the key's function is not called."""
+        """Hold a key for a time, s, for viewers that do not report releases; the key's function is not called."""
         self._hold_times[key] = time.monotonic() + seconds
 
     def release(self, key: str) -> None:

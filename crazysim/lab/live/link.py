@@ -22,7 +22,7 @@ class Link(Protocol):
     """Name of the drone."""
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command to the drone, one of the arrays that ``sim.state_control``, ... take for each drone. (k,)"""
+        """Send a command to the drone: the array that ``sim.state_control``, ... take for one drone. (k,)"""
         ...
 
     def state(self) -> DroneState:
@@ -74,7 +74,7 @@ def fly_policy(
 ) -> list[DroneState]:
     """Fly a policy over a link, and return the states that it acted on.
 
-    Any exception, including Ctrl-C, stops the motors. After the last command they keep running.
+    Any exception, including Ctrl-C, stops the motors. After the last command the motors keep running.
 
     Args:
         link: Link to a simulated or a real drone.
@@ -103,8 +103,8 @@ def fly_policy(
 class TrainedPolicy:
     """A trained policy as a function of the state of a drone, for ``fly_policy``.
 
-    ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
-    The memory of a recurrent policy is kept between calls; call ``reset`` before a new flight.
+    ``crazysim.train.load_policy`` returns the policy and its ``meta``; ``meta["actions"]["level"]`` is the command
+    level. The memory of a recurrent policy is kept between calls; call ``reset`` before a new flight.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class TrainedPolicy:
 
         Args:
             policy: Function of the observations that returns an action from -1 to 1.
-            meta: Description of its inputs and outputs (``crazysim.train.export.describe``).
+            meta: Description of the policy's inputs and outputs (``crazysim.train.export.describe``).
             goal: Position to fly to, m. (3,)
         """
         self.policy, self.goal = policy, np.asarray(goal, float)
@@ -143,10 +143,10 @@ class TrainedPolicy:
         return self._centre + self._scale * np.clip(np.asarray(action, float), -1.0, 1.0)
 
     def _compute_observations(self, state: DroneState) -> dict[str, NDArray]:
-        rows = rotate(np.tile(state.quat, (3, 1)), np.eye(3)).T  # columns are the body's axes
+        rotation_matrix = rotate(np.tile(state.quat, (3, 1)), np.eye(3)).T
         return {
             "pos": state.pos,
-            "rot": rows.reshape(9),
+            "rot": rotation_matrix.reshape(9),
             "quat": state.quat,
             "vel": state.vel,
             "ang_vel": state.ang_vel,

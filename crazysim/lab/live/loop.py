@@ -33,7 +33,7 @@ MAX_SLEEP = 0.01
 WARNING_LATENESS = 0.02
 """Lateness of a control step above which a warning is logged, s."""
 WARNING_PERIOD = 10.0
-"""Shortest time between two such warnings, s."""
+"""Shortest time between two warnings of lateness, s."""
 
 V = TypeVar("V", bound="Viewer[Live]")
 log = logging.getLogger(__name__)
@@ -47,8 +47,8 @@ class Live(Interaction, Closeable):
             live.record("flight.journal")
             print(live.run(seconds=20))
 
-    The loop calls processes, timed events and requests of viewers between two steps, in one thread, so
-    that they may read and write ``live.sim``. Other threads use ``post``.
+    The loop calls processes, timed events and requests of viewers between two steps, in one thread. They may read and
+    write ``live.sim``; functions in other threads use ``post``.
     """
 
     step: int
@@ -96,8 +96,8 @@ class Live(Interaction, Closeable):
         self._viewers = Viewers[Live](fps, self.stop)
         self._recordings = Recordings(sim, control_freq)
         self._paused = self._is_stopped = self._in_step = False
-        self._n_refused = 0
-        self._factor_sample = (perf_counter(), 0, 0.0)
+        self._n_refused_requests = 0
+        self._factor_sample = (perf_counter(), 0, 0.0)  # wall-clock time, s; steps run until then; real-time factor
         self._may_warn = RateLimit(WARNING_PERIOD)
         for key, callback in KEY_CALLBACKS.items():
             self.keyboard.bind(key, callback)
@@ -160,7 +160,7 @@ class Live(Interaction, Closeable):
 
     @property
     def command(self) -> NDArray:
-        """Command of every drone, which processes write; every control step stages it after the first access.
+        """Commands of all drones, which processes write. From the first access on, every control step applies them.
 
         (n_worlds, n_drones, k)
         """
@@ -176,7 +176,8 @@ class Live(Interaction, Closeable):
         """Add a process: a function of the loop that is called before control steps, in the order of adding.
 
         Args:
-            process: Function; must not wait. Its method ``reset(live)``, if it has one, is called after resets.
+            process: Function; must not wait. If it has a method ``reset(live)``, this is called after a reset or a jump
+                backwards.
             freq: Rate of the calls in simulated time, Hz, a divisor of the rate of control steps; None for every
                 control step.
             name: Name in messages; None for the name of the function.
@@ -212,9 +213,9 @@ class Live(Interaction, Closeable):
     # Recording ------------------------------------------------------------------------------------------------------
 
     def record(self, path: str | Path, freq: float = 50.0) -> Path:
-        """Record poses from now on, and return the path of the file: a new one, numbered if ``path`` exists.
+        """Record poses into a new file from now on, and return its path, which has a number if ``path`` exists.
 
-        Each sample is written at once, so after a crash the file is complete up to that moment. Load it with
+        Each sample is written at once, so after a crash the file is complete up to the crash. Load it with
         ``crazysim.media.Flight.load``.
 
         Args:
@@ -236,7 +237,7 @@ class Live(Interaction, Closeable):
         self._recordings.close()
 
     def toggle_recording(self) -> None:
-        """Finish the present recording, or start one with the name of the last."""
+        """Finish the present recording, or start a new one, named like the last."""
         if self.is_recording:
             self.stop_recording()
         else:
@@ -264,7 +265,7 @@ class Live(Interaction, Closeable):
         jax.block_until_ready(self.sim.data.states.pos)
         wall_s = perf_counter() - start_time - paused_s
         simulated_s = (self.n_steps_run - first_step) * self._dt
-        failures = self._n_refused + self._viewers.failures + self._recordings.failures
+        failures = self._n_refused_requests + self._viewers.failures + self._recordings.failures
         n_pictures = self._viewers.n_pictures - first_picture
         return self._pace.report(self._processes, simulated_s, wall_s, n_pictures, failures)
 
@@ -274,10 +275,10 @@ class Live(Interaction, Closeable):
 
     @property
     def status(self) -> str:
-        """State of the loop for viewers: time, speed, pause, recording."""
-        now, (last_time, n_steps_run, factor) = perf_counter(), self._factor_sample
+        """Time, speed, pause and recording as text, for viewers."""
+        now, (last_time, last_n_steps, factor) = perf_counter(), self._factor_sample
         if now - last_time > 0.5:
-            factor = (self.n_steps_run - n_steps_run) * self._dt / (now - last_time)
+            factor = (self.n_steps_run - last_n_steps) * self._dt / (now - last_time)
             self._factor_sample = (now, self.n_steps_run, factor)
         parts = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
         parts += ["paused"] * self._paused + ["recording"] * self.is_recording
@@ -333,7 +334,7 @@ class Live(Interaction, Closeable):
             while self._posted_callbacks:
                 self._posted_callbacks.popleft()(self)
         except ConfigError as error:
-            self._n_refused += 1
+            self._n_refused_requests += 1
             log.warning("refused at %.2f s: %s", self.time, error)
 
     def _between_steps(self, callback: Callable[[Live], object]) -> None:

@@ -26,7 +26,7 @@ BIN_WIDTH = 1e-4
 SWITCH_INTERVAL = 5e-4
 """Time after which another Python thread yields to the loop, s."""
 N_BINS = 5000
-"""Number of bins of the statistics of lateness; the last one also holds everything above."""
+"""Number of bins of the statistics of lateness; the last bin also counts any greater lateness."""
 MAX_LISTED_PROCESSES = 3
 """Largest number of processes that a report lists."""
 
@@ -168,8 +168,8 @@ class Pace:
         total = self._counts.sum()
         if not total:
             return 0.0
-        k = int(np.searchsorted(np.cumsum(self._counts), fraction * total))
-        return min((k + 1) * BIN_WIDTH, self.max_lateness) if k < N_BINS - 1 else self.max_lateness
+        bin_index = int(np.searchsorted(np.cumsum(self._counts), fraction * total))
+        return min((bin_index + 1) * BIN_WIDTH, self.max_lateness) if bin_index < N_BINS - 1 else self.max_lateness
 
     def report(
         self, processes: Sequence[Process], simulated_s: float, wall_s: float, n_pictures: int, failures: int

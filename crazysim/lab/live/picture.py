@@ -35,7 +35,7 @@ class Picture:
     time: float
     """Simulated time since the last reset, s."""
     status: str
-    """State of the loop: time, speed, pause, recording."""
+    """Time, speed, pause and recording as text."""
     pos: NDArray
     """Positions of all mocap bodies, world frame, m. (n, n_mocap, 3)"""
     quat: NDArray
@@ -43,7 +43,7 @@ class Picture:
     drone_pos: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
-    """Goals of the loop, or else the positions in the state commands, world frame, m; empty if there are neither.
+    """Goals of the loop, or else the positions in the state commands, world frame, m; empty if there is neither.
     (n, n_drones or 0, 3)"""
     has_contact: NDArray
     """True where a drone touches something. (n, n_drones)"""
@@ -54,7 +54,7 @@ class Picture:
     selected: tuple[int, int] | None
     """World and index of the selected drone; None if no drone is selected."""
     followed: tuple[int, int] | None
-    """World and mocap id of the body that the camera follows; None if it follows none."""
+    """World and mocap id of the body that the camera follows; None if the camera follows no body."""
     followed_name: str
     """Name of the followed body; empty if there is none."""
     widget_lines: tuple[str, ...]
@@ -103,10 +103,10 @@ class PictureSource:
         has_contact = (
             np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drone_pos.shape[:2], bool)
         )
-        plotted = np.zeros(0)
+        plot_values = np.zeros(0)
         if plot and live.selected is not None:
             quantity_fn = live.quantities.get(plot)
-            plotted = (
+            plot_values = (
                 read_quantity(data, plot, *live.selected)
                 if quantity_fn is None
                 else np.ravel(np.asarray(quantity_fn(live), float))
@@ -128,7 +128,7 @@ class PictureSource:
             followed=None if body is None or followed is None else (followed[0], body.mocap),
             followed_name="" if body is None else body.name,
             widget_lines=live.widget_lines,
-            plot=plotted,
+            plot=plot_values,
         )
 
 

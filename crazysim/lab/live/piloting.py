@@ -23,12 +23,12 @@ is released or the drone is held back."""
 
 
 def keyboard_sticks(live: Live) -> NDArray:
-    """Return the deflections of the sticks that the arrow keys and W, S, A, D represent. (4,)"""
+    """Return the stick deflections for the arrow keys and W, S, A, D that are held. (4,)"""
     return np.array([live.keyboard.axis(*keys) for keys in STICK_KEYS])
 
 
 def move_setpoint(setpoint: ArrayLike, sticks: ArrayLike, dt: float, speed: float, yaw_rate: float) -> NDArray:
-    """Return a setpoint after the sticks have moved it for a while, in axes that turn with its yaw.
+    """Return a setpoint after the sticks have moved it for a time ``dt``, in axes that turn with its yaw.
 
     Args:
         setpoint: Position, world frame, m, and yaw, rad. (4,)
@@ -65,7 +65,8 @@ class Pilot:
         """Choose sticks and limits.
 
         Args:
-            sticks: Sources of deflections, whose sum is clipped to -1 to 1: ``keyboard_sticks``, a ``Gamepad``.
+            sticks: Functions that return deflections: ``keyboard_sticks``, a ``Gamepad``. Their sum is clipped to -1
+                to 1.
             speed: Speed at full deflection, m/s.
             yaw_rate: Yaw rate at full deflection, rad/s.
             low: Lower limits of the setpoint's position, world frame, m. (3,)
@@ -95,8 +96,8 @@ class Pilot:
     def go_to(self, live: Live, world: int, point: ArrayLike) -> None:
         """Move the setpoint of the selected drone, if it is in that world, above a point.
 
-        The setpoint keeps its height, but rises to at least 0.5 m and the lower limit. The state controllers limit
-        their position errors, so that the drone flies there without overturning.
+        The setpoint keeps its height, but rises to at least 0.5 m and the lower limit of the height. The state
+        controllers limit the position error that they correct, so the drone does not overturn on the way.
 
         Args:
             live: Loop.

@@ -50,12 +50,13 @@ class PolicyPilot:
         Args:
             env: Environment of the policy; its wrappers may only add images.
             policy: Trained policy, or any function from observations to actions.
-            points: Goals of every drone, one after another, world frame, m; None for the goal of the task. (n, 3)
+            points: Goals that every drone flies to one after another, world frame, m; None for the goal of the task.
+                (n, 3)
             seed: Random seed of the episode.
 
         Raises:
-            ConfigError: If there are points, and the task has no goals that can be set or a point lies outside of its
-                arena.
+            ConfigError: If ``points`` are given for a task without goals that can be set, or one of them lies outside
+                of the task's arena.
         """
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
@@ -80,7 +81,7 @@ class PolicyPilot:
             self.goals[:] = self._points[0]
             self._start_data = self._set_goal_fn(self._start_data, self.goals)
         env.sim.data = self._start_data
-        self._command_fn(self._start_data, self._memory)  # compiles it before the clock starts
+        self._command_fn(self._start_data, self._memory)  # compile before the clock starts
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
@@ -172,7 +173,7 @@ class PolicyPilot:
             raise ConfigError(f"{prefix}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
     def _pass_points(self, live: Live) -> None:
-        """Set the next listed goal of drones that are close to their present one."""
+        """Set the next listed goal for drones that are close to their present goal."""
         points: Any = self._points
         distance = np.linalg.norm(self.goals - np.asarray(live.sim.data.states.pos), axis=-1)
         is_near = self._follows_points & (distance < ARRIVAL_DISTANCE) & (self.n_passed < len(points))
@@ -184,7 +185,7 @@ class PolicyPilot:
 
 
 def typed_lines() -> Iterator[str]:
-    """Yield the lines of the standard input, for another thread."""
+    """Yield the lines of the standard input; for use in a thread."""
     # A daemon thread that waits in sys.stdin holds its lock when Python ends, which Python reports as a fatal error.
     with contextlib.suppress(OSError), open(0, closefd=False) as lines:
         yield from lines

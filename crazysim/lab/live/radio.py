@@ -44,7 +44,7 @@ class Radio(Closeable):
     | --- | --- | --- |
     | ``state`` | ``send_full_state_setpoint`` | position and velocity in steps of 1 mm and 1 mm/s |
     | ``attitude`` | ``send_setpoint``, absolute roll, pitch and yaw | thrust in 65535 steps up to the largest thrust |
-    | ``body_rate`` | ``send_setpoint`` with rates | the same |
+    | ``body_rate`` | ``send_setpoint`` with rates | thrust as for ``attitude`` |
     """
 
     def __init__(
@@ -62,9 +62,9 @@ class Radio(Closeable):
         Args:
             uri: URI of cflib, such as ``radio://0/80/2M/E7E7E7E701``.
             arm: True to connect, arm the drone and let commands be sent.
-            airframe: Airframe, whose largest thrust corresponds to full collective thrust.
+            airframe: Airframe; the largest thrust of its rotors corresponds to full thrust in a packet.
             period_ms: Time between two states, ms, a multiple of 10.
-            max_height: Largest height of a state command, m; higher ones are an error.
+            max_height: Largest height of a state command, m; a higher command is an error.
             crazyflie: ``cflib.crazyflie.Crazyflie``, or an object with its interface; None for a new one.
             timeout: Longest time until the first state arrives, s.
 
@@ -76,7 +76,7 @@ class Radio(Closeable):
         self._max_thrust = loaded_airframe.n_rotors * float(np.max(loaded_airframe.value("rotors.thrust_max")))
         self._lock, self._state_arrived = threading.Lock(), threading.Event()
         self._values = {part: np.zeros(len(names)) for part, names in LOG_VARIABLES.items()}
-        self._received_names: set[str] = set()
+        self._received_parts: set[str] = set()
         self._state_time, self._flight_mode = 0.0, None
         self._sync_crazyflie: Any = None
         self._log_configs: list[Any] = []
@@ -126,7 +126,7 @@ class Radio(Closeable):
             return DroneState(self._state_time, parts["pos"], quat, parts["vel"], parts["ang_vel"], parts["acc"])
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command: the numbers that ``sim.state_control``, ``attitude_control``, ``body_rate_control`` take."""
+        """Send a command of level state, (16,), attitude, (4,), or body rate, (4,), with the numbers for one drone."""
         level = Control(level)
         sizes = {Control.state: 16, Control.attitude: 4, Control.body_rate: 4}
         if level not in sizes:
@@ -154,7 +154,7 @@ class Radio(Closeable):
         commander.send_setpoint(roll, pitch, yaw if level == Control.attitude else -yaw, thrust)
 
     def send_pose(self, frame: Frame, body: str) -> None:
-        """Send a measured pose to the drone's estimator, as motion capture does."""
+        """Send the pose of a body, measured by motion capture, to the drone's estimator."""
         self._require_armed()
         if body not in frame.names:
             raise ConfigError(f"expected one of the bodies {list(frame.names)}, got {body!r}")
@@ -201,6 +201,6 @@ class Radio(Closeable):
                     x = np.array([data[name] for name in names])
                     if np.isfinite(x).all():
                         self._values[part], self._state_time = x, stamp / 1000
-                        self._received_names.add(part)
-        if len(self._received_names) == len(LOG_VARIABLES):
+                        self._received_parts.add(part)
+        if len(self._received_parts) == len(LOG_VARIABLES):
             self._state_arrived.set()

@@ -37,14 +37,14 @@ class Recordings:
         return self._recorder is not None
 
     def start(self, path: str | Path, period: int) -> Path:
-        """Finish the present recording, start another with its first sample, and return its path.
+        """Finish the present recording, start another, write its first sample, and return its path.
 
         Args:
-            path: Path; numbered if it exists, so that no earlier recording is lost.
+            path: Path; a number is added if it exists, so that no earlier recording is lost.
             period: Control steps from one sample to the next.
 
         Raises:
-            ConfigError: If it cannot be created.
+            ConfigError: If the file cannot be created.
         """
         self.close()
         self.last_path, unused_path = Path(path), free_path(Path(path))
@@ -77,6 +77,6 @@ class Recordings:
 
 
 def free_path(path: Path) -> Path:
-    """Return the path, or, if it exists, the first path with a number after its name that does not."""
+    """Return the path if it does not exist, else the first unused path with a number after its name."""
     candidates = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
     return path if not path.exists() else next(candidate for candidate in candidates if not candidate.exists())

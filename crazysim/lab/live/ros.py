@@ -103,7 +103,7 @@ class RosBridge:
                 raise ConfigError(f"expected one of the movable objects {list(names)}, got {name!r}")
         self._object_rows = {name: names.index(name) for name in objects}
         self._period, self._next_time = 1 / freq, 0.0
-        self._clock = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)
+        self._clock_publisher = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)
         message_types = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
         self._publishers = [
             {
@@ -139,37 +139,37 @@ class RosBridge:
         if now < self._next_time - 1e-9 and self._next_time - now <= self._period:
             return
         self._next_time = now + self._period
-        stamp = self._stamp(now)
+        stamp = self._make_stamp(now)
         clock = self.messages.Clock()
         clock.clock = stamp
-        self._clock.publish(clock)
+        self._clock_publisher.publish(clock)
         for k, publishers in enumerate(self._publishers):
             state = self.swarm.state(k)
-            publishers["pose"].publish(self._pose_message(stamp, state.pos, state.quat))
-            publishers["odom"].publish(self._odometry_message(stamp, state, self.swarm.names[k]))
-            publishers["imu"].publish(self._imu_message(stamp, state, self.swarm.names[k]))
+            publishers["pose"].publish(self._make_pose_message(stamp, state.pos, state.quat))
+            publishers["odom"].publish(self._make_odometry_message(stamp, state, self.swarm.names[k]))
+            publishers["imu"].publish(self._make_imu_message(stamp, state, self.swarm.names[k]))
         if self._object_rows:
             objects = self.swarm.sim.data.objects
             pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
             for name, row in self._object_rows.items():
-                self._object_publishers[name].publish(self._pose_message(stamp, pos[row], quat[row]))
+                self._object_publishers[name].publish(self._make_pose_message(stamp, pos[row], quat[row]))
 
     # Messages -------------------------------------------------------------------------------------------------------
 
-    def _stamp(self, now: float) -> Any:
+    def _make_stamp(self, now: float) -> Any:
         stamp = self.messages.Time()
         nanoseconds = round(now * 1e9)
         stamp.sec, stamp.nanosec = nanoseconds // 10**9, nanoseconds % 10**9
         return stamp
 
-    def _pose_message(self, stamp: Any, pos: NDArray, quat: NDArray) -> Any:
+    def _make_pose_message(self, stamp: Any, pos: NDArray, quat: NDArray) -> Any:
         message = self.messages.PoseStamped()
         message.header.stamp, message.header.frame_id = stamp, self.frame
         _write_fields(message.pose.position, pos)
         _write_fields(message.pose.orientation, quat)
         return message
 
-    def _odometry_message(self, stamp: Any, state: DroneState, name: str) -> Any:
+    def _make_odometry_message(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Odometry()
         message.header.stamp, message.header.frame_id, message.child_frame_id = stamp, self.frame, name
         _write_fields(message.pose.pose.position, state.pos)
@@ -178,7 +178,7 @@ class RosBridge:
         _write_fields(message.twist.twist.angular, state.ang_vel)
         return message
 
-    def _imu_message(self, stamp: Any, state: DroneState, name: str) -> Any:
+    def _make_imu_message(self, stamp: Any, state: DroneState, name: str) -> Any:
         message = self.messages.Imu()
         message.header.stamp, message.header.frame_id = stamp, name
         _write_fields(message.orientation, state.quat)
@@ -207,7 +207,7 @@ class RosBridge:
         if message.header.frame_id not in ("", self.frame):
             raise ConfigError(f"expected a pose in the frame {self.frame!r}, got {message.header.frame_id!r}")
         quat = _read_fields(message.pose.orientation, "xyzw")
-        self.swarm.commanders[drone].position(_read_fields(message.pose.position), _unit_rpy(quat)[2])
+        self.swarm.commanders[drone].position(_read_fields(message.pose.position), _normalized_rpy(quat)[2])
 
     def _set_thrust(self, drone: int, message: Any) -> None:
         thrust = float(message.data)
@@ -216,7 +216,7 @@ class RosBridge:
         self._thrust[drone] = thrust
 
     def _command_attitude(self, drone: int, message: Any) -> None:
-        rpy = _unit_rpy(_read_fields(message.quaternion, "xyzw"))
+        rpy = _normalized_rpy(_read_fields(message.quaternion, "xyzw"))
         self.swarm.commanders[drone].command(Control.attitude, [*rpy, self._thrust[drone]])
 
 
@@ -231,7 +231,7 @@ def _read_fields(part: Any, names: str = "xyz") -> NDArray:
     return np.array([getattr(part, name) for name in names], float)
 
 
-def _unit_rpy(quat: NDArray) -> NDArray:
+def _normalized_rpy(quat: NDArray) -> NDArray:
     """Return roll, pitch and yaw, rad, of a quaternion, xyzw, after it is normalized. (3,)"""
     norm = float(np.linalg.norm(quat))
     if not 1e-3 < norm < math.inf:

@@ -20,16 +20,16 @@ DRONE = "drone"
 MARK_RADIUS = 0.12
 """Radius of the sphere that marks a drone, and smallest radius of the spheres that mark other bodies, m."""
 MAX_TRAILS = 256
-"""Largest number of bodies of a world for which all have trails; with more bodies, only drones have them."""
+"""Largest number of bodies of a world for which all have trails; with more bodies, only drones have trails."""
 
 
 class SceneBody(NamedTuple):
-    """A body, which every world has."""
+    """A body that every world has."""
 
     kind: str
     """``"drone"``, or the name of the objects in the scene, such as ``"cars"``, ``"load"`` or a handle's name."""
     index: int
-    """Number among the bodies of its kind."""
+    """Index of the body among the bodies of its kind."""
     name: str
     """Name in viewers."""
     mocap: int
@@ -55,7 +55,7 @@ class SceneBodies:
             sim: Simulation.
             shapes: Visible geoms, for the sizes of the bodies.
         """
-        names = _mocap_names(sim)
+        names = _list_mocap_names(sim)
         parts = {part: base for plugin in sim.plugins.values() for part, base in _find_parts(plugin.moved_kinds or ())}
         counts = Counter(kind for kind, _ in names)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
@@ -72,7 +72,7 @@ class SceneBodies:
         self.owner = np.array([index_of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
         for mocap in np.flatnonzero(self.owner < 0):
             kind, k = names[mocap]
-            base = parts[kind]  # parts are in the order of their bodies, with the same number for each
+            base = parts[kind]  # parts are in the order of their bodies, equally many for each
             self.owner[mocap] = item_indices[base, k * counts[base] // counts[kind]]
         self.low, self.high = _bounding_boxes(len(names), shapes)
 
@@ -83,7 +83,7 @@ class SceneBodies:
         others = [body.mocap for body in self.items if body.kind != DRONE]
         return np.array(drones + (others if len(self.items) <= MAX_TRAILS else []), int)
 
-    def radius(self, mocap: int) -> float:
+    def mark_radius(self, mocap: int) -> float:
         """Return the radius of the mark around a body, m.
 
         Args:
@@ -98,7 +98,7 @@ class SceneBodies:
 
         Args:
             kind: Kind, see ``SceneBody``.
-            index: Number among the bodies of its kind.
+            index: Index of the body among the bodies of its kind.
         """
         match = next((body for body in self.items if (body.kind, body.index) == (kind, index)), None)
         if match is None:
@@ -113,8 +113,8 @@ def _list_drones(sim: Sim) -> list[tuple[str, int]]:
     return list(zip(sim.drone_names, np.asarray(sim.data.core.drone_mocap_ids).tolist(), strict=True))
 
 
-def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
-    """Return kind and number of every mocap body, by mocap id; a body of MJCF whose name has no number gets 0."""
+def _list_mocap_names(sim: Sim) -> list[tuple[str, int]]:
+    """Return kind and number of every mocap body, by mocap id; a body without a number in its name gets 0."""
     model = sim.mj_model
     names: list[tuple[str, int]] = [("", 0)] * model.nmocap
     for body in np.flatnonzero(model.body_mocapid >= 0):

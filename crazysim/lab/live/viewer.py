@@ -44,7 +44,7 @@ class Viewer(Generic[L]):
     """Base class of viewers. A loop of type ``L`` calls their methods in its own thread, so they must not block."""
 
     def open(self, live: L) -> None:
-        """Show the simulation of a loop from now on, with the widgets that it has.
+        """Show the simulation and the widgets of a loop from now on.
 
         Raises:
             CrazysimError: If this machine cannot show it.

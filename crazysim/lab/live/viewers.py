@@ -21,7 +21,7 @@ class Viewers(Generic[L]):
     """Time between two pictures, s."""
 
     n_pictures: int
-    """Number of pictures sent so far; one sent to several viewers counts once."""
+    """Number of pictures sent so far; a picture sent to several viewers counts once."""
     failures: int
     """Number of viewers that failed."""
     next_picture_time: float
@@ -37,12 +37,12 @@ class Viewers(Generic[L]):
         self.period = 1.0 / fps
         self.n_pictures = self.failures = 0
         self.next_picture_time = 0.0
-        self._open: list[Viewer[L]] = []
+        self._open_viewers: list[Viewer[L]] = []
         self._on_last_closed = on_last_closed
 
     def __bool__(self) -> bool:
         """Return True if a viewer is open."""
-        return bool(self._open)
+        return bool(self._open_viewers)
 
     def open(self, live: L, viewer: Viewer[L]) -> None:
         """Open a viewer.
@@ -51,17 +51,17 @@ class Viewers(Generic[L]):
             RenderError: If this machine cannot show it, or a port is in use.
         """
         viewer.open(live)
-        self._open.append(viewer)
+        self._open_viewers.append(viewer)
 
     def draw(self, live: L, due_time: float) -> bool:
-        """Send a picture to every viewer if one is due; return True if so.
+        """Send a picture to every viewer if ``due_time`` has come; return True if a picture was sent.
 
         Args:
             live: Loop.
-            due_time: Earliest time at which to send a picture, s, by ``time.perf_counter``.
+            due_time: Time from which on a picture is sent, s, by ``time.perf_counter``.
         """
         now = time.perf_counter()
-        if not self._open or now < due_time:
+        if not self._open_viewers or now < due_time:
             return False
         self.next_picture_time = max(self.next_picture_time + self.period, now - self.period)
         self.update(live)
@@ -69,7 +69,7 @@ class Viewers(Generic[L]):
 
     def update(self, live: L) -> None:
         """Send a picture to every viewer, and remove viewers that are closed or fail."""
-        for viewer in list(self._open):
+        for viewer in list(self._open_viewers):
             try:
                 if viewer.is_open:
                     viewer.update(live)
@@ -77,14 +77,14 @@ class Viewers(Generic[L]):
             except Exception as error:
                 self.failures += 1
                 log.warning("%s failed and is closed: %s", type(viewer).__name__, error)
-            self._open = [x for x in self._open if x is not viewer]  # viewers can be equal
+            self._open_viewers = [x for x in self._open_viewers if x is not viewer]  # "is": viewers may compare equal
             viewer.close()
-            if not self._open:
+            if not self._open_viewers:
                 self._on_last_closed()
-        self.n_pictures += bool(self._open)
+        self.n_pictures += bool(self._open_viewers)
 
     def close(self) -> None:
         """Close all viewers."""
-        for viewer in self._open:
+        for viewer in self._open_viewers:
             viewer.close()
-        self._open.clear()
+        self._open_viewers.clear()

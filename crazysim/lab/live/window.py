@@ -34,22 +34,23 @@ from crazysim.scene.visual_geoms import visual_geoms
 OPEN_TIMEOUT = 60.0
 """Longest time to wait for the window to open, s."""
 CLOSE_TIMEOUT = 3.0
-"""Longest time to wait for it to close, s."""
+"""Longest time to wait for the window to close, s."""
 LENGTH_PREFIX = struct.Struct("<Q")
-"""Length in front of each message to the process of the window."""
+"""Format of the length, bytes, in front of each message to the process of the window."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass
 class Window(Viewer[Live]):
-    """Viewer in a window, ``live.show(Window())``; show several for several views.
+    """Viewer in a window, ``live.show(Window())``; show several windows for several views.
 
-    The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
-    makes viewers follow it, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses,
-    a full stop makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [
-    and ] move the chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window is
-    drawn by a separate process, which skips pictures that it has no time for, and never delays the simulation.
+    The mouse turns, moves and zooms the view. A double click on a drone selects it. A double click on a vehicle, load
+    or object makes viewers follow it, and a double click on the ground calls ``live.on_click``. Keys go to
+    ``live.keyboard``: space pauses, a full stop makes a single step, backspace resets, tab selects the next drone, plus
+    and minus change the speed, [ and ] move the chosen slider, an apostrophe chooses the next slider, R records, escape
+    ends the run. A separate process draws the window. It skips pictures that it has no time for, and never delays the
+    simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -61,15 +62,15 @@ class Window(Viewer[Live]):
     camera: int | str = -1
     """Name or id of a camera; -1 is the free camera, which the mouse moves."""
     cam_config: Mapping[str, ArrayLike] | None = None
-    """Settings of the free camera at first: lookat, distance, azimuth, elevation."""
+    """Initial settings of the free camera: lookat, distance, azimuth, elevation."""
     follow: bool = False
     """True to let the free camera look at the followed body."""
     trail: float = 2.0
-    """Duration of trails, s; 0 for none."""
+    """Duration of the motion that trails show, s; 0 for no trails."""
     setpoints: bool = True
     """True to draw the goals of the loop, or else the positions of state commands."""
     contacts: bool = False
-    """True to mark drones that touch something, which is computed for every picture."""
+    """True to mark drones that touch something; contacts are then computed for every picture."""
     wind: bool = True
     """True to draw the wind at every drone."""
     plot: str = ""

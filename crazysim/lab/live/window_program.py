@@ -1,4 +1,4 @@
-"""The process of a window: draws pictures from its standard input, and writes the user's actions to its output."""
+"""Program of a window: it draws pictures from its standard input, and writes the user's actions to its output."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REDRAW_TIME = 0.03
 DOUBLE_CLICK_TIME = 0.35
 """Longest time between the clicks of a double click, s."""
 MAX_CLICK_MOVE = 0.01
-"""Largest movement of the cursor between these clicks, as a fraction of the window's size."""
+"""Largest movement of the cursor between the clicks of a double click, as a fraction of the window's size."""
 SETPOINT_RADIUS = 0.02
 """Radius of a setpoint's sphere, m."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
@@ -97,7 +97,7 @@ class Program:
             out: Stream to which the actions of the user are written.
 
         Raises:
-            RenderError: If it cannot be opened.
+            RenderError: If the window cannot be opened.
         """
         self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
         self._out = out
@@ -150,7 +150,7 @@ class Program:
             self._report_click(picture, self.window.pick(n, lambda k: self._compose_tile(picture, k)))
 
     def _compose_tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
-        """Return the state of the k-th world, and its overlays."""
+        """Return the state of the k-th shown world, and its overlays."""
         data, overlays, settings = self._data, self._overlays, self._settings
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
         mujoco.mj_kinematics(self._model, data)
@@ -175,7 +175,7 @@ class Program:
                 drones[is_lit], np.insert(picture.lights[k, is_lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0
             )
         if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
-            followed_pos, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
+            followed_pos, radius = picture.pos[k, picture.followed[1]], self._bodies.mark_radius(picture.followed[1])
             overlays.points(followed_pos[None], FOLLOWED_COLOR, radius)
             overlays.label(_ascii(picture.followed_name), followed_pos + [0.0, 0.0, radius])
         text = picture.status if k == 0 else ""
@@ -202,7 +202,7 @@ class Program:
         return is_double
 
     def _report_click(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
-        """Write which body, or which point, was clicked."""
+        """Write which body or point was clicked; ``hit`` is a tile, a geom id and a point, world frame, m."""
         if hit is None:
             return
         k, geom, point = hit
@@ -234,12 +234,12 @@ def main() -> int:
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # output of libraries must not reach the simulation
     stream = sys.stdin.buffer
-    start = read_message(stream)
-    if start is None:
+    setup = read_message(stream)
+    if setup is None:
         return 1
-    model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": start["model"]})
+    model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": setup["model"]})
     try:
-        program = Program(model, start["bodies"], start["settings"], out)
+        program = Program(model, setup["bodies"], setup["settings"], out)
     except RenderError as error:
         print(error, file=sys.stderr)
         return 2

@@ -13,13 +13,14 @@ from crazysim.storage import ZipReader, wrap_read_errors, write_file
 from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
-"""Most files of an archive: four for each of 5,000 drones, Skybrush's limit, and the show's own."""
+"""Largest number of files in an archive: four for each of 5,000 drones, Skybrush's limit, and 100 for the show."""
 MAX_MEMBER_BYTES = 16 * 2**20
 """Largest file of an archive that is unpacked, bytes."""
 MAX_TOTAL_BYTES = 512 * 2**20
-"""Most bytes that may be unpacked from an archive."""
+"""Largest number of bytes that may be unpacked from an archive."""
 MIN_TOTAL_BYTES, MAX_RATIO = 64 * 2**20, 100
-"""Bytes that may be unpacked from any archive, and the multiple of its size that may be unpacked from a larger one."""
+"""Number of bytes that may be unpacked from any archive; larger archives may be unpacked to this multiple of their
+size."""
 MAX_CHAIN = 8
 """Longest chain of references."""
 REMEDY = "Export it again, or use another copy."
@@ -37,7 +38,7 @@ class Archive:
             location: Name of the file, for messages.
 
         Raises:
-            ConfigError: If it has too many files.
+            ConfigError: If the archive has too many files.
             DamagedFileError: If the file is not a zip archive.
         """
         self.location = location
@@ -50,8 +51,8 @@ class Archive:
         """Return the contents of a JSON file of the archive.
 
         Raises:
-            ConfigError: If it is missing, too large, or not JSON.
-            DamagedFileError: If it cannot be unpacked.
+            ConfigError: If the JSON file is missing, too large, or not JSON.
+            DamagedFileError: If the JSON file cannot be unpacked.
         """
         if name in self._parsed:
             return self._parsed[name]
@@ -63,7 +64,9 @@ class Archive:
         return self._parsed[name]
 
     def resolve(self, value: Any, location: str) -> tuple[Any, str]:
-        """Return a value, or the contents of the file it refers to by ``{"$ref": "./name#"}``, and its location.
+        """Return a value and its location, or the contents and location of the file that the value refers to.
+
+        A reference is ``{"$ref": "./name#"}``.
 
         Raises:
             ConfigError: If the file is missing, or references form a cycle or a chain that is too long.

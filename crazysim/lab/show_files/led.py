@@ -14,12 +14,12 @@ import numpy as np
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files.lights import Lights
 
-TICK_DURATION = 0.02
-"""Unit of durations, s."""
+TIME_UNIT = 0.02
+"""Unit of times and durations, s."""
 MAX_BYTES = 2**20
 """Longest program, bytes."""
 MAX_REPEATED_COMMANDS = 200_000
-"""Most commands that the loops and jumps of a program may repeat."""
+"""Largest number of commands that the loops and jumps of a program may repeat."""
 MAX_LOOPS = 4
 """Deepest nesting of loops, libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
 MAX_VARINT = 2**28 - 1
@@ -50,7 +50,7 @@ def decode_lights(
         program: Byte code, or its base64 form as in ``lights.json``.
         until: Time at which the program is stopped, s; endless loops end there.
         location: File and location in it, for messages.
-        max_repeated: Most commands that loops and jumps may repeat.
+        max_repeated: Largest number of commands that loops and jumps may repeat.
 
     Raises:
         ConfigError: If the program is malformed: an unknown command, a missing argument, a jump to nowhere, loops that
@@ -64,7 +64,7 @@ def decode_lights(
     if len(program) > MAX_BYTES:
         raise ConfigError(f"expected at most {MAX_BYTES} bytes in {location}, got {len(program)}")
     machine = _Machine(program, location)
-    machine.run(round(until / TICK_DURATION), len(program) + max_repeated)
+    machine.run(round(until / TIME_UNIT), len(program) + max_repeated)
     return machine.lights()
 
 
@@ -73,7 +73,7 @@ class _Machine:
 
     def __init__(self, code: bytes, location: str):
         self.code, self.location, self.address = code, location, 0
-        self.now = self.origin = 0  # in ticks
+        self.now = self.origin = 0  # in units of TIME_UNIT
         self.color = BLACK
         self.loops: list[tuple[int, int]] = []  # address of the body, iterations left; 0 for endless
         self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]
@@ -99,11 +99,11 @@ class _Machine:
                 return value
 
     def run(self, end: int, max_commands: int) -> None:
-        """Run until the program ends, or until the time exceeds ``end``, ticks."""
+        """Run until the program ends, or until the time exceeds ``end``, in units of ``TIME_UNIT``."""
         for _ in range(max_commands):
             if self.address >= len(self.code) or self.now > end or not self.run_command(self.read_byte()):
                 return
-        self.raise_error(f"a program that runs at most {max_commands} commands in {end * TICK_DURATION:g} s", "more")
+        self.raise_error(f"a program that runs at most {max_commands} commands in {end * TIME_UNIT:g} s", "more")
 
     def run_command(self, code: int) -> bool:
         """Run one command; return False at the end of the program."""
@@ -174,10 +174,10 @@ class _Machine:
         self.loops.clear()
 
     def lights(self) -> Lights:
-        """Return the lights so far; of pieces that begin at the same time, only the last counts."""
+        """Return the lights so far; of pieces that begin at the same time, only the last is used."""
         piece_colors = {start: (a, b) for start, a, b in self.pieces}
         starts, colors = list(piece_colors), np.array(list(piece_colors.values()), float) / 255
-        return Lights.of_pieces(TICK_DURATION * np.array(starts), colors[:, 0], colors[:, 1])
+        return Lights.of_pieces(TIME_UNIT * np.array(starts), colors[:, 0], colors[:, 1])
 
 
 def encode_lights(lights: Lights) -> bytes:
@@ -189,30 +189,30 @@ def encode_lights(lights: Lights) -> bytes:
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if times.ndim != 1:
         raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
-    ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK_DURATION), 0).astype(int)
+    unit_times = np.maximum(np.round((times - min(times[0], 0.0)) / TIME_UNIT), 0).astype(int)
     start_colors, end_colors = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
     code = bytearray()
     color = None
-    if ticks[0] > 0:
-        code += _color_command(SET_COLOR, start_colors[0], ticks[0])
-    for k, start in enumerate(ticks):
-        duration = ticks[k + 1] - start if k + 1 < len(ticks) else 0
-        if k + 1 < len(ticks) and not duration:
-            continue  # padding, or a piece shorter than a tick
+    if unit_times[0] > 0:
+        code += _encode_color(SET_COLOR, start_colors[0], unit_times[0])
+    for k, start in enumerate(unit_times):
+        duration = unit_times[k + 1] - start if k + 1 < len(unit_times) else 0
+        if k + 1 < len(unit_times) and not duration:
+            continue  # padding, or a piece shorter than a unit of time
         is_fade = duration and not np.array_equal(start_colors[k], end_colors[k])
         if is_fade:
             if color is None or not np.array_equal(color, start_colors[k]):
-                code += _color_command(SET_COLOR, start_colors[k], 0)
-            code += _color_command(FADE_TO_COLOR, end_colors[k], duration)
+                code += _encode_color(SET_COLOR, start_colors[k], 0)
+            code += _encode_color(FADE_TO_COLOR, end_colors[k], duration)
             color = end_colors[k]
         else:
-            code += _color_command(SET_COLOR, start_colors[k], duration)
+            code += _encode_color(SET_COLOR, start_colors[k], duration)
             color = start_colors[k]
     code.append(END)
     return bytes(code)
 
 
-def _color_command(code: int, color: np.ndarray, duration: int) -> bytes:
+def _encode_color(code: int, color: np.ndarray, duration: int) -> bytes:
     """Return the shortest command that sets, or fades to, a colour."""
     red, green, blue = (int(x) for x in color)
     if (red, green, blue) == BLACK:
@@ -229,7 +229,7 @@ def _color_command(code: int, color: np.ndarray, duration: int) -> bytes:
 def _encode_varint(value: int) -> bytes:
     if value > MAX_VARINT:
         raise ConfigError(
-            f"expected durations of at most {MAX_VARINT * TICK_DURATION:g} s, got {value * TICK_DURATION:g} s. "
+            f"expected durations of at most {MAX_VARINT * TIME_UNIT:g} s, got {value * TIME_UNIT:g} s. "
             "Split longer pieces."
         )
     code = bytearray()

@@ -21,11 +21,11 @@ class Lights(PyTree):
     """
 
     times: Array = leaf("shared", 1)
-    """Start of each piece, s, ascending. Padding repeats the last one. (n_pieces,)"""
+    """Start of each piece, s, ascending. Padding repeats the last piece. (n_pieces,)"""
     starts: Array = leaf("shared", 2)
     """Colour where each piece begins, red, green and blue, 0 to 1. (n_pieces, 3)"""
     ends: Array = leaf("shared", 2)
-    """Colour that each piece approaches at the start of the next; ``starts`` where it is constant. (n_pieces, 3)"""
+    """Colour that each piece fades to until the next piece begins; ``starts`` for constant pieces. (n_pieces, 3)"""
 
     @staticmethod
     def of_pieces(times: ArrayLike, starts: ArrayLike, ends: ArrayLike | None = None) -> Lights:
@@ -34,8 +34,8 @@ class Lights(PyTree):
         Args:
             times: Start of each piece, s, ascending. (n_pieces,)
             starts: Colour where each piece begins, 0 to 1. (n_pieces, 3)
-            ends: Colour that each piece fades to until the next begins; None for constant colours. The last piece is
-                constant in any case. (n_pieces, 3)
+            ends: Colour that each piece fades to until the next piece begins; None for constant colours. The last piece
+                is constant in any case. (n_pieces, 3)
         """
         t, a = np.asarray(times, float), np.asarray(starts, float)
         b = a.copy() if ends is None else np.array(ends, float)
@@ -73,7 +73,7 @@ class Lights(PyTree):
         return jax.tree.map(lambda *leaves: np.stack([pad(x) for x in leaves]), *lights)
 
     def evaluate(self, t: ArrayLike) -> Array:
-        """Return the colour of one drone at one time, 0 to 1; where two pieces meet, the later one counts.
+        """Return the colour of one drone at one time, 0 to 1; where two pieces meet, the colour of the later piece.
 
         Args:
             t: Time, s. ()

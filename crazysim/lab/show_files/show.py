@@ -75,7 +75,7 @@ class Show:
                 f"expected one or more drones with different names, got {list(self.names)[:10]}. Rename those that "
                 "repeat."
             )
-        start, end = self._points(0.0), self._points(self.duration)
+        start, end = self._end_points(0.0), self._end_points(self.duration)
         defaults = {
             "homes": start[:, :3],
             "landings": end[:, :3],
@@ -116,7 +116,7 @@ class Show:
         """Return a copy with the given fields replaced."""
         return dataclasses.replace(self, **changes)
 
-    def _points(self, time: float) -> NDArray:
+    def _end_points(self, time: float) -> NDArray:
         """Return the position, m, and yaw, rad, of every drone at an end of its trajectory. (n_drones, 4)
 
         Args:

@@ -15,9 +15,11 @@ from crazysim.trajectories.splines import trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 ENCODINGS = ("COMPRESSED", "POLY4D")
+"""Formats in which a Crazyflie receives a trajectory."""
 MAX_DEGREE = 7
+"""Highest degree of a curve."""
 COEFFICIENT_TOLERANCE = 1e-6
-"""Size of coefficients that a file omits, m or rad."""
+"""Largest coefficient that may be left out to lower the degree of a curve, m or rad."""
 
 
 def parse_trajectory(value: object, location: str, yaw_control: object = None) -> tuple[Trajectory, str]:
@@ -76,16 +78,16 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
         checks.raise_error(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", location)
     first_curve = curves[0][:1] if curves else np.asarray(last_point)[None]
     ends = [takeoff + t for t in times[1:]]
-    if start >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
+    if start >= checks.MIN_LENGTH or not curves:  # a shorter rest is added to the first curve
         ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first_curve, *curves]
-    return _trajectory_of_curves(np.array(ends), curves, yaw_control, location), encoding
+    return _make_trajectory(np.array(ends), curves, yaw_control, location), encoding
 
 
 def _is_point(point: object) -> TypeGuard[list[Any]]:
     return isinstance(point, list) and 2 <= len(point) <= 3 and isinstance(point[1], list)
 
 
-def _trajectory_of_curves(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
+def _make_trajectory(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
     """Return the trajectory of Bezier curves."""
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
@@ -136,12 +138,12 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
     c = c if yaw else c[:, :3]
     require_no_jumps(ends, c)
-    digits = np.asarray(trajectory.coefficients).dtype
+    dtype = np.asarray(trajectory.coefficients).dtype
 
     def format_point(point: NDArray) -> list[float]:
         point = np.array(point)
         point[3:] = np.rad2deg(point[3:])
-        return [float(str(x)) for x in point.astype(digits)]
+        return [float(str(x)) for x in point.astype(dtype)]
 
     points: list[Any] = [[0.0, format_point(c[0, :, 0]), []]]
     for end, axes in zip(ends, c, strict=True):

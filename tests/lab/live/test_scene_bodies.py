@@ -51,9 +51,9 @@ def test_parts_belong_to_their_bodies(sim, bodies):
 def test_bodies_have_boxes_radii_and_trails(bodies):
     gate, drone = bodies.find("ball_gate", 0).mocap, bodies.find("drone", 0).mocap
     np.testing.assert_allclose([bodies.low[gate], bodies.high[gate]], [[-0.1, -0.2, -0.3], [0.1, 0.2, 0.3]], atol=1e-6)
-    assert bodies.radius(gate) == pytest.approx(np.sqrt(0.01 + 0.04 + 0.09))
-    assert bodies.radius(drone) == MARK_RADIUS
-    assert bodies.radius(bodies.find("load", 0).mocap) >= MARK_RADIUS
+    assert bodies.mark_radius(gate) == pytest.approx(np.sqrt(0.01 + 0.04 + 0.09))
+    assert bodies.mark_radius(drone) == MARK_RADIUS
+    assert bodies.mark_radius(bodies.find("load", 0).mocap) >= MARK_RADIUS
     assert len(bodies.trail_mocap_ids) == len(bodies.items)
     assert bodies.trail_mocap_ids[:2].tolist() == [bodies.items[0].mocap, bodies.items[1].mocap]
 

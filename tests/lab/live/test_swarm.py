@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from crazysim import Sim
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.lab.live.host_trajectory import HostTrajectory, host_trajectories
+from crazysim.lab.live.host_trajectory import HostTrajectory, to_host_trajectories
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
 from crazysim.lab.live.swarm.motion import PlannedMotion, nearest_yaw, plan_move
@@ -58,19 +58,19 @@ def test_a_reversed_slow_plan():
     np.testing.assert_allclose(
         plan.evaluate(5.0)[2], (plan.evaluate(5.01)[1] - plan.evaluate(4.99)[1]) / 0.02, atol=1e-5
     )
-    assert not plan.finished(8.9)
-    assert plan.finished(9.0)
+    assert not plan.has_ended(8.9)
+    assert plan.has_ended(9.0)
 
 
 def test_paths_equal_trajectories():
     trajectories = [circle(radius=0.5, period=3.0), minimum_snap([[0, 0, 1], [1, 0, 2], [2, 1, 1]], [1.0, 2.0])]
-    for path, trajectory in zip(host_trajectories(trajectories), trajectories, strict=True):
+    for path, trajectory in zip(to_host_trajectories(trajectories), trajectories, strict=True):
         for t in (-1.0, 0.0, 0.7, 1.0, 2.9, 4.1):
             s = trajectory.evaluate(t)
             expected = [[*s.pos, *s.yaw], [*s.vel, *s.yaw_rate], [*s.acc, *s.yaw_acc]]
             np.testing.assert_allclose(path.derivatives(t, 2), expected, atol=2e-3)
-    assert len(host_trajectories(Trajectory.stack(trajectories))) == 2
-    assert len(host_trajectories(trajectories[0])) == 1
+    assert len(to_host_trajectories(Trajectory.stack(trajectories))) == 2
+    assert len(to_host_trajectories(trajectories[0])) == 1
 
 
 def test_the_nearest_yaw():

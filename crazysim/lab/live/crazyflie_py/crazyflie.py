@@ -33,7 +33,7 @@ class TimeHelper:
         self.node.sleep(duration)
 
     def sleepForRate(self, rateHz: float) -> None:
-        """Wait at the end of a loop so that it runs at a rate, Hz."""
+        """Wait until the next iteration of a loop that runs at a rate, Hz."""
         if self.nextTime is None or self.rateHz != rateHz:
             self.rateHz, self.nextTime = rateHz, self.time() + 1 / rateHz
         self.sleep(max(self.nextTime - self.time(), 0.0))
@@ -144,10 +144,10 @@ class Crazyflie:
         return {"position": state.pos.copy(), "orientation": state.quat.copy()}
 
     def get_status(self) -> dict[str, Any]:
-        """Return name, time, bits of the supervisor, battery voltage, V, state of the power management and radio.
+        """Return name, time, supervisor bits, battery voltage, V, battery state, signal strength and packet counts.
 
-        The battery's values come from the plugin ``Battery``; without it the battery is never empty. There is no radio:
-        the signal is perfect, and no packets are counted.
+        The battery's values are those of the plugin ``Battery``; without it the battery is never empty. There is no
+        radio: the signal is perfect, and no packets are counted.
         """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
@@ -164,7 +164,7 @@ class Crazyflie:
         }
 
     def _run_command(self, command: Callable[[Commander], object], group: int = 0) -> None:
-        """Run a function of the commander; a refused command is reported and the drone continues, as over radio."""
+        """Call a function with the commander if the drone is in a group; refused commands are reported, not raised."""
         with self._swarm.lock:
             if not self._commander.in_group(group):
                 return
@@ -178,11 +178,11 @@ class CrazyflieServer:
     """All drones of a swarm, and commands to all of them."""
 
     crazyflies: list[Crazyflie]
-    """Drones, in their order."""
+    """Drones, in the order of the swarm."""
     crazyfliesByName: dict[str, Crazyflie]
     """Drones by name."""
     crazyfliesById: dict[int, Crazyflie]
-    """Drones by the number at the end of their names, or else by their position in the order, from 1 on."""
+    """Drones by the number at the end of their names; a name without a number gets its position from 1 on."""
 
     def __init__(self, swarm: Swarm):
         self._swarm = swarm

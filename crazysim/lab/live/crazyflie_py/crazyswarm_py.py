@@ -1,4 +1,4 @@
-"""Entry of Crazyswarm2 scripts: the swarm, its clock and its drones."""
+"""Entry point of Crazyswarm2 scripts: the swarm, its clock and its drones."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def use(swarm: Swarm | None) -> None:
 class Crazyswarm:
     """The swarm of a script: ``allcfs`` with the drones, and ``timeHelper`` with the clock.
 
-    Without an argument it flies the swarm of ``use``, or the drones of ``crazyflies.yaml`` in the working directory, or
-    one drone.
+    Without an argument it flies the swarm passed to ``use``, else the drones of ``crazyflies.yaml`` in the working
+    directory, else one drone.
     """
 
     allcfs: CrazyflieServer
@@ -57,7 +57,7 @@ class Crazyswarm:
 
 
 def _create_simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, list[str]]:
-    """Return the simulation and the names of a configuration's enabled robots."""
+    """Return a simulation of the enabled robots in a configuration, and their names."""
     if isinstance(configuration, (str, Path)):
         try:
             import yaml
@@ -70,15 +70,16 @@ def _create_simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[S
         except (OSError, yaml.YAMLError) as error:
             raise ConfigError(f"expected a crazyflies.yaml, got {str(configuration)!r}: {error}") from error
     robots = (configuration or {}).get("robots", {"cf1": {"initial_position": [0.0, 0.0, 0.0]}})  # type: ignore[union-attr]
-    enabled = {name: robot for name, robot in robots.items() if robot.get("enabled", True)}
+    enabled_robots = {name: robot for name, robot in robots.items() if robot.get("enabled", True)}
     try:
-        home = np.array([robot["initial_position"] for robot in enabled.values()], float).reshape(len(enabled), 3)
+        initial_pos = np.array([robot["initial_position"] for robot in enabled_robots.values()], float)
+        initial_pos = initial_pos.reshape(len(enabled_robots), 3)
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"expected initial_position of three numbers for every robot, got {error!r}") from error
-    if not enabled or not np.isfinite(home).all():
-        raise ConfigError(f"expected at least one enabled robot at finite positions, got {home.tolist()}")
-    sim = Sim(n_drones=len(enabled), control="state")
+    if not enabled_robots or not np.isfinite(initial_pos).all():
+        raise ConfigError(f"expected at least one enabled robot at finite positions, got {initial_pos.tolist()}")
+    sim = Sim(n_drones=len(enabled_robots), control="state")
     states = sim.data.states
-    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[0].set(home)))
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[0].set(initial_pos)))
     sim.build_default_data()
-    return sim, list(enabled)
+    return sim, list(enabled_robots)

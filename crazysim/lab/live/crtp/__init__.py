@@ -1,7 +1,7 @@
 """Simulated Crazyflies that speak CRTP, the protocol of ``cflib``: scripts run unchanged, except for the URI.
 
-``CrtpServer`` answers on UDP, which ``cflib`` reaches by ``udp://127.0.0.1:19850``, from any process.
-``add_cflib_driver`` adds ``sim://`` to ``cflib`` within this one.
+``CrtpServer`` answers on UDP: ``cflib`` in any process connects to ``udp://127.0.0.1:19850``. ``add_cflib_driver`` adds
+``sim://`` to ``cflib`` in the present process.
 """
 
 from crazysim.lab.live.crtp.device import CrtpDevice

@@ -1,4 +1,4 @@
-"""A simulated Crazyflie as cflib sees it: it answers packets, and sends logs and console text by itself.
+"""A simulated Crazyflie for cflib: it answers packets, and sends logs and console text by itself.
 
 Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a header
 byte with port and channel, then up to 30 bytes of data. Malformed packets are reported and ignored.
@@ -35,7 +35,7 @@ PROTOCOL_VERSION = 12
 MAX_DATA_BYTES = 30
 """Largest number of bytes after the header."""
 MAX_LOG_BLOCKS, MAX_LOG_VARIABLES = 16, 128
-"""Largest numbers of log blocks and of their variables (``Log`` of cflib)."""
+"""Largest number of log blocks, and of the variables in all of them together (``Log`` of cflib)."""
 MAX_LOG_BYTES = 26
 """Largest number of bytes of the values of a log block."""
 MEMORY_SIZE = 4096
@@ -58,10 +58,10 @@ Packet = tuple[int, int, bytes]
 
 @dataclass
 class LogBlock:
-    """Variables that are sent together."""
+    """Log variables that are sent together in one packet."""
 
     variables: list[tuple[int, str]]
-    """Number in the table, and format, of each variable."""
+    """Number in the table of log variables, and format of ``struct``, of each variable."""
     period: float | None = None
     """Time between two packets, s; None while the block is stopped."""
     next_time: float = 0.0
@@ -147,6 +147,7 @@ class CrtpDevice:
         return packets
 
     def _pack_value(self, k: int, struct_format: str, state: object) -> bytes:
+        """Return the value of the k-th log variable as bytes; NaN if it cannot be computed."""
         name = self.log.variables[k].name
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
@@ -223,9 +224,9 @@ class CrtpDevice:
         if channel == 1 and data[0] == 0:
             self.commander.notify_setpoints_stop(struct.unpack("<I", data[1:5])[0] / 1000)
         elif channel == 0 and data[0] == 11:
-            roll, pitch, yaw_rate, thrust, rates = struct.unpack("<fffHB", data[1:])
+            roll, pitch, yaw_rate, thrust, is_rate_mode = struct.unpack("<fffHB", data[1:])
             angles = _radians(roll, -pitch, yaw_rate)
-            if rates:
+            if is_rate_mode:
                 self.commander.command(Control.body_rate, [*angles, self._collective_thrust(thrust)])
             else:
                 self.commander.attitude(*angles, self._collective_thrust(thrust))

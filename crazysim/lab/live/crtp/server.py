@@ -1,4 +1,4 @@
-"""CRTP over UDP: one port for each drone, which ``cflib`` reaches by ``udp://127.0.0.1:19850`` and the ports after it.
+"""CRTP over UDP, with one port for each drone: ``cflib`` connects to ``udp://127.0.0.1:19850`` and the ports after it.
 
 The protocol has no passwords, so the server binds to this machine only unless another address is given.
 """
@@ -17,7 +17,7 @@ from crazysim.lab.live.swarm import Swarm
 from crazysim.storage import Closeable
 
 PORT = 19850
-"""First port; cflib scans ten from here on."""
+"""First port; cflib scans ten ports from this one on."""
 POLL_INTERVAL = 0.1
 """Longest time until the thread ends after ``close``, s."""
 
@@ -33,10 +33,10 @@ class CrtpServer(Closeable):
         Args:
             swarm: Swarm. The server does not advance it; use ``swarm.start()``, for example.
             host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
-            port: Port of the first drone; 0 for any free ones.
+            port: Port of the first drone; 0 for any free ports.
 
         Raises:
-            ConfigError: If it cannot listen there.
+            ConfigError: If it cannot listen at one of the ports.
         """
         if host not in ("127.0.0.1", "localhost"):
             log.warning("listening at %s: every machine of that network can fly the drones", host)

@@ -20,11 +20,11 @@ N_CONTROL_POINTS = (0, 1, 3, 7)
 
 
 def handle_generic(commander: Commander, data: bytes) -> None:
-    """Carry out a packet of the generic commander: its type, then numbers (crtp_commander_generic.c).
+    """Carry out the data of a packet to the generic commander: a type, then numbers (crtp_commander_generic.c).
 
     Raises:
-        ConfigError: If the commander refuses it, or the type is not supported.
-        struct.error: If its length is wrong.
+        ConfigError: If the commander refuses the command, or the type is not supported.
+        struct.error: If the data have a wrong length.
     """
     kind, content = data[0], data[1:]
     if kind == 0:
@@ -48,7 +48,7 @@ def handle_generic(commander: Commander, data: bytes) -> None:
 
 
 def unpack_quat(packed: int) -> NDArray:
-    """Return a quaternion, xyzw, from 32 bits: index of the largest component, then 10 bits for each other one. (4,)"""
+    """Return a quaternion, xyzw, from 32 bits: the index of its largest component, then 10 bits for each other. (4,)"""
     largest, quat = packed >> 30, np.zeros(4)
     for i in (i for i in (3, 2, 1, 0) if i != largest):
         magnitude = (packed & 0x1FF) / 0x1FF / math.sqrt(2)
@@ -59,11 +59,11 @@ def unpack_quat(packed: int) -> NDArray:
 
 
 def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
-    """Carry out a packet of the high-level commander: its type, then numbers (crtp_commander_high_level.c).
+    """Carry out the data of a packet to the high-level commander: a type, then numbers (crtp_commander_high_level.c).
 
     Raises:
-        ConfigError: If the commander refuses it, or the type is not supported.
-        struct.error: If it has a wrong length.
+        ConfigError: If the commander refuses the command, or the type is not supported.
+        struct.error: If the data have a wrong length.
     """
     kind, content = data[0], data[1:]
     if kind == 0:
@@ -114,7 +114,7 @@ def _polynomial_trajectory(memory: bytes, offset: int, n_pieces: int) -> HostTra
     with np.errstate(invalid="ignore"):  # NaN is refused below
         numbers = np.frombuffer(memory, "<f4", 33 * n_pieces, offset).astype(float).reshape(n_pieces, 33)
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n_pieces, 4, 8)
-    _require_durations(durations)
+    _check_durations(durations)
     with np.errstate(over="ignore", invalid="ignore"):
         return _create_trajectory(durations, c * durations[:, None, None] ** np.arange(8))
 
@@ -154,7 +154,7 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     return _create_trajectory(np.array(durations), np.array(pieces))
 
 
-def _require_durations(durations: NDArray) -> None:
+def _check_durations(durations: NDArray) -> None:
     if not len(durations) or not np.isfinite(durations).all() or not (durations > 1e-4).all() or durations.sum() > 1e5:
         raise ConfigError(f"expected pieces of positive durations, got {durations.tolist()} s")
 

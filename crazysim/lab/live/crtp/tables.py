@@ -74,7 +74,7 @@ class Table:
 
 
 def pack_number(struct_format: str, value: float) -> bytes:
-    """Return a number as bytes, clipped to the range of its format; integers are rounded, and 0 if it is not finite."""
+    """Return a number as bytes, clipped to the range of its format; integer formats round it, and take 0 for NaN."""
     if struct_format in ("<f", "<e"):
         largest = 3.4e38 if struct_format == "<f" else 65504.0
         return struct.pack(struct_format, value if math.isnan(value) else min(max(value, -largest), largest))
@@ -118,7 +118,7 @@ def _acceleration_reading(k: int) -> Reading:
 
 
 def _goal_reading(row: int, k: int) -> Reading:
-    """Return the reading of an entry of the goal: its row and its index in the row."""
+    """Return the reading of the k-th number in a row of ``commander.goal()``."""
     return lambda _s, commander: float(commander.goal()[row, k])
 
 

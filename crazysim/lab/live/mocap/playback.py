@@ -34,7 +34,7 @@ class PlaybackData(PyTree):
 
 
 class Playback(Plugin):
-    """Objects that follow sampled poses in every world, and rest after the last one; see ``Twins.playback``."""
+    """Objects that follow sampled poses in every world, and rest after the last sample; see ``Twins.playback``."""
 
     handles: Sequence[Handle]
     """Handles of one object each, in the order of the samples."""
@@ -77,18 +77,21 @@ class Playback(Plugin):
     def set_object_poses(self, data: SimData) -> SimData:
         """Return the data of one world with the objects at their poses."""
         record = self.read(data)
-        last = record.pos.shape[0] - 1
-        sample = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last)
-        previous_sample = jnp.minimum(jnp.floor(sample), last - 1)
-        fraction, k = sample - previous_sample, previous_sample.astype(jnp.int32)
+        last_index = record.pos.shape[0] - 1
+        sample_time = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last_index)
+        previous_index = jnp.minimum(jnp.floor(sample_time), last_index - 1)
+        fraction, k = sample_time - previous_index, previous_index.astype(jnp.int32)
         pos, quat, vel = (x[k] + fraction * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
         quat = quat / jnp.sqrt(jnp.sum(quat * quat, axis=-1, keepdims=True))
         objects = data.objects
-        rows = {handle.rows[0]: i for i, handle in enumerate(self.handles)}
+        index_of_row = {handle.rows[0]: i for i, handle in enumerate(self.handles)}
 
         def replace_rows(old: Array, new: Array) -> Array:
-            parts = [new[rows[k]] if k in rows else old[..., k, :].reshape(old.shape[-1]) for k in range(old.shape[-2])]
-            return jnp.stack(parts).reshape(old.shape)
+            rows = [
+                new[index_of_row[k]] if k in index_of_row else old[..., k, :].reshape(old.shape[-1])
+                for k in range(old.shape[-2])
+            ]
+            return jnp.stack(rows).reshape(old.shape)
 
         moved_objects = objects.replace(
             pos=replace_rows(objects.pos, pos),

@@ -21,19 +21,19 @@ from crazysim.storage import Closeable, wrap_read_errors
 NAMES_CHUNK, POLL_CHUNK = b"NAME", b"POLL"
 """Kinds of chunks: names of bodies that were not seen before, and a poll."""
 POLL_LAYOUT = struct.Struct("<dII")
-"""Time of a poll, s, number of frames, and number of frames lost."""
+"""Layout of a poll before its frames: time, s, number of frames, and number of frames lost."""
 FRAME_LAYOUT = struct.Struct("<ddI")
-"""Stamp and time of arrival of a frame, s, and number of bodies."""
+"""Layout of a frame before its bodies: stamp and time of arrival, s, and number of bodies."""
 
 
 class MocapRecorder(Closeable):
     """Writer of a recording."""
 
     def __init__(self, path: str | Path):
-        """Create a file; an existing one is replaced.
+        """Create a file; an existing file is replaced.
 
         Raises:
-            ConfigError: If it cannot be written.
+            ConfigError: If the file cannot be written.
         """
         self._journal = Journal(path, replace=True)
         self._ids: dict[str, int] = {}
@@ -89,11 +89,11 @@ def _parse_poll(content: bytes, names: list[str]) -> Poll:
 
 
 class ReplaySource(MocapSource):
-    """Frames of a recording.
+    """Source of the frames in a recording.
 
-    With ``by="poll"``, the k-th poll returns the frames of the k-th recorded poll, so a simulation that is stepped as
-    the recorded one was reproduces the run bit for bit. With ``by="time"``, a frame that arrived t seconds after the
-    first frame is returned at simulated time t; use it for a simulation that is stepped differently.
+    With ``by="poll"``, the k-th poll returns the frames of the k-th recorded poll. A simulation that takes the same
+    steps between polls as in the recording then reproduces the run bit for bit. With ``by="time"``, a frame that
+    arrived t seconds after the first frame is returned at simulated time t, whichever steps the simulation takes.
     """
 
     def __init__(self, path: str | Path, by: str = "poll"):
@@ -132,7 +132,7 @@ class ReplaySource(MocapSource):
         return "the recording ended" if self._next_index >= n else None
 
     def poll(self, step: int, freq: int) -> Poll:
-        """Return the frames of the next recorded poll, or those up to the present simulated time."""
+        """Return the frames of the next recorded poll, or the frames up to the present simulated time."""
         if self.by == "poll":
             if self._next_index < len(self._polls):
                 self._next_index += 1

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
-from crazysim.lab.live.host_trajectory import host_trajectories
+from crazysim.lab.live.host_trajectory import to_host_trajectories
 from crazysim.lab.live.mocap.frames import Convention, Frame
 from crazysim.storage import Closeable
 from crazysim.trajectories import Trajectory
@@ -22,7 +22,7 @@ from crazysim.trajectories import Trajectory
 log = logging.getLogger(__name__)
 
 MAX_QUEUED_FRAMES = 4096
-"""Largest number of frames that wait for the reader, 17 s at 240 Hz; beyond it, the oldest are lost."""
+"""Largest number of frames that wait for the reader, 17 s at 240 Hz; if more arrive, the oldest are lost."""
 
 
 class Poll(NamedTuple):
@@ -55,7 +55,7 @@ class MocapSource(Closeable):
 
     @property
     def ended(self) -> str | None:
-        """Reason for which the source sends no more frames; None while it may."""
+        """Reason for which the source sends no more frames; None while it may still send some."""
         return None
 
     def close(self) -> None:
@@ -77,7 +77,7 @@ class FunctionSource(MocapSource):
         """Sample a function.
 
         Args:
-            function: Function of time, s, that returns position and attitude of each body by name, in the convention.
+            function: Function of time, s, that returns position and attitude of each body by name, in ``convention``.
             freq: Frames per second, Hz.
             convention: Convention of the poses; None for crazysim's.
             name: Name in reports.
@@ -111,7 +111,7 @@ def show_source(
         names: Names of the bodies; None for ``vcf0``, ``vcf1``, ...
         freq: Frames per second, Hz.
     """
-    paths = host_trajectories(trajectories)
+    paths = to_host_trajectories(trajectories)
     names = [f"vcf{k}" for k in range(len(paths))] if names is None else list(names)
     if len(names) != len(paths) or len(set(names)) < len(names):
         raise ConfigError(
@@ -129,8 +129,8 @@ def show_source(
 class ThreadSource(MocapSource):
     """Base of sources that wait for frames in a thread, such as network clients.
 
-    A subclass yields frames from ``stream`` in the convention of its system. An error there ends the source, not the
-    simulation, and ``ended`` gives the reason.
+    A subclass yields frames from ``stream`` in the convention of its system. An error in ``stream`` ends the source,
+    not the simulation, and ``ended`` gives the reason.
     """
 
     def __init__(self, name: str, convention: Convention | None = None):
@@ -190,7 +190,7 @@ class ThreadSource(MocapSource):
 
 
 class RealTimeSource(ThreadSource):
-    """Another source's frames, sent by a thread in real time: a stand-in for a motion capture system."""
+    """Source that sends the frames of another source in real time, as a motion capture system would."""
 
     def __init__(self, source: FunctionSource, speed: float = 1.0):
         """Send the frames of a function of time.

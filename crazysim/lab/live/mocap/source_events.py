@@ -1,4 +1,4 @@
-"""Reports of live sources: kind of event, name and time."""
+"""Reports of events in motion capture, swarms and links: kind, name, time and description."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ MAX_REPORTS = 1000
 
 
 class Report(NamedTuple):
-    """One event of a source."""
+    """One event, such as a lost frame or a refused command."""
 
     kind: str
     """Kind, such as ``"dropped"`` or ``"unknown"``."""
     name: str
-    """Name of the body or of the source."""
+    """Name of the body, drone or source."""
     time: float
-    """Time of the frame or of the poll, s."""
+    """Time of the event, s."""
     text: str
     """Description with numbers."""
 
 
 class Reports:
-    """The latest reports, and counts of all. Report 1, 10, 100, ... of each kind and name is logged."""
+    """The latest reports, and counts of all reports. Report 1, 10, 100, ... of each kind and name is logged."""
 
     def __init__(self) -> None:
         self.latest: deque[Report] = deque(maxlen=MAX_REPORTS)

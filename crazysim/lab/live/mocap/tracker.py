@@ -14,7 +14,7 @@ from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source_events import Reports
 
 N_INTERVALS = 32
-"""Number of intervals between frames whose median is the period of the source."""
+"""Number of intervals between frames that are measured to find the period of the source, which is their median."""
 MAX_COORDINATE = 1e6
 """Magnitude at which a coordinate becomes invalid, m."""
 MAX_DELAY_AGE = 10.0
@@ -66,6 +66,17 @@ class Tracker:
     | more frames than the reader took | the oldest are lost | `overrun` |
     | thread or connection ended | as stalled | `ended` |
     """
+
+    pos: NDArray
+    """Positions of the bodies, world frame, m. (n, 3)"""
+    vel: NDArray
+    """Velocities of the bodies, world frame, m/s. (n, 3)"""
+    quat: NDArray
+    """Attitudes of the bodies, body to world, xyzw. (n, 4)"""
+    seen: NDArray
+    """True for bodies that have had a valid pose. (n,)"""
+    n_frames: int
+    """Number of accepted frames."""
 
     def __init__(self, names: Sequence[str], rules: Rules | None = None, source: str = "mocap"):
         """Create a tracker without poses.
@@ -132,14 +143,14 @@ class Tracker:
         self.n_frames += 1
         with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused below
             self._update_bodies(frame, now)
-        missing = self.seen & ~self._is_lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
-        for k in np.flatnonzero(missing):
+        is_missing = self.seen & ~self._is_lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
+        for k in np.flatnonzero(is_missing):
             self._is_lost[k], self.vel[k] = True, 0.0
             self._report("lost", self.names[k], now, f"no valid pose for {now - self._stamps[k]:.3f} s; it stays there")
         return True
 
     def restart(self) -> None:
-        """Accept the next frame with any time; poses stay, and velocities restart at zero."""
+        """Accept the next frame with any time; poses are kept, and velocities restart at zero."""
         self._stamps[self.seen] = -np.inf
         self._least_delay, self._least_delay_time, self._stamp, self._received = np.inf, -np.inf, None, None
 
@@ -178,7 +189,7 @@ class Tracker:
             self._report("dropped", self.source, now, f"{n} frames missing in {interval:.4f} s")
 
     def _watch_delay(self, now: float, delay: float) -> None:
-        """Report frames that took much longer than the quickest one; the clocks may differ by any constant."""
+        """Report frames that took much longer than the quickest frame; the clocks may differ by any constant."""
         if delay < self._least_delay or now - self._least_delay_time > MAX_DELAY_AGE:
             self._least_delay, self._least_delay_time = delay, now
         elif delay - self._least_delay > self.rules.late:
@@ -219,10 +230,10 @@ class Tracker:
         was_seen = self.seen[rows] & np.isfinite(dt)
         distance = np.sqrt((displacement * displacement).sum(-1))
         is_plausible = ~was_seen | (distance <= self.rules.max_speed * np.where(was_seen, dt, 0.0) + self.rules.slack)
-        relocated = np.zeros(len(rows), bool)
+        is_relocated = np.zeros(len(rows), bool)
         if not is_plausible.all():
-            relocated = self._confirm_jumps(rows, pos, distance, is_plausible, now)
-            is_plausible |= relocated
+            is_relocated = self._confirm_jumps(rows, pos, distance, is_plausible, now)
+            is_plausible |= is_relocated
         self._n_suspect_frames[rows[is_plausible]] = 0
         for k in rows[is_plausible & self._is_lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
@@ -234,7 +245,7 @@ class Tracker:
             dt[is_plausible],
             displacement[is_plausible],
         )
-        has_no_speed = ~was_seen[is_plausible] | relocated[is_plausible] | self._is_lost[rows]
+        has_no_speed = ~was_seen[is_plausible] | is_relocated[is_plausible] | self._is_lost[rows]
         dt = np.where(has_no_speed, np.inf, np.maximum(dt, distance[is_plausible] / self.rules.max_speed))
         self.vel[rows] = displacement / np.where(dt > 0, dt, np.inf)[:, None]
         self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
@@ -244,17 +255,17 @@ class Tracker:
         self, rows: NDArray, pos: NDArray, distance: NDArray, is_plausible: NDArray, now: float
     ) -> NDArray:
         """Return True for bodies that jumped and have stayed at their new position for ``confirm`` frames. (n,)"""
-        accepted = np.zeros(len(rows), bool)
+        is_accepted = np.zeros(len(rows), bool)
         for i in np.flatnonzero(~is_plausible):
             k = rows[i]
             is_near = np.linalg.norm(pos[i] - self._suspect_pos[k]) <= self.rules.slack
             self._n_suspect_frames[k] = self._n_suspect_frames[k] + 1 if is_near and self._n_suspect_frames[k] else 1
             self._suspect_pos[k] = pos[i]
             if self._n_suspect_frames[k] >= self.rules.confirm:
-                accepted[i] = True
+                is_accepted[i] = True
                 self._report(
                     "relocated", self.names[k], now, f"{distance[i]:.3f} m away in {self.rules.confirm} frames"
                 )
             else:
                 self._report("jumped", self.names[k], now, f"{distance[i]:.3f} m; it keeps its pose")
-        return accepted
+        return is_accepted

@@ -92,7 +92,7 @@ class Twins(Closeable):
 
     ``update`` reads all frames that have arrived, applies the rules of ``Tracker``, and writes all poses and velocities
     into ``data.objects`` of every world at once. Contact reports, ``ContactResponse``, range finders and images then
-    include them like any other objects. A reset hides objects below the floor until the next update.
+    include the twins like any other objects. A reset hides objects below the floor until the next update.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Twins(Closeable):
                 )
             twin_by_name[name] = twin
         self.twins = twin_by_name
-        self._order = _parents_first(twin_by_name)
+        self._order = _order_parents_first(twin_by_name)
         with sim.scene.restore_on_error():
             self.handles: dict[str, Handle] = {
                 name: sim.scene.add(t.model, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
@@ -132,13 +132,13 @@ class Twins(Closeable):
             }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)
         self.tracker = Tracker(self.names, rules, source.name)
-        self._frozen, self._step = np.zeros(len(self.names), bool), 0
+        self._is_frozen, self._step = np.zeros(len(self.names), bool), 0
         self._recorder = None if record is None else MocapRecorder(record)
         twin_list = twin_by_name.values()
-        self._turn = from_rpy([t.turn for t in twin_list]).reshape(-1, 4)
-        self._offset = np.array([t.offset for t in twin_list], float).reshape(-1, 3)
+        self._turn_quat = from_rpy([t.turn for t in twin_list]).reshape(-1, 4)
+        self._offsets = np.array([t.offset for t in twin_list], float).reshape(-1, 3)
         fixed = np.array([[np.nan if x is None else x for x in t.fixed] for t in twin_list], float).reshape(-1, 3)
-        self._fixed, self._is_fixed = fixed, np.isfinite(fixed).any(-1)
+        self._fixed_angles, self._is_fixed = fixed, np.isfinite(fixed).any(-1)
         self._poses = (
             np.tile(HIDDEN_POSITION, (len(twin_by_name), 1)),
             np.tile([0.0, 0, 0, 1], (len(twin_by_name), 1)),
@@ -180,15 +180,15 @@ class Twins(Closeable):
 
     def freeze(self, *names: str) -> None:
         """Keep bodies at their present poses and ignore the source; without names, all bodies."""
-        self._frozen[self._indices(names)] = True
+        self._is_frozen[self._find_indices(names)] = True
 
     def thaw(self, *names: str) -> None:
         """Make frozen bodies follow the source again; without names, all bodies."""
-        self._frozen[self._indices(names)] = False
+        self._is_frozen[self._find_indices(names)] = False
 
     def pose(self, name: str) -> tuple[NDArray, NDArray, NDArray]:
         """Return position, m (3,), attitude, xyzw (4,), and velocity, m/s (3,), of the object of a body."""
-        k = self._indices([name])[0]
+        k = self._find_indices([name])[0]
         return tuple(x[k].copy() for x in self._poses)  # type: ignore[return-value]
 
     def playback(
@@ -226,7 +226,8 @@ class Twins(Closeable):
         if self._recorder is not None:
             self._recorder.close()
 
-    def _indices(self, names: Sequence[str]) -> list[int]:
+    def _find_indices(self, names: Sequence[str]) -> list[int]:
+        """Return the indices of the bodies with these names; of all bodies if there are no names."""
         for name in names:
             if name not in self.names:
                 raise UnknownNameError(f"expected one of the bodies {list(self.names)}, got {name!r}")
@@ -243,13 +244,13 @@ class Twins(Closeable):
             direction = pos[k] - joint
             distance = np.linalg.norm(direction)
             pos[k] = joint + (twin.length / distance * direction if distance > 0 else 0.0)
-        quat = multiply(tracker.quat, self._turn)
+        quat = multiply(tracker.quat, self._turn_quat)
         if self._is_fixed.any():
             rpy = to_rpy(quat[self._is_fixed])
-            fixed = self._fixed[self._is_fixed]
+            fixed = self._fixed_angles[self._is_fixed]
             quat[self._is_fixed] = from_rpy(np.where(np.isfinite(fixed), fixed, rpy))
-        pos += rotate(quat, self._offset)
-        is_shown = tracker.seen & ~self._frozen
+        pos += rotate(quat, self._offsets)
+        is_shown = tracker.seen & ~self._is_frozen
         for k in self._order:
             is_shown[k] &= tracker.seen[self.names.index(self.twins[self.names[k]].parent)]  # type: ignore[arg-type]
         old_pos, old_quat, old_vel = self._poses
@@ -276,7 +277,7 @@ def _write_poses(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArra
     return [x.at[..., rows, :].set(jnp.asarray(y, x.dtype)) for x, y in zip(old, new, strict=True)]
 
 
-def _parents_first(twins: Mapping[str, Twin]) -> list[int]:
+def _order_parents_first(twins: Mapping[str, Twin]) -> list[int]:
     """Return the indices of the parts of skeletons, parents first."""
     names, order = list(twins), list[int]()
     for name, twin in twins.items():

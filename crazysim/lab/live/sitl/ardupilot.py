@@ -14,10 +14,10 @@ from crazysim.lab.live.sitl.measured import Measurements, to_frd, to_ned, to_ned
 PORT = 9002
 """Port at which a simulation listens."""
 PACKET_LAYOUTS = {18458: "<HHI16H", 29569: "<HHI32H"}
-"""Layouts of packets with 16 and 32 outputs, by their first number. It is followed by the frame rate, the frame count
-and the pulse widths, us."""
+"""Layouts of packets with 16 and 32 outputs, by the first number in a packet. The frame rate, the frame count and the
+pulse widths, us, follow that number."""
 PULSE_MIN, PULSE_MAX = 1000.0, 2000.0
-"""Pulse widths for a motor that is off and for one at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
+"""Pulse widths for a motor that is off, and for a motor at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
 
 
 class ArduPilot(FirmwareLink):
@@ -33,7 +33,7 @@ class ArduPilot(FirmwareLink):
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
     yaw_torque_signs = (-1, -1, 1, 1)
-    remedy = "set FRAME_TYPE to the one whose motors turn so"
+    remedy = "set FRAME_TYPE to a frame whose motors turn in these senses"
     lockstep = True
 
     def __init__(self, host: str = "127.0.0.1", *, port: int = PORT):
@@ -49,7 +49,7 @@ class ArduPilot(FirmwareLink):
         self._link = Datagrams(host, port)
 
     def send(self, measured: Measurements) -> None:
-        """Answer the last packet with the state, if there was one."""
+        """Answer the last packet with the state, if there was a packet."""
         message = {
             "timestamp": measured.time,
             "imu": {"gyro": to_frd(measured.gyro).tolist(), "accel_body": to_frd(measured.accel).tolist()},

@@ -16,6 +16,7 @@ from crazysim.tables import range_between, read_numbers
 PORTS = (9002, 9003, 9004)
 """Ports for motor packets, which Betaflight sends, and for state and remote-control packets, which it receives."""
 N_CHANNELS = 16
+"""Number of channels of the remote control."""
 MAX_PULSE = 65535
 """Largest pulse that a packet of the remote control holds, us."""
 
@@ -23,14 +24,14 @@ MAX_PULSE = 65535
 class Betaflight(FirmwareLink):
     """A process ``betaflight_SITL``, which runs in real time.
 
-    Packets follow ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
-    its clock to the simulation's but does not wait for it, and answers each state packet with at most one motor
-    packet.
+    Packets follow ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts its clock
+    to the clock of the simulation but does not wait for the simulation. It answers each state packet with at most one
+    motor packet.
 
     It receives the measurements of ``IMU`` and ``GPS``, and the pressure at the height that ``Barometer`` measures; a
-    firmware with ``gazebo`` replaces this by the pressure at the altitude of the ``GPS``. It also receives the true
-    attitude, from which it simulates a compass and which it uses instead of its own estimate unless it was built with
-    ``USE_IMU_CALC``.
+    firmware with ``gazebo`` replaces this pressure by the pressure at the altitude of the ``GPS``. It also receives the
+    true attitude. It simulates a compass from this attitude, and uses it in place of its own estimate unless it was
+    built with ``USE_IMU_CALC``.
     """
 
     positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
@@ -79,7 +80,7 @@ class Betaflight(FirmwareLink):
     def channels(self) -> NDArray[np.float64]:
         """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)
 
-        Set all of them, or single ones, which are checked when they are sent.
+        Assign all channels, or single elements; elements are checked when they are sent.
         """
         return self._channels
 
@@ -92,7 +93,7 @@ class Betaflight(FirmwareLink):
         latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
-            # the bridge mirrors positions about the first one
+            # the bridge mirrors positions about the first position
             self._start_position = self._start_position or (latitude, longitude)
             latitude, longitude = (2 * x - y for x, y in zip(self._start_position, (latitude, longitude), strict=True))
         else:

@@ -40,7 +40,7 @@ class FirmwareLink(Closeable):
     remedy: ClassVar[str]
     """Remedy for an airframe whose rotors turn in the opposite senses, for an error message."""
     lockstep: ClassVar[bool]
-    """True for a firmware that waits for the simulation, False for one that follows another clock."""
+    """True if the firmware waits for the simulation, False if it follows another clock."""
 
     @abstractmethod
     def send(self, measured: Measurements) -> None:
@@ -59,7 +59,7 @@ class Rate:
     """Schedule of an action at a rate in simulated time."""
 
     def __init__(self, name: str, freq: float):
-        """Create a rate whose first time is due at once.
+        """Create a schedule whose first action is due at once.
 
         Args:
             name: Name of the rate, for messages.
@@ -68,7 +68,7 @@ class Rate:
         self._period, self._next_time = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
-        """Return True if the action is due at a simulated time, s, and then schedule the next one."""
+        """Return True if the action is due at a simulated time, s, and then schedule the next action."""
         if time < self._next_time - ROUNDING_TOLERANCE:
             return False
         self._next_time = max(self._next_time + self._period, time)
@@ -81,7 +81,7 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
     Args:
         host: Name or address of a host.
         port: Port.
-        min_port: Smallest valid port; 0 allows any free one.
+        min_port: Smallest valid port; 0 also allows port 0, which means any free port.
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
@@ -113,7 +113,7 @@ class Datagrams(Closeable):
             self._socket.sendto(packet, (self._host, port))
 
     def answer(self, packet: bytes) -> None:
-        """Send a packet to the sender of the last one."""
+        """Send a packet to the sender of the last valid packet."""
         if self._sender is not None:
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(packet, self._sender)

@@ -1,4 +1,4 @@
-"""Simulations flown by firmware: one process per drone receives measurements and sends motor commands."""
+"""Simulations flown by firmware: a process for each drone receives measurements and sends motor commands."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SILENCE_LIMIT = 1.0
 GPS_FREQ = 5
 """Rate of satellite navigation without a ``GPS``, Hz."""
 SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
-"""Sensors whose measurements firmware receives."""
+"""Sensors whose measurements are sent to firmware."""
 MOUNTED_SENSORS = (IMU, Magnetometer)
 """Sensors whose frame may be rotated relative to the body."""
 
 
 class SoftwareInTheLoop(Closeable):
-    """Processes of a firmware that fly the drones of a simulation, one each.
+    """Processes of a firmware that fly the drones of a simulation, one process for each drone.
 
     The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation provide the measurements. If the
     ``IMU`` is missing, one without errors is added; if another sensor is missing, the true values are sent. The
@@ -60,8 +60,8 @@ class SoftwareInTheLoop(Closeable):
 
         Args:
             sim: Simulation at the level ``rotor_vel``.
-            links: Links to the firmware, one for each drone, in the order of worlds.
-            freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for one in every step.
+            links: Links to the firmware, one for each drone, world by world.
+            freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for an exchange in every step.
             motors: Meaning of a motor command from 0 to 1: fraction of a rotor's largest speed, or of its
                 largest thrust.
             reversed: True for a firmware that is set up for rotors that turn in the opposite senses.
@@ -136,7 +136,7 @@ class SoftwareInTheLoop(Closeable):
         for k, link in enumerate(self.links):
             command = link.receive(self.timeout if link.lockstep else 0.0)
             if command is not None:
-                self._rotor_vel[k] = self._rotor_speeds(k, command)
+                self._rotor_vel[k] = self._to_rotor_speeds(k, command)
                 self._last_command_times[k] = time.monotonic()
             elif link.lockstep:
                 raise _silence_error(link, self.timeout)
@@ -149,18 +149,19 @@ class SoftwareInTheLoop(Closeable):
         return self._read_measurements()[0]
 
     def _read_measurements(self) -> tuple[list[Measurements], NDArray]:
-        """Return the measurements of every drone, and counts of when they were taken. (n_links, n_kinds)"""
+        """Return the measurements of every drone, and numbers that change with each new sample. (n_links, n_kinds)"""
         states, time_now = self.sim.data.states, self._n_exchanges * self._n_steps / self.sim.freq
-        pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
+        pos, quat, vel, ang_vel = (_flatten_drones(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
         values, steps_taken = zip(*map(self._latest_values, SENSOR_KINDS), strict=True)
         imu, height, field, gps = values
         if field is None:
             field = rotate(quat * [-1, -1, -1, 1], MAGNETIC_FIELD)
         gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
-        counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING_TOLERANCE)}
+        default_numbers: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING_TOLERANCE)}
         sample_numbers = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
         for k, kind in enumerate(SENSOR_KINDS):
-            sample_numbers[:, k] = counts.get(kind, self._n_exchanges) if steps_taken[k] is None else steps_taken[k]
+            is_missing = steps_taken[k] is None
+            sample_numbers[:, k] = default_numbers.get(kind, self._n_exchanges) if is_missing else steps_taken[k]
         is_new = (
             np.ones_like(sample_numbers, bool)
             if self._sample_numbers is None
@@ -202,7 +203,7 @@ class SoftwareInTheLoop(Closeable):
         if kind in MOUNTED_SENSORS:
             vectors = value.reshape(*value.shape[:-1], -1, 3)
             value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
-        return _rows(value), taken
+        return _flatten_drones(value), taken
 
     def _check_commands_arrived(self, start_time: float, seconds: float) -> None:
         """Check that every firmware has sent commands since a time (``time.monotonic``), ``seconds`` ago."""
@@ -214,7 +215,7 @@ class SoftwareInTheLoop(Closeable):
         for link in self.links:
             link.close()
 
-    def _rotor_speeds(self, k: int, command: NDArray) -> NDArray:
+    def _to_rotor_speeds(self, k: int, command: NDArray) -> NDArray:
         """Return the speeds of the rotors of a drone for the motor commands of its firmware, rpm. (4,)"""
         rotor_commands, airframe = np.zeros(4), self._airframes[k]
         rotor_commands[self._orders[k]] = command
@@ -238,8 +239,8 @@ def _check_links(links: object) -> tuple[FirmwareLink, ...]:
     return tuple(sequence)
 
 
-def _rows(values: Any) -> NDArray:
-    """Return values of all drones as one row for each drone, in the order of worlds. (n_links, k)"""
+def _flatten_drones(values: Any) -> NDArray:
+    """Return values of all drones as one row for each drone, world by world. (n_links, k)"""
     values = np.asarray(values, float)
     return values.reshape(-1, values.shape[-1])
 

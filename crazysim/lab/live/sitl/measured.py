@@ -21,7 +21,7 @@ MAX_LATITUDE = 89.0
 MIN_ALTITUDE, MAX_ALTITUDE = -1000.0, 11000.0
 """Limits of the origin's altitude, m: the lowest layer of the standard atmosphere, up to the tropopause."""
 COS_45_DEGREES = np.sqrt(0.5)
-"""Cosine and sine of 45 degrees, half of a quarter turn, 1."""
+"""Cosine and sine of 45 degrees, which is half of a quarter turn."""
 
 
 class Measurements(NamedTuple):
@@ -53,8 +53,7 @@ class Measurements(NamedTuple):
     field: NDArray
     """Magnetic field, body frame, T. (3,)"""
     new: frozenset[type[Sensor]]
-    """Sensors with a new measurement: ``IMU``, ``Barometer``, ``Magnetometer`` and
-    ``GPS``. The first measurements name all."""
+    """Sensors with a new measurement: ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS``; at first all of them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,8 +19,8 @@ from crazysim.tables import read_number
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
 UPDATED_BITS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
-"""Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor, without which PX4 ignores them: ``ACCEL`` with
-``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
+"""Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor; PX4 ignores fields whose bits are not set. They
+are ``ACCEL`` with ``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
 STARTUP_LAG = 0.02
 """Time by which the simulation lags behind the clock until PX4 has started, s."""
 TEMPERATURE = 25.0
@@ -37,7 +37,7 @@ class Px4(FirmwareLink):
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
     ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts, it needs the clock but does not
     answer; until the first answer, the simulation runs in real time with its motors off. PX4 answers only to new
-    measurements of the gyroscope; without one from the ``IMU``, its last motor commands stay in force.
+    measurements of the gyroscope; while the ``IMU`` has none, its last motor commands stay in force.
 
     PX4 receives each new measurement of ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS``. It treats a sensor whose
     measurements never change as broken, so give every sensor noise. ``HIL_STATE_QUATERNION`` holds the true state, for
@@ -58,8 +58,8 @@ class Px4(FirmwareLink):
             host: Address to listen at.
             port: Port, 4560 plus the number of the instance.
             origin: Geodetic position of the world's origin.
-            connect_timeout: Time to wait for PX4 to connect when the first measurements are sent, s, and time limit of
-                each message that is sent.
+            connect_timeout: Time to wait for PX4 to connect when the first measurements are sent, s, and time limit for
+                sending each message.
 
         Raises:
             ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
@@ -151,8 +151,8 @@ class Px4(FirmwareLink):
         """Return the newest motor commands, zero while PX4 is not armed; None if none arrived in time. (4,)
 
         Args:
-            deadline: Time of ``time.monotonic`` until which to wait for commands. Later, only those that have already
-                arrived are read, for at most ``MAX_DRAIN_TIME``.
+            deadline: Time of ``time.monotonic`` until which to wait for commands. Later, only commands that have
+                already arrived are read, for at most ``MAX_DRAIN_TIME``.
         """
         motors, now = None, time.monotonic()
         end = max(deadline, now) + MAX_DRAIN_TIME
@@ -169,7 +169,8 @@ class Px4(FirmwareLink):
         latitude, longitude, altitude = self.origin.geodetic_position(pos)
         return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
 
-    def _require_client(self) -> socket.socket:
+    def _wait_for_client(self) -> socket.socket:
+        """Return the connection; the first call waits until PX4 connects."""
         if self._client is None:
             self._server.settimeout(self.connect_timeout)
             try:
@@ -184,7 +185,7 @@ class Px4(FirmwareLink):
         return self._client
 
     def _send(self, message: Any) -> None:
-        client = self._require_client()
+        client = self._wait_for_client()
         client.settimeout(self.connect_timeout)
         try:
             client.sendall(message.pack(self._mav))
@@ -192,7 +193,7 @@ class Px4(FirmwareLink):
             raise _closed_error() from None
 
     def _has_data(self, timeout: float) -> bool:
-        client = self._require_client()
+        client = self._wait_for_client()
         client.settimeout(max(timeout, 1e-6))
         try:
             return bool(client.recv(1, socket.MSG_PEEK))
@@ -202,7 +203,7 @@ class Px4(FirmwareLink):
             return False
 
     def _read_messages(self) -> list[Any]:
-        client = self._require_client()
+        client = self._wait_for_client()
         client.settimeout(0)
         try:
             return self._mav.parse_buffer(client.recv(CHUNK_BYTES)) or []
@@ -211,5 +212,5 @@ class Px4(FirmwareLink):
 
 
 def _closed_error() -> ConfigError:
-    """Return the error for a connection that PX4 closed, or from which it did not read a message in time."""
+    """Return the error for a connection that PX4 closed, or did not read from in time."""
     return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")

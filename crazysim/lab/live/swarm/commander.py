@@ -1,9 +1,9 @@
 """Commander of one drone: the choice of the active setpoint, as in the firmware of the Crazyflie.
 
-High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
-drone holds its position, and after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
-commander.h of crazyflie-firmware). Each streamed setpoint discards the plan of a high-level command, and a plan
-that is made while setpoints are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
+High-level commands plan smooth motions. Streamed setpoints take precedence until they stop: after 0.5 s without a
+setpoint the drone holds its position, and after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and
+``_SHUTDOWN`` in commander.h of crazyflie-firmware). Each streamed setpoint discards the planned motion. A motion that
+is planned while setpoints are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
 ``crtpCommanderHighLevelGetSetpoint`` in crtp_commander_high_level.c). Until the first command, and after landing, the
 motors are off.
 """
@@ -33,7 +33,7 @@ LANDED_HEIGHT, RESTING_SPEED, REST_TIME = 0.01, 0.02, 0.5
 """A landing stops the motors at or below this height above its target, m. It also stops them if the vertical speed is
 below this limit, m/s, later than this time after its planned end, s."""
 MIN_DURATION, MAX_DURATION = 1e-3, 1e4
-"""Limits of durations, s, and of factors of durations, 1."""
+"""Limits of durations, s, and of factors of durations."""
 N_TRAJECTORIES = 256
 """Number of trajectories that a drone holds; their IDs are one byte."""
 
@@ -56,11 +56,11 @@ class Commander:
         self.reset()
 
     def reset(self) -> None:
-        """Return to the floor with motors off and an estimate in the world's frame; trajectories stay."""
+        """Return to the floor with motors off and an estimate in the world's frame; trajectories are kept."""
         self.now = 0.0
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
-        self._plan: PlannedMotion | None = None
+        self._planned_motion: PlannedMotion | None = None
         self._cached_hover: tuple[PlannedMotion, NDArray] | None = None
         self.estimate_frame: EstimateFrame | None = None
         self._stream: tuple[str, NDArray] | None = None
@@ -73,54 +73,57 @@ class Commander:
     @property
     def motors_on(self) -> bool:
         """True while a command is active."""
-        return self.armed and not self.locked and (self._plan is not None or self._stream is not None)
+        return self.armed and not self.locked and (self._planned_motion is not None or self._stream is not None)
 
     @property
     def finished(self) -> bool:
         """True if no planned move is in progress."""
-        return self._plan is None or self._plan.finished(self.now)
+        return self._planned_motion is None or self._planned_motion.has_ended(self.now)
 
     def goal(self) -> NDArray:
         """Return position, yaw and their derivatives of the active setpoint, or else of the drone. (3, 4)"""
         if self._stream is not None:
             return self._last_goal
-        if self._plan is not None:
-            point = self._plan.evaluate(self.now)
-            if self._plan.is_landing and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
-                point[:2, 2] += -min(SINK_SPEED * (self.now - self._plan.end_time), MAX_SINK), -SINK_SPEED
+        if self._planned_motion is not None:
+            point = self._planned_motion.evaluate(self.now)
+            if self._planned_motion.is_landing and self._planned_motion.has_ended(
+                self.now
+            ):  # the setpoint sinks until the drone has landed
+                point[:2, 2] += -min(SINK_SPEED * (self.now - self._planned_motion.end_time), MAX_SINK), -SINK_SPEED
             return point
         return self._drone_motion()
 
     def in_group(self, mask: int) -> bool:
-        """Return True if a command with this group mask, 0 for all drones, addresses this one."""
+        """Return True if a command with this group mask, 0 for all drones, addresses this drone."""
         return mask == 0 or (mask & self.group) != 0
 
     # High-level commands --------------------------------------------------------------------------------------------
 
     def take_off(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Rise to a height, m, within a duration, s; a yaw of None keeps the present one."""
+        """Rise to a height, m, within a duration, s; a yaw of None keeps the present yaw."""
         self._move_vertically(height, duration, yaw, is_landing=False)
 
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Descend to a height, m, and stop the motors there, or where the drone comes to rest; a yaw of None
-        keeps the present one.
+        """Descend to a height, m, and stop the motors there, or where the drone comes to rest.
+
+        A yaw of None keeps the present yaw.
 
         A drone that is still higher at the end, because its controller lags or has an offset, descends further.
         """
         self._move_vertically(height, duration, yaw, is_landing=True)
 
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
-        """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
+        """Move to a position, m (3,), and yaw, rad; if ``relative``, they are added to the present setpoint."""
         goal, (yaw,) = _check_numbers("goal", goal, 3), _check_numbers("yaw", [yaw], 1)
         start = self._motion_start("go_to")
         if relative:
             goal, yaw = goal + start[0, :3], yaw + start[0, 3]
         end = [*goal, nearest_yaw(start[0, 3], yaw)]
-        self._plan = PlannedMotion(plan_move(start, end, _check_duration(duration), linear), self.now)
+        self._planned_motion = PlannedMotion(plan_move(start, end, _check_duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
-        self._plan = self._stream = None
+        self._planned_motion = self._stream = None
 
     def upload(self, trajectory_id: int, trajectory: HostTrajectory, compressed: bool = False) -> None:
         """Receive a trajectory.
@@ -149,7 +152,7 @@ class Commander:
 
         Args:
             trajectory_id: ID of the trajectory.
-            timescale: Factor of its duration, 1.
+            timescale: Factor of its duration.
             relative: True to begin at the present setpoint.
             reversed: True to follow it from its end to its start.
             relative_yaw: True to begin at the present yaw as well.
@@ -165,14 +168,14 @@ class Commander:
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
-        plan = PlannedMotion(self.trajectories[trajectory_id], self.now, timescale, bool(reversed))
-        start, first_point = self._motion_start("start_trajectory")[0], plan.evaluate(self.now)[0]
+        planned_motion = PlannedMotion(self.trajectories[trajectory_id], self.now, timescale, bool(reversed))
+        start, first_point = self._motion_start("start_trajectory")[0], planned_motion.evaluate(self.now)[0]
         offset = np.zeros(4)
         if relative:
             offset[:3] = start[:3] - first_point[:3]
             if relative_yaw and trajectory_id not in self._compressed_ids:
                 offset[3] = start[3] - nearest_yaw(start[3], first_point[3])
-        self._plan = plan._replace(offset=offset)
+        self._planned_motion = planned_motion._replace(offset=offset)
 
     # Streamed setpoints ---------------------------------------------------------------------------------------------
 
@@ -273,34 +276,42 @@ class Commander:
         self.pos, self.vel, self.yaw = pos, vel, yaw
         if self._stream is not None:
             age = now - self._stream_time
-            if now >= self._release_time and self._plan is not None:
+            if now >= self._release_time and self._planned_motion is not None:
                 self._stream = None
             elif age > SHUTDOWN_TIMEOUT:
                 self.stop()
             elif age > STABILIZE_TIMEOUT and self._stream[0] != "stay":
                 self._stream = ("stay", np.append(pos, yaw))
-        plan = self._plan
-        is_landing_over = plan is not None and plan.is_landing and plan.finished(now) and self._has_landed(plan)
+        planned_motion = self._planned_motion
+        is_landing_over = (
+            planned_motion is not None
+            and planned_motion.is_landing
+            and planned_motion.has_ended(now)
+            and self._has_landed(planned_motion)
+        )
         if self._stream is None and is_landing_over:
             self.stop()
         if not self.motors_on:
             return None
         if self._stream is not None:
             return self._streamed_command(dt)
-        if plan is None or not plan.finished(now) or plan.is_landing:
+        if planned_motion is None or not planned_motion.has_ended(now) or planned_motion.is_landing:
             return _state_command(*self.goal())
         # The command is calculated only once while the drone hovers.
-        if self._cached_hover is None or self._cached_hover[0] is not plan:
-            self._cached_hover = plan, _state_command(plan.evaluate(now)[0], np.zeros(4), np.zeros(4))
+        if self._cached_hover is None or self._cached_hover[0] is not planned_motion:
+            self._cached_hover = (
+                planned_motion,
+                _state_command(planned_motion.evaluate(now)[0], np.zeros(4), np.zeros(4)),
+            )
         return self._cached_hover[1]
 
-    def _has_landed(self, plan: PlannedMotion) -> bool:
+    def _has_landed(self, planned_motion: PlannedMotion) -> bool:
         """Return True if the drone has reached the height of its landing, or stands on a surface."""
-        is_standing = self.now > plan.end_time + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
-        return is_standing or self.pos[2] <= plan.evaluate(self.now)[0, 2] + LANDED_HEIGHT
+        is_standing = self.now > planned_motion.end_time + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
+        return is_standing or self.pos[2] <= planned_motion.evaluate(self.now)[0, 2] + LANDED_HEIGHT
 
     def _streamed_command(self, dt: float) -> NDArray:
-        """Return the command of the streamed setpoint; velocities and yaw rates are integrated over a time, s."""
+        """Return the command of the streamed setpoint; velocities and yaw rates are integrated over ``dt``, s."""
         kind, x = self._stream  # type: ignore[misc]
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
@@ -329,11 +340,16 @@ class Commander:
         return x
 
     def _stream_setpoint(self, kind: str, values: NDArray) -> None:
-        """Make a streamed setpoint the active one, and discard the plan of high-level commands."""
+        """Make a streamed setpoint the active setpoint, and discard the planned motion."""
         if self._stream is None:
             self._last_goal = self.goal()
             self._reference = self._last_goal[0].copy()
-        self._stream, self._stream_time, self._release_time, self._plan = (kind, values), self.now, math.inf, None
+        self._stream, self._stream_time, self._release_time, self._planned_motion = (
+            (kind, values),
+            self.now,
+            math.inf,
+            None,
+        )
         self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
 
     def _move_vertically(self, height: float, duration: float, yaw: float | None, is_landing: bool) -> None:
@@ -344,7 +360,9 @@ class Commander:
         if yaw is not None:
             goal[3] = nearest_yaw(start_point[3], _check_numbers("yaw", [yaw], 1)[0])
         start = np.array([start_point, np.zeros(4), np.zeros(4)])
-        self._plan = PlannedMotion(plan_move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing)
+        self._planned_motion = PlannedMotion(
+            plan_move(start, goal, _check_duration(duration)), self.now, is_landing=is_landing
+        )
 
     def _drone_motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""

@@ -16,14 +16,14 @@ NO_JERK_INVERSE = np.linalg.inv(
 
 
 class PlannedMotion(NamedTuple):
-    """A trajectory that is flown from a time on, at a speed, in a direction and with an offset."""
+    """A trajectory with the time, speed, direction and offset of its flight."""
 
     trajectory: HostTrajectory
     """Trajectory."""
     start_time: float
     """Time at which it starts, s."""
     timescale: float = 1.0
-    """Factor of its duration, 1."""
+    """Factor of its duration."""
     reversed: bool = False
     """True if it is followed from its end to its start."""
     offset: NDArray = np.zeros(4)
@@ -36,8 +36,8 @@ class PlannedMotion(NamedTuple):
         """Time at which it ends, s."""
         return self.start_time + self.trajectory.duration * self.timescale
 
-    def finished(self, t: float) -> bool:
-        """Return True from the end of the plan on."""
+    def has_ended(self, t: float) -> bool:
+        """Return True if the motion has ended at a time, s."""
         return not self.trajectory.repeats and t >= self.end_time
 
     def evaluate(self, t: float) -> NDArray:
@@ -54,8 +54,8 @@ def plan_move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool =
     """Return the trajectory of a move that ends at rest at a goal.
 
     It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
-    end, and without jerk at both (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``); or the straight line at
-    constant speed.
+    end, and without jerk at both ends (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``); or the straight line
+    at constant speed.
 
     Args:
         start: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)

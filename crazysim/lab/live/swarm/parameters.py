@@ -16,9 +16,9 @@ LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE = 0, 7, 13, 14
 """Effects of the LED ring (``effectsFct`` in ledring12.c of crazyflie-firmware): dark, ``ring.solidRed`` and so on, the
 memory of 12 LEDs, ``ring.fadeColor``."""
 LIGHT_GROUPS = ("ring.", "colorLedBot.")
-"""Groups of parameters of lights."""
+"""Prefixes of the names of parameters that control lights."""
 INITIAL_POSE = ("kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
-"""Pose that ``kalman.resetEstimation`` gives to the estimate, m and rad."""
+"""Names of the parameters that hold the pose of the estimate after ``kalman.resetEstimation``, m and rad."""
 
 
 class Parameter(NamedTuple):
@@ -102,11 +102,15 @@ class Parameters(Mapping[str, float]):
 
     @property
     def initial_pose(self) -> NDArray:
-        """Position, m, and yaw, rad, that a reset gives to the estimate. (4,)"""
+        """Position, m, and yaw, rad, of the estimate after its reset. (4,)"""
         return np.array([self._values[name] for name in INITIAL_POSE])
 
     def get_value(self, name: str) -> float:
-        """Return the value of a parameter; a name that the simulation lacks is a ``ConfigError``."""
+        """Return the value of a parameter.
+
+        Raises:
+            ConfigError: If the simulation does not have the parameter.
+        """
         self._require_parameter(name)
         return self._values[name]
 

@@ -47,7 +47,7 @@ def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
     """Return distances from a ``MultiRanger`` or ``RangeFinder``, m, by direction (``MULTI_RANGER_DIRECTIONS``).
 
     A distance is infinite if no object is within range. Directions that the sensor does not have are missing; without a
-    sensor the result is empty. Before the first measurement of a ``MultiRanger`` the distances are the true ones.
+    sensor the result is empty. Before the first measurement of a ``MultiRanger``, the distances have no errors.
     """
     ranger = _find_plugin(sim, MultiRanger)
     plugin = _find_plugin(sim, RangeFinder) if ranger is None else sim.plugins[ranger.range_finder]
