@@ -154,8 +154,8 @@ class DroneParallelEnv(ParallelEnv):
             raise ConfigError(
                 f"expected a dict with an action of every drone, got {short_repr(actions)}. Use {{'drone_0': ...}}."
             )
-        if unknown := [agent for agent in actions if agent not in self.agents]:
-            raise UnknownNameError(f"expected actions of {', '.join(self.agents)}, got one of {unknown[0]}")
+        if unknown_agents := [agent for agent in actions if agent not in self.agents]:
+            raise UnknownNameError(f"expected actions of {', '.join(self.agents)}, got one of {unknown_agents[0]}")
         if missing_agents := [agent for agent in self.agents if agent not in actions]:
             raise ConfigError(f"expected an action of every drone, got none of {', '.join(missing_agents)}")
         shape = self.action_spaces[self.agents[0]].shape

@@ -33,11 +33,11 @@ def as_seed(seed: object) -> int | None:
 
 
 def check_key(key: object) -> None:
-    """Check that an argument is a typed random key, or an array of them."""
+    """Check that an argument is a typed random key, or an array of typed random keys."""
     if not isinstance(key, Array) or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         raise ConfigError(
-            f"expected a random key, got {short_repr(key)}. Use jax.random.key(0), or jax.random.wrap_key_data(key) if "
-            f"it comes from jax.random.PRNGKey."
+            f"expected a random key, got {short_repr(key)}. Use jax.random.key(0), or jax.random.wrap_key_data(key) "
+            f"for a key of jax.random.PRNGKey."
         )
 
 

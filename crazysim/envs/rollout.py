@@ -132,15 +132,15 @@ def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array,
     results = policy(obs, memory, key)
     if not isinstance(results, (tuple, list)) or len(results) != 3:
         raise ConfigError(
-            f"expected a policy that returns (action, memory, extras), got {short_repr(results)}. Return (action, "
-            f"memory, ()) with the memory that it receives if it needs none."
+            f"expected a policy that returns (action, memory, extras), got {short_repr(results)}. A policy without "
+            f"memory returns (action, memory, ()) with the memory that it receives."
         )
-    before, after = (
+    formats, new_formats = (
         jax.tree.map(lambda x: (jnp.shape(x), jnp.asarray(x).dtype), tree) for tree in (memory, results[1])
     )
-    if before != after:
+    if formats != new_formats:
         raise ConfigError(
-            f"expected a policy that returns a memory of the shapes and types {before}, which it received, got "
-            f"{after}. Pass initial_memory= of the shapes that it returns."
+            f"expected a policy that returns a memory of the shapes and types that it receives, {formats}, got "
+            f"{new_formats}. Pass initial_memory= of the shapes that it returns."
         )
     return results[0], results[1], results[2]

@@ -43,6 +43,7 @@ class Observe(Wrapper):
         return self._observe(state)
 
     def _observe(self, state: EnvState) -> EnvState:
+        """Return the state with the observations of ``fn``, after checking that they are a dict."""
         obs = self.fn(state.obs, state.data)
         if not isinstance(obs, Mapping) or not obs:
             raise ConfigError(
