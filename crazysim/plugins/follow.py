@@ -105,8 +105,10 @@ class Follow(Plugin):
         n_needed = max(t.n_pieces for t in trajectories)
         n_pieces = n_needed if self.max_pieces is None else _check_count("max_pieces", self.max_pieces, n_needed)
         has_room = self.n_slots is not None or self.max_pieces is not None
-        first = trajectories[0].padded(n_pieces, MIN_SLOT_DEGREE if has_room else 0)
-        slots = Trajectory.stack([first, *trajectories[1:], *[first] * (n_slots - len(trajectories))])
+        first_trajectory = trajectories[0].padded(n_pieces, MIN_SLOT_DEGREE if has_room else 0)
+        slots = Trajectory.stack(
+            [first_trajectory, *trajectories[1:], *[first_trajectory] * (n_slots - len(trajectories))]
+        )
         index = np.int32(0) if self.index is None else self.index
         if self.index is None and len(trajectories) > 1 and sim.n_drones > 1:
             index = np.broadcast_to(np.arange(sim.n_drones) % len(trajectories), (sim.n_worlds, sim.n_drones))

@@ -134,8 +134,8 @@ def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array
     if p is None:
         return translation
     x, y, z = (jnp.sum(weight * p[..., k], axis=-1) for k in range(3))
-    o = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack(r, axis=-1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
     square = jnp.sum(weight * jnp.sum(p * p, axis=-1), axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
     angular = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
     upper = jnp.concatenate([translation, -cross], axis=-1)

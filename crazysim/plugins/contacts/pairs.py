@@ -163,8 +163,8 @@ def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: 
 
     gap, pull_back = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
     normal, torque = pull_back(jnp.ones_like(gap))
-    half = jnp.asarray(box.size, pos.dtype)
-    reach = jnp.sum(jnp.abs(matvec(rot.T, normal)) * half)
+    half_lengths = jnp.asarray(box.size, pos.dtype)
+    reach = jnp.sum(jnp.abs(matvec(rot.T, normal)) * half_lengths)
     point = pos + rotation.cross(normal, torque) - reach * normal
     return Manifold(gap[None], normal[None], point[None])
 

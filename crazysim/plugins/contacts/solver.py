@@ -145,8 +145,8 @@ def solve_contacts(
     normal_response, slip_response = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
     for body_indices, sum_matrix, lever in ((a, sum_matrices[0], arm), (b, sum_matrices[1], arm + offset[pair])):
         lever_matrix = rotation.cross_matrix(lever)
-        inverse, inv_mass = bodies.inv_inertia[body_indices][pair], bodies.inv_mass[body_indices][pair]
-        angular_response = matmul(inverse, lever_matrix)
+        inv_inertia, inv_mass = bodies.inv_inertia[body_indices][pair], bodies.inv_mass[body_indices][pair]
+        angular_response = matmul(inv_inertia, lever_matrix)
         normal_compliance = (
             inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(angular_response, normal))[:, 0]
         )
@@ -176,9 +176,11 @@ def solve_contacts(
         speed = rotation.dot(contact_vel, normal)[:, 0]
         normal_impulse = jnp.where(is_near, jnp.maximum(y + (target_speed - speed) / normal_response, 0.0), 0.0)
         friction_impulse = z - (contact_vel - speed[:, None] * normal) / slip_response[:, None]
-        size, limit = rotation.safe_norm(friction_impulse), (contacts.friction * normal_impulse)[:, None]
+        friction_size, limit = rotation.safe_norm(friction_impulse), (contacts.friction * normal_impulse)[:, None]
         friction_impulse = jnp.where(
-            size > limit, friction_impulse * (limit / jnp.where(size > 0, size, 1.0)), friction_impulse
+            friction_size > limit,
+            friction_impulse * (limit / jnp.where(friction_size > 0, friction_size, 1.0)),
+            friction_impulse,
         )
         # Momentum that points uphill is dropped (O'Donoghue and Candes 2015).
         normal_slope = (y - normal_impulse) * normal_response * (normal_impulse - current.normal)

@@ -139,7 +139,7 @@ class RotorAerodynamics(Plugin):
         record, s, p = self.read(data), data.states, data.params
         vel = rotation.rotate_inverse(s.quat, s.vel - air_velocity(data))
         hub_vel = vel + rotation.cross(s.ang_vel, record.hub_pos)
-        u, v, axial = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
+        u, v, axial_vel = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
         speed = RPM_TO_RAD_S * s.rotor_vel
         static_thrust = quadratic_curve(s.rotor_vel, p.rpm2thrust)
         blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
@@ -148,7 +148,14 @@ class RotorAerodynamics(Plugin):
             height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
             ceiling_gain = ceiling_factor(record.ceiling - height, record.propeller_radius)
         thrust = thrust_in_flight(
-            static_thrust, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, ceiling_gain
+            static_thrust,
+            speed,
+            axial_vel,
+            u * u + v * v,
+            blade,
+            record.propeller_radius,
+            record.air_density,
+            ceiling_gain,
         )
         thrust_change = jnp.where(blade > 0, thrust - jnp.where(static_thrust > 0, static_thrust, 0.0), 0.0)
 

@@ -89,9 +89,9 @@ class Complementary(Estimator):
     def record(self, sim: Simulation) -> ComplementaryData:
         self.check_sensors(sim)
         if not self.aiding_sensors or len({type(sensor) for sensor in self.aiding_sensors}) < len(self.aiding_sensors):
-            got = [type(sensor).__name__ for sensor in self.aiding_sensors]
+            classes = [type(sensor).__name__ for sensor in self.aiding_sensors]
             raise ConfigError(
-                f"expected a Barometer, a TimeOfFlight or one of each among the sensors of {self.name!r}, got {got}"
+                f"expected a Barometer, a TimeOfFlight or one of each among the sensors of {self.name!r}, got {classes}"
             )
         if self.control and sim.data.controls.mode == Control.state:
             raise ConfigError(
@@ -156,15 +156,15 @@ class Complementary(Estimator):
         return new_height, over_surface
 
 
-def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
+def filtered_height(height: Array, measured_height: Array, shift: Array) -> Array:
     """Return the height after an update, m. (1,)
 
     Args:
         height: Height before the update, m. (1,)
-        measured: Measured height, m. (1,)
+        measured_height: Measured height, m. (1,)
         shift: Change of the height in the interval by the inertial velocity, m. (1,)
     """
-    return HEIGHT_WEIGHT * height + (1 - HEIGHT_WEIGHT) * measured + shift
+    return HEIGHT_WEIGHT * height + (1 - HEIGHT_WEIGHT) * measured_height + shift
 
 
 def height_over_surface(
@@ -205,8 +205,8 @@ def update_mahony(
     integral = integral + ki * dt * error
     has_force = jnp.any(accel != 0)
     rate = gyro + jnp.where(has_force, integral + kp * error, 0.0)
-    step = jnp.concatenate([0.5 * dt * rate, jnp.ones_like(rate[:1])])
-    return rotation.safe_normalize(rotation.multiply(quat, step), quat), integral
+    quat_step = jnp.concatenate([0.5 * dt * rate, jnp.ones_like(rate[:1])])
+    return rotation.safe_normalize(rotation.multiply(quat, quat_step), quat), integral
 
 
 def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:

@@ -185,15 +185,15 @@ def predict_biased(
         accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
-    vel, predicted = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
+    vel, predicted_estimate = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
     mid_quat = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
-    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, mid_quat, predicted.quat))
+    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, mid_quat, predicted_estimate.quat))
 
     error_rot, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
     vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
     gravity_to_vel, gyro_to_vel = (
         dt * rotation.cross_matrix(rot_end.T @ gravity),
-        -dt * rotation.cross_matrix(predicted.vel),
+        -dt * rotation.cross_matrix(predicted_estimate.vel),
     )
 
     def transform_errors(p: Array) -> Array:
@@ -209,7 +209,7 @@ def predict_biased(
     vel_att_noise = -dt * gyro_noise
     p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(vel_att_noise).at[6:9, 3:6].add(vel_att_noise.T)
     p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
-    return predicted.replace(cov=bound_covariance(p))
+    return predicted_estimate.replace(cov=bound_covariance(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
@@ -242,14 +242,17 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     p = jnp.where(is_unused, p, 0.0) + reduction @ p[jnp.asarray(rows)]
     p = jnp.where(is_unused.T, p, 0.0) + p[:, rows] @ reduction.T
     p = p + r * gain[:, None] * gain
-    step = error * gain
+    correction = error * gain
     biases = {}
     if estimate.accel_bias is not None and estimate.gyro_bias is not None:
-        biases = {"accel_bias": estimate.accel_bias + step[9:12], "gyro_bias": estimate.gyro_bias + step[12:]}
+        biases = {
+            "accel_bias": estimate.accel_bias + correction[9:12],
+            "gyro_bias": estimate.gyro_bias + correction[12:],
+        }
     return estimate.replace(
-        pos=estimate.pos + step[:3],
-        vel=estimate.vel + step[3:6],
-        att_error=estimate.att_error + step[6:9],
+        pos=estimate.pos + correction[:3],
+        vel=estimate.vel + correction[3:6],
+        att_error=estimate.att_error + correction[6:9],
         cov=bound_covariance(p),
         **biases,
     )
@@ -300,8 +303,8 @@ def turn_attitude(quat: Array, angle: Array, resting_quat: Array | None = None) 
     """
     size = rotation.safe_norm(angle) + NORM_EPSILON
     half_angle = 0.5 * size
-    step = jnp.concatenate([jnp.sin(half_angle) / size * angle, jnp.cos(half_angle)])
-    quat = rotation.multiply(quat, step)
+    quat_step = jnp.concatenate([jnp.sin(half_angle) / size * angle, jnp.cos(half_angle)])
+    quat = rotation.multiply(quat, quat_step)
     if resting_quat is not None:
         quat = (1 - REVERSION_FRACTION) * quat + REVERSION_FRACTION * resting_quat
     return quat / (rotation.safe_norm(quat) + NORM_EPSILON)

@@ -274,10 +274,10 @@ def _use_satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) ->
 def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     altitude = estimate.pos[2:] + record.altitude
-    predicted = pressure_at(altitude)
-    slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
+    predicted_pressure = pressure_at(altitude)
+    slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted_pressure / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
     std = _combined_std(record.noise, record.drift, record.offset_spread, min_std=100 * MIN_STD)
-    error = sensor.part(data, "pressure") - predicted
+    error = sensor.part(data, "pressure") - predicted_pressure
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 

@@ -114,8 +114,8 @@ class Estimator(Plugin):
         """Check that there is one ``IMU``, that all kinds are supported, and that the simulation has all sensors."""
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
-            got = [type(sensor).__name__ for sensor in self.sensors]
-            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {got}")
+            classes = [type(sensor).__name__ for sensor in self.sensors]
+            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {classes}")
         for sensor in self.aiding_sensors:
             if type(sensor) not in self.kinds:
                 raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")

@@ -84,9 +84,9 @@ def link_geometry(state: SimState, pos: Array, vel: Array, attach: Array | None)
     if attach is not None:
         arm = matvec(rot, attach)
         offset, rel_vel = offset - arm, matvec(rot, -cross(state.ang_vel, attach), rel_vel)
-    square = dot(offset, offset)
-    inverse_distance = lax.rsqrt(square + MIN_SQUARED_LENGTH)
-    return LinkGeometry(rot, arm, offset, square * inverse_distance, offset * inverse_distance, rel_vel)
+    squared_distance = dot(offset, offset)
+    inverse_distance = lax.rsqrt(squared_distance + MIN_SQUARED_LENGTH)
+    return LinkGeometry(rot, arm, offset, squared_distance * inverse_distance, offset * inverse_distance, rel_vel)
 
 
 class LinkedMotion(NamedTuple):

@@ -59,6 +59,6 @@ def _ball_panels(radius: float, max_edge: float) -> Panels:
     n = max(MIN_BALL_PANELS, math.ceil(surface / max_edge**2))
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     angle = np.arange(n) * math.pi * (3 - math.sqrt(5))
-    horizontal = np.sqrt(1 - z**2)
-    normal = np.stack([horizontal * np.cos(angle), horizontal * np.sin(angle), z], axis=-1)
+    horizontal_radius = np.sqrt(1 - z**2)
+    normal = np.stack([horizontal_radius * np.cos(angle), horizontal_radius * np.sin(angle), z], axis=-1)
     return Panels(radius * normal, normal, np.full((n, 1), surface / n))

@@ -119,10 +119,10 @@ def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None
         acc = acc + jnp.where(load.mass > 0, jet / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
     if load.air_vel is None or load.drag is None:
         return acc
-    air = wind_at(data, load.pos) + load.air_vel
+    air_vel = wind_at(data, load.pos) + load.air_vel
     if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
-        air = air + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
-    return acc + drag_rate(load.drag, load.mass, dt, data.core.freq) * (air - load.vel)
+        air_vel = air_vel + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
+    return acc + drag_rate(load.drag, load.mass, dt, data.core.freq) * (air_vel - load.vel)
 
 
 def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:

@@ -166,11 +166,11 @@ def jet_pressure(
     drone_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in drone_values)
     offset = pos - drone_pos
 
-    def momentum_flux(air: Array) -> Array:
-        relative_vel = air - vel[..., None, :]
+    def momentum_flux(air_vel: Array) -> Array:
+        relative_vel = air_vel - vel[..., None, :]
         closing_speed = -rotation.dot(relative_vel, normal)
         # Only air in the jet transfers momentum: still air outside it exerts no force on a load that moves.
-        is_in_jet = rotation.dot(air, air) > 0
+        is_in_jet = rotation.dot(air_vel, air_vel) > 0
         return jnp.where(is_in_jet & (closing_speed > 0), density * closing_speed, 0.0) * relative_vel
 
     if record.speeds is None:

@@ -125,8 +125,8 @@ class Scenery(Plugin):
         gaps, start = [], 0
         for model in self.models():
             rows = slice(start, start + len(model.pos))
-            local = rotation.rotate_inverse(quat[..., rows, :], pos[..., None, :] - obstacle_pos[..., rows, :])
-            gaps += [point_distance(shape, local - jnp.asarray(x, pos.dtype)) for shape, x in model.shapes]
+            body_pos = rotation.rotate_inverse(quat[..., rows, :], pos[..., None, :] - obstacle_pos[..., rows, :])
+            gaps += [point_distance(shape, body_pos - jnp.asarray(x, pos.dtype)) for shape, x in model.shapes]
             start = rows.stop
         return functools.reduce(jnp.minimum, [jnp.min(gap, axis=-1) for gap in gaps])
 

@@ -79,8 +79,8 @@ class Camera(ImageSensor):
             return distance
         cosine = jnp.asarray(self.rays[..., 0], distance.dtype)
         depth = distance * cosine
-        measured = self.noise.apply(depth, self.focal, key)
-        return jnp.where(depth < self.far * (1 - 1e-6), measured, self.far) / cosine
+        measured_depth = self.noise.apply(depth, self.focal, key)
+        return jnp.where(depth < self.far * (1 - 1e-6), measured_depth, self.far) / cosine
 
     @property
     def optics(self) -> dict[str, Any]:

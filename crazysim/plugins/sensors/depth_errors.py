@@ -67,12 +67,14 @@ class StereoNoise:
             key: Random key.
         """
         deviation = depth**2 * (self.disparity_noise / (self.focal * self.baseline))
-        measured = depth + deviation * normal(key, depth.shape, depth.dtype)
-        measured = quantise(measured, jnp.asarray(self.resolution, depth.dtype)) if self.resolution else measured
+        measured_depth = depth + deviation * normal(key, depth.shape, depth.dtype)
+        measured_depth = (
+            quantise(measured_depth, jnp.asarray(self.resolution, depth.dtype)) if self.resolution else measured_depth
+        )
         is_hole = depth < self.min_depth
         if self.has_holes:
             is_hole |= self.is_occluded(depth, image_focal)
-        return jnp.where(is_hole, 0.0, measured)
+        return jnp.where(is_hole, 0.0, measured_depth)
 
     def is_occluded(self, depth: Array, image_focal: float) -> Array:
         """Return True for pixels that the second imager does not see; see ``apply``. (height, width)"""

@@ -92,8 +92,8 @@ class Lidar(ImageSensor):
     @property
     def rays(self) -> np.ndarray:
         elevation, azimuth = np.meshgrid(np.radians(self.elevation), np.radians(self.azimuth), indexing="ij")
-        horizontal = np.cos(elevation)
-        return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        cos_elevation = np.cos(elevation)
+        return np.stack([cos_elevation * np.cos(azimuth), cos_elevation * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
     @property
     def optics(self) -> dict[str, Any]:
@@ -109,11 +109,11 @@ class Lidar(ImageSensor):
 
     def measure(self, distance: Array, key: Array) -> Array:
         deviation = self.noise + self.relative_noise * distance
-        measured = distance + deviation * normal(key, distance.shape, distance.dtype)
+        measured_distance = distance + deviation * normal(key, distance.shape, distance.dtype)
         if self.resolution:
-            measured = quantise(measured, jnp.asarray(self.resolution, distance.dtype))
+            measured_distance = quantise(measured_distance, jnp.asarray(self.resolution, distance.dtype))
         has_return = (distance < self.max_range) & (distance >= self.min_range)
         if self.dropout:
             random_numbers = uniform(jax.random.fold_in(key, 1), distance.shape, distance.dtype)
             has_return &= random_numbers >= self.dropout
-        return jnp.where(has_return, jnp.clip(measured, 0.0, self.max_range), self.max_range)
+        return jnp.where(has_return, jnp.clip(measured_distance, 0.0, self.max_range), self.max_range)

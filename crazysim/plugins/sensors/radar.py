@@ -156,10 +156,16 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
 def lobe_curves(max_range: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
     """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
     half_range, t = 0.5 * max_range, np.linspace(0.0, math.pi, N_POINTS)
-    axial, lateral = half_range * (1 - np.cos(t)), height_scale * half_range * np.sin(t) * np.sin(t / 2) ** exponent
-    axial, lateral = np.concatenate([axial, axial[::-1]]), np.concatenate([lateral, -lateral[::-1]])
-    level_distance = axial * math.cos(tilt) - lateral * math.sin(tilt)
-    height = axial * math.sin(tilt) + lateral * math.cos(tilt)
+    axial_pos, lateral_pos = (
+        half_range * (1 - np.cos(t)),
+        height_scale * half_range * np.sin(t) * np.sin(t / 2) ** exponent,
+    )
+    axial_pos, lateral_pos = (
+        np.concatenate([axial_pos, axial_pos[::-1]]),
+        np.concatenate([lateral_pos, -lateral_pos[::-1]]),
+    )
+    level_distance = axial_pos * math.cos(tilt) - lateral_pos * math.sin(tilt)
+    height = axial_pos * math.sin(tilt) + lateral_pos * math.cos(tilt)
     meridians = np.linspace(0.0, 2 * math.pi, N_MERIDIANS, endpoint=False)
     curves = [
         np.stack([level_distance * math.cos(a), level_distance * math.sin(a), height], axis=-1) for a in meridians

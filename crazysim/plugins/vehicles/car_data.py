@@ -91,8 +91,8 @@ class CarData(Members):
 
 @jit_eager_calls()
 def _level_vel(yaw: Array, body_vel: Array) -> Array:
-    level = to_world_frame(yaw, body_vel)
-    return jnp.concatenate([level, jnp.zeros_like(yaw)], axis=-1)
+    level_vel = to_world_frame(yaw, body_vel)
+    return jnp.concatenate([level_vel, jnp.zeros_like(yaw)], axis=-1)
 
 
 @jit_eager_calls()

@@ -216,9 +216,9 @@ class Path(PyTree):
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
         """Return the arc length of the point of a path nearest to a position, from a guess nearby.
 
-        Newton's method, with steps ``along_error / (1 - curvature lateral)`` of at most ``MAX_NEWTON_STEP``, where
-        ``along_error`` and ``lateral`` are the components of the offset along the tangent and to its left. Usable in
-        compiled code. On a closed path the arc length increases with every lap.
+        Newton's method, with steps ``along_error / (1 - curvature lateral_error)`` of at most ``MAX_NEWTON_STEP``. The
+        errors are the components of the offset along the tangent and to its left. Usable in compiled code.
+        On a closed path the arc length increases with every lap.
 
         Args:
             index: Index of the path. ()
@@ -233,9 +233,11 @@ class Path(PyTree):
             point = self.point_at(index, s)
             offset = pos - point.pos
             along_error = offset[0] * point.tangent[0] + offset[1] * point.tangent[1]
-            lateral = point.tangent[0] * offset[1] - point.tangent[1] * offset[0]
+            lateral_error = point.tangent[0] * offset[1] - point.tangent[1] * offset[0]
             s = s + clip(
-                along_error / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
+                along_error / jnp.maximum(1 - point.curvature[0] * lateral_error, 0.2),
+                -MAX_NEWTON_STEP,
+                MAX_NEWTON_STEP,
             )
             s = jnp.where(is_closed, s, clip(s, 0.0, length))
         return s

@@ -133,8 +133,8 @@ def matrix_exponential(matrix: Array) -> Array:
 
     In float64 its relative error is below 1e-12 for norms up to 100.
     """
-    eye, scaled = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
+    eye, scaled_matrix = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
     total = eye
     for k in range(6, 0, -1):
-        total = eye + scaled @ total / k
+        total = eye + scaled_matrix @ total / k
     return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, total)
