@@ -18,7 +18,7 @@ from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, m
 from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, host_array, leaf, static
 
 SimParams = first_principles.Params | fitted.Params
@@ -246,6 +246,12 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
     """Return the shape of a command to all drones, (n_worlds, n_drones, k)."""
     n_worlds, n_drones, n_rotors = data.states.rotor_vel.shape
     return n_worlds, n_drones, command_size(control, n_rotors)
+
+
+def require_data(data: object) -> None:
+    """Check that an argument is the data of a simulation."""
+    if not isinstance(data, SimData):
+        raise ConfigError(f"expected the data of a simulation, got {short_repr(data)}. Use sim.data.")
 
 
 def as_key(seed: int | Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
-from crazysim.core.data import SimData, command_shape
+from crazysim.core.data import SimData, command_shape, require_data
 from crazysim.core.settings import check_flag
 from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError, short_repr
@@ -74,6 +74,7 @@ def check_setpoint(
 
     Arguments and errors are those of ``state_control``, but leaves of ``data`` may also be ``jax.ShapeDtypeStruct``.
     """
+    require_data(data)
     explicit_parts = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
         controls = _join_setpoint(data, explicit_parts)
@@ -225,11 +226,13 @@ def _compiled_default_feedforward(command: Array) -> Array:
 
 def time(data: SimData) -> Array:
     """Return the time since each world's last reset, s. (n_worlds, 1)"""
+    require_data(data)
     return data.core.steps / data.core.freq
 
 
 def controllable(data: SimData) -> Array:
     """Return True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
+    require_data(data)
     mode = data.controls.mode
     mask = None if mode == Control.rotor_vel else is_tick(data, getattr(data.controls, mode.value).freq)
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask
@@ -241,6 +244,7 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
     Leaves of ``data`` may be ``jax.ShapeDtypeStruct`` instead of arrays. A command on the host is copied and
     stays on the host; ``put_command`` moves it to the device.
     """
+    require_data(data)
     if data.controls.mode != control:
         raise ConfigError(
             f"this simulation takes {data.controls.mode.value!r} commands, not {control.value!r}. "

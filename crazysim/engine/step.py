@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.data import MAX_STEPS, SimData
+from crazysim.core.data import MAX_STEPS, SimData, require_data
 from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, find_location
@@ -169,6 +169,7 @@ class Step:
                 parameters are unknown under a trace, and no terms are left out.
         """
         _check_steps(n_steps)
+        require_data(data)
         leaves, treedef = jax.tree.flatten(data)
         flat_after = self.advance(self._flatten(data, leaves, treedef, zeros, n_steps), n_steps)
         return treedef.unflatten(flat_after.leaves[: len(leaves)])

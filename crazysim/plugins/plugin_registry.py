@@ -22,7 +22,7 @@ from crazysim.core.population import Population
 from crazysim.core.settings import collect_settings
 from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, n_batch_axes
 
@@ -119,6 +119,8 @@ class PluginRegistry(Mapping[str, Plugin]):
             return self._replace_plugin(plugin)
 
     def _replace_plugin(self, plugin: P) -> P:
+        if not isinstance(plugin, Plugin):
+            raise ConfigError(f"expected a plugin, got {short_repr(plugin)}. Use sim.replace(Wind(...)), for example.")
         old_plugin = self[plugin.name]
         if type(old_plugin) is not type(plugin):
             raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, require_data
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
@@ -29,6 +29,7 @@ def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
 
     If ``data.objects.recorded`` is True, the data is returned unchanged.
     """
+    require_data(data)
     if not plugins or data.objects is None or data.objects.recorded:
         return data
     if data.states.pos.ndim == 1:

@@ -14,10 +14,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.data import Objects, SimData
+from crazysim.core.data import Objects, SimData, require_data
 from crazysim.core.settings import as_mask, check_flag, positive_integer
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
@@ -94,6 +94,7 @@ class Handle:
         return _select_rows(objects.pos, self.rows), _select_rows(objects.quat, self.rows)
 
     def _objects(self, data: SimData) -> Objects:
+        require_data(data)
         if not self.movable:
             raise ConfigError(f"expected objects added with mocap=True, got {self.name!r}, which cannot be moved")
         names = data.objects.names if data.objects is not None else ()
@@ -191,6 +192,8 @@ class SceneObjects:
     ) -> Handle:
         """Add bodies to a spec, and return their handle; see ``Scene.add``."""
         name = _default_name(source) if name is None else name
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"expected a non-empty string as name of an object, got {short_repr(name)}")
         numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
         used_names = sorted({body.name for body in spec.bodies} & {name, *names})

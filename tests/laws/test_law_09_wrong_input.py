@@ -48,11 +48,11 @@ WRONG_SETTINGS = [
     ({"dynamics": "so_rpy_rotor", "control": "force_torque"}, "'force_torque'", "dynamics='first_principles'"),
     ({"dynamics": "so_rpy_rotor_drag", "control": "body_rate"}, "'body_rate'", "dynamics='first_principles'"),
     ({"drone": "hb_x500"}, "expected dynamics that drone 'hb_x500' has parameters for", "so_rpy"),
-    ({"device": "abacus"}, "'abacus' does not exist", "'cpu' or 'gpu'"),
-    ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
+    ({"device": "abacus"}, "got 'abacus'", "'cpu' or 'gpu'"),
+    ({"device": "cpu:99"}, "got 'cpu:99'", "'cpu' or 'gpu'"),
     ({"device": None}, "got None", "jax.Device"),
-    ({"device": ""}, "got ''", "use device='cpu'"),
-    ({"device": "cpu:-1"}, "got 'cpu:-1'", "use device='cpu'"),
+    ({"device": ""}, "got ''", "Use device='cpu'"),
+    ({"device": "cpu:-1"}, "got 'cpu:-1'", "Use device='cpu'"),
     ({"drone": []}, "got an empty list", "a list with one for each drone"),
     ({"drone": [], "n_drones": 3}, "got an empty list", "a list with one for each drone"),
     ({"mesh": 2}, "got 2", "world_mesh"),
@@ -336,3 +336,41 @@ def test_data_of_another_simulation_is_refused_where_it_is_assigned(sim, name, w
 def test_commands_under_jit_are_checked_in_shape_too(sim):
     with pytest.raises(ValueError, match=r"has shape \(1, 4\)"):
         jax.eval_shape(lambda data, cmd: F.attitude_control(data, cmd, check_finite=True), sim.data, jnp.zeros((1, 4)))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda sim, data: F.state_control(data, pos=[0, 0, 1]),
+        lambda sim, data: F.attitude_control(data, np.zeros((3, 1, 4))),
+        lambda sim, data: F.time(data),
+        lambda sim, data: F.controllable(data),
+        lambda sim, data: sim.step_fn(data),
+        lambda sim, data: sim.reset_fn(data, sim.default_data),
+        lambda sim, data: sim.reset_fn(sim.data, data),
+        lambda sim, data: sim.scene.contact_fn()(data),
+        lambda sim, data: sim.scene.depth_fn(width=2, height=2)(data),
+    ],
+)
+def test_a_simulation_in_place_of_its_data_is_refused_by_pure_functions(sim, call):
+    for data in (sim, None):
+        with pytest.raises(ConfigError, match=r"expected the data of a simulation, got .*sim\.data"):
+            call(sim, data)
+
+
+def test_default_data_of_another_simulation_are_refused_by_a_reset(sim):
+    for other in (Sim(n_worlds=2), Sim(n_worlds=3, control="state")):
+        with pytest.raises(ConfigError, match="of one simulation"):
+            sim.reset_fn(sim.data, other.default_data)
+
+
+@pytest.mark.parametrize("name", ["", 5])
+def test_a_name_of_an_object_is_a_text(sim, name):
+    with pytest.raises(ConfigError, match="non-empty string as name of an object"):
+        sim.scene.add("box", name=name)
+
+
+def test_replace_takes_a_plugin(sim):
+    for plugin in (None, "wind"):
+        with pytest.raises(ConfigError, match="expected a plugin"):
+            sim.replace(plugin)

@@ -11,12 +11,13 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, require_data
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import PHASES, Axes, Phase, Stage
 from crazysim.core.stages import nonfinite_worlds
 from crazysim.engine.backends import Run
+from crazysim.errors import ConfigError
 from crazysim.pytree import leaf_flags, replace_leaves
 
 
@@ -97,6 +98,14 @@ class Reset:
             default_data: The data to return to.
             mask: True in the worlds to reset; None for all. (n_worlds,)
         """
+        require_data(data)
+        require_data(default_data)
+        if (data.core.n_worlds, data.core.n_drones, data.controls.mode) != (
+            default_data.core.n_worlds, default_data.core.n_drones, default_data.controls.mode,
+        ):  # fmt: skip
+            raise ConfigError(
+                "expected data and default_data of one simulation, got those of two. Use its default_data."
+            )
         mask = as_mask(mask, data.core.steps.shape[:1])
         with keep_programs(enabled=not self._cache_size()):
             return self._compiled(data, default_data, mask)
