@@ -34,7 +34,7 @@ least recently used files are removed."""
 TRIMMED_FRACTION = 0.8
 """Fraction of ``MAX_CACHE_BYTES`` to which a removal reduces the size, so that not every process removes files."""
 MIN_FREE_BYTES = 50_000_000
-"""Smallest free space of a disk on which programs are kept, bytes; the programs of a few simulations need it."""
+"""Smallest free space on the disk of the cache, bytes: the size of the programs of a few simulations."""
 CACHE_FILE_PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
             "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")  # fmt: skip
 """Names of the files that JAX, XLA and the engine write; other files in the folder are never removed."""
@@ -60,7 +60,7 @@ def default_folder() -> Path | None:
     """Return the folder that is used by default; None where ``CRAZYSIM_CACHE`` is ``off``.
 
     XLA's programs are machine code, but their names do not depend on the features of the CPU. Therefore each kind of
-    CPU has a subfolder of its own.
+    CPU has a separate subfolder.
 
     Raises:
         ConfigError: If the path depends on a home folder that does not exist.
@@ -176,7 +176,7 @@ def enable_cache(
             the default folder cannot be used, no programs are kept and None is returned. A line on stderr reports a
             folder that cannot be used.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
-        min_compile_time_secs: Shortest compilation whose program is kept, s.
+        min_compile_time_secs: Smallest duration of a compilation to keep its program, s.
         enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
 
     Raises:

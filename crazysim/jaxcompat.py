@@ -12,7 +12,7 @@ removed it, and whether the replacement is implemented:
   while NumPy has a view of it. The compiled step replaces them, and ``jit_donating`` donates nothing. Implemented here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
   of XLA's foreign function interface that launches them. Implemented in ``engine/backends/ffi_handlers.py``.
-- **Primitives of our own** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
+- **Custom primitives** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
   ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. Not implemented.
 - **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): no replacement. A stage
   with a primitive that has changed is run unfused.
@@ -177,7 +177,7 @@ class Parameters(dict):
 
 @dataclasses.dataclass(frozen=True)
 class Equation:
-    """Equation of a jaxpr whose parameters are checked as they are read."""
+    """Equation of a jaxpr; its parameters are checked when they are read."""
 
     primitive: Any
     """Primitive, with its ``name``."""
@@ -232,7 +232,7 @@ def batched_primitive(
 
 
 def simple_primitive(name: str, fn: Callable[..., list[Any]], batching_rule: Callable[..., Any]) -> Primitive:
-    """Return a primitive for a function without a derivative that has a rule of its own for ``vmap``.
+    """Return a primitive for a function without a derivative, with a custom rule for ``vmap``.
 
     Args:
         name: Its name.
@@ -418,7 +418,7 @@ def bits_generator(dtype: Any) -> str:
 
 
 def add_vmap_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with a rule of its own for ``vmap``.
+    """Return a function with a custom rule for ``vmap``.
 
     Args:
         fn: The function.

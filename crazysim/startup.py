@@ -25,7 +25,7 @@ __version__ = "0.2.0"
 """The version of the package; ``pyproject.toml`` says the same."""
 
 refused_variables: dict[str, str] = {}
-"""Environment variables whose values could not be used, with the user's values."""
+"""Values of environment variables that could not be used, by variable."""
 
 
 def set_variables() -> None:

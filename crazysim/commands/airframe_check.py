@@ -26,7 +26,7 @@ from crazysim.storage import open_replacement
 STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 """Controllers that follow state commands, besides Crazyflow's cascade."""
 QUARTER_TURN = np.pi / 2
-"""Angle of the turn whose duration and largest rate are printed, rad."""
+"""Angle of the turn for which duration and largest rate are printed, rad."""
 MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given (dimensionless)."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}

@@ -401,7 +401,7 @@ def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
 
 
 class FunctionPlugin(Plugin):
-    """A plugin made of a record and functions, for parts that need no class of their own."""
+    """A plugin made of a record and functions, for parts that need no class."""
 
     name: str
     data: PyTree | None = None

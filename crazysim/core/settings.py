@@ -144,7 +144,7 @@ def color(per_item: bool = False) -> Any:
 def collect_settings(kind: type) -> dict[str, Setting]:
     """Return the declarations of a class's fields by ``setting`` or ``parameter``.
 
-    A field that overrides a field of a base class inherits its declaration, unless it has one of its own.
+    A field without a declaration inherits the declaration of the field of the same name in a base class.
     """
     settings = {}
     for base in reversed(kind.__mro__):
@@ -157,10 +157,10 @@ def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` must have values of that kind,
-    with finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and
-    fields of ``Callable`` and ``Mapping`` have functions and mappings of any kind. None is accepted where the
-    annotation or the default allows it. Shapes that depend on the simulation, such as shapes of
-    parameters, are checked with it.
+    with finite numbers in the range of ``setting`` or ``parameter``. Fields annotated with a class must have instances
+    of the class, and fields of ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted if the
+    annotation or the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked
+    later.
     """
     kind = type(settings)
     for field in dataclasses.fields(settings):

@@ -40,7 +40,7 @@ class Location(NamedTuple):
 
 
 def find_location(x: jax.Array) -> Location:
-    """Return the devices of an array whose first axis is over worlds."""
+    """Return the devices of an array with a first axis over worlds, and the distribution of worlds over them."""
     devices = tuple(sorted(x.sharding.device_set, key=lambda d: d.id))
     platform = devices[0].platform
     if len(devices) == 1 or not isinstance(x.sharding, NamedSharding):

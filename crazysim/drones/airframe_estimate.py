@@ -110,7 +110,7 @@ def estimate_airframe(
     resistance: float | None = None,
     name: str = "my_drone",
 ) -> str:
-    """Return the TOML text of an airframe whose constants are estimated from a few numbers.
+    """Return the TOML text of an airframe with constants that are estimated from a few numbers.
 
     The file has the values that the first-principles dynamics, the battery and the controllers without tuned gains
     need, and no gains. Each estimate states its formula and source.
@@ -188,7 +188,7 @@ class _AirframeFile:
         self.sources: dict[str, str] = {}
 
     def add(self, table: str, key: str, value: ArrayLike, unit: str, source: str, **numbers: Any) -> None:
-        """Add a number with its unit and a source of ``SOURCES``, whose text is formatted with ``numbers``."""
+        """Add a number with its unit and a source of ``SOURCES``; ``numbers`` fill the template of the source."""
         if source not in self.sources:
             self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
         line = f'{key} = {{ value = {_toml_value(value)}, unit = "{unit}", source = "{source}" }}'

@@ -41,7 +41,7 @@ def load_airframe(source: AirframeSource) -> Airframe:
 
     Raises:
         UnknownNameError: If the source is neither the name of an airframe nor a file.
-        ConfigError: If the file has an unknown table or key, or numbers that cannot belong to a drone.
+        ConfigError: If the file has an unknown table or key, or numbers with which no drone can fly.
     """
     return _load(source, ())
 

@@ -138,7 +138,7 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
             hit = _nearer_hit((jnp.where(is_on_triangle, t, jnp.inf), n), hit)
         step = jnp.int32(1)
-        # Continue with the neighbour whose border is nearer.
+        # Continue with the neighbouring cell that the ray enters first.
         goes_right, goes_up = du > 0, dv > 0
         is_moving_x, is_moving_y = jnp.abs(du) > MIN_COMPONENT, jnp.abs(dv) > MIN_COMPONENT
         t_x = jnp.where(is_moving_x, (jnp.where(goes_right, 1.0, 0.0) - x) / jnp.where(is_moving_x, du, 1.0), jnp.inf)

@@ -140,7 +140,7 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
 def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
     """Return gaps, normal and points of the contact between a face of a box and the nearest face of another box.
 
-    The normal points towards the other box, whose face is clipped to the face of the first.
+    The normal points towards the other box. The face of the other box is clipped to the face of the first.
 
     Args:
         face: Half lengths, position and attitude of the box with the face.

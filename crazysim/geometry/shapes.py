@@ -13,7 +13,7 @@ from crazysim.errors import ConfigError
 N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
 """Number of entries of ``Shape.size`` for each kind."""
 MAX_HULL_VERTICES = 64
-"""Largest number of vertices whose convex hull is computed, by trying every triangle."""
+"""Largest number of vertices for which ``hull`` computes the convex hull; it tries every triangle."""
 UNBOUNDED_LENGTH = 1e18
 """Half length of unbounded shapes in ``bounding_box``, m; float32 can hold its square."""
 

@@ -210,7 +210,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
 
 
 def _drone_numbers(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
-    """Return the elements of a leaf that belong to one drone, as float64. (size,)"""
+    """Return the elements of a leaf for one drone, as float64. (size,)"""
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
     index = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())
     return x[index].astype(np.float64).reshape(-1)

@@ -228,7 +228,7 @@ class MPPI:
         costs = final.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         excess_cost = costs - jnp.min(costs, axis=1, keepdims=True)
-        is_finite = jnp.isfinite(excess_cost)  # a drone whose rollouts all failed keeps its plan
+        is_finite = jnp.isfinite(excess_cost)  # the plan of a drone does not change if all of its rollouts fail
         mean_excess = jnp.sum(jnp.where(is_finite, excess_cost, 0.0), axis=1, keepdims=True) / jnp.maximum(
             jnp.sum(is_finite, axis=1, keepdims=True), 1
         )

@@ -142,9 +142,9 @@ class Sim:
                 sensors and the estimator are added before ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
                 for the dynamics model only. Shorthand for ``Residual()`` before ``plugins``.
-            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. A
-                plugin whose initial state depends on the drones' poses, such as a load, should be added by ``add``
-                when they are in place.
+            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. If the initial
+                state of a plugin depends on the drones' poses, such as that of a load, place the drones first, and then
+                call ``add``.
         """
         rates = {
             Control.state: state_freq,
@@ -195,8 +195,9 @@ class Sim:
     ) -> Sim:
         """Return a simulation with the vehicles of an MJCF, at their poses; everything else in the file is the scene.
 
-        Vehicles are the children of the world with a joint, or mocap bodies, whose names are a prefix and a number:
-        ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by the airframes' bodies.
+        Vehicles are children of the world body that have a joint, or are mocap bodies, and have a name made of a prefix
+        and a number: ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by the bodies
+        of the airframes.
 
         Args:
             xml_path: MJCF file.

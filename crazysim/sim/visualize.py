@@ -112,7 +112,7 @@ def change_material(
     rgba: ArrayLike | None = None,
     emission: ArrayLike | None = None,
 ) -> None:
-    """Change the colour or emission of a material that belongs to each drone: ``led_top`` or ``led_bot``.
+    """Change the colour or emission of the material ``led_top`` or ``led_bot`` of some drones.
 
     Args:
         sim: Simulation.

@@ -47,7 +47,7 @@ def sys_id_translation(
         dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
         mass: Mass, kg.
         data: A log from ``derivatives_svf``.
-        data_validation: A log that is not fitted, for which the error is reported; None for none.
+        data_validation: A held-out log, to report its error; None for none.
         gravity: Gravitational acceleration, world frame, m/s^2. (3,)
         verbose: Ignored: results are logged at level INFO.
         plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
@@ -81,7 +81,7 @@ def sys_id_rotation(
 
     Args:
         data: A log from ``derivatives_svf``.
-        data_validation: A log that is not fitted, for which the error is reported; None for none.
+        data_validation: A held-out log, to report its error; None for none.
         verbose: Ignored: results are logged at level INFO.
         plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
 
