@@ -83,7 +83,7 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
     import numpy as np
 
     from crazysim.lab.live import Browser, Window
-    from crazysim.lab.shows.flight import planned_at
+    from crazysim.lab.shows.flight import planned_positions
     from crazysim.lab.shows.view import camera_around, live_show
 
     file_option = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
@@ -91,7 +91,7 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
         raise ConfigError(f"expected --live or --{file_option}, got both. Leave one of them out.")
     with live_show(show, **settings) as live:
         if options.window:
-            planned = planned_at(show.trajectories, np.linspace(0.0, show.duration, 50))
+            planned = planned_positions(show.trajectories, np.linspace(0.0, show.duration, 50))
             live.show(Window(cam_config=camera_around(np.asarray(planned))))
         if options.browser:
             print(f"open {live.show(Browser(options.port, options.host)).url}; stop with Ctrl-C", flush=True)

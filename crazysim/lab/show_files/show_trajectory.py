@@ -122,7 +122,7 @@ def _with_yaw(ends: NDArray, coefficients: NDArray, yaw_control: object, locatio
     return ends, coefficients
 
 
-def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw: bool = True) -> dict[str, Any]:
+def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", with_yaw: bool = True) -> dict[str, Any]:
     """Return a trajectory as the contents of a ``trajectory.json``.
 
     Curves have degree 1, 3 or 7 in a compressed trajectory, and degree 1 to 7 in any other.
@@ -130,13 +130,13 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
     Args:
         trajectory: Trajectory of one vehicle.
         encoding: ``COMPRESSED`` or ``POLY4D``.
-        yaw: True to write the yaw as the fourth coordinate, degrees.
+        with_yaw: True to write the yaw as the fourth coordinate, degrees.
     """
     if encoding not in ENCODINGS:
         raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
     ends, c = trajectory_pieces(trajectory)
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
-    c = c if yaw else c[:, :3]
+    c = c if with_yaw else c[:, :3]
     require_no_jumps(ends, c)
     dtype = np.asarray(trajectory.coefficients).dtype
 

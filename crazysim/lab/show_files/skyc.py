@@ -26,11 +26,11 @@ from crazysim.trajectories.files import checks
 from crazysim.trajectories.trajectory import Trajectory
 
 MAX_DRONES = 5000
-"""Most drones of a show, Skybrush's limit."""
+"""Largest number of drones in a show, Skybrush's limit."""
 MAX_PIECES = 2_000_000
-"""Most pieces of all trajectories, or all lights, padded to the longest."""
+"""Largest number of pieces of all trajectories together, or of all lights, after padding to the longest."""
 MAX_LOOPED_COMMANDS = 10_000_000
-"""Most commands that the loops of all light programs may repeat."""
+"""Largest number of commands that the loops of all light programs may repeat."""
 
 log = logging.getLogger(__name__)
 
@@ -69,17 +69,19 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     )
     if not drones:
         checks.raise_error("at least one drone", "none", swarm_location)
-    parsed = []
+    parsed_drones = []
     for i, drone in enumerate(drones):
-        parsed.append(_parse_drone(archive, drone, f"{swarm_location}, drone {i}", i))
-        _check_piece_count(len(drones) * parsed[-1]["trajectory"].n_pieces, parsed[-1]["at"])
-    trajectories = [drone["trajectory"] for drone in parsed]
+        parsed_drones.append(_parse_drone(archive, drone, f"{swarm_location}, drone {i}", i))
+        _check_piece_count(len(drones) * parsed_drones[-1]["trajectory"].n_pieces, parsed_drones[-1]["location"])
+    trajectories = [drone["trajectory"] for drone in parsed_drones]
     duration = max(float(x.duration) for x in trajectories)
-    lights, decoded = [], {}
-    for drone in parsed:
-        lights.append(_decode_lights(archive, drone, duration, MAX_LOOPED_COMMANDS // len(parsed), decoded))
-        _check_piece_count(len(parsed) * len(lights[-1].times), f"{drone['at']}, lights")
-    names = [drone["name"] for drone in parsed]
+    lights, decoded_programs = [], {}
+    for drone in parsed_drones:
+        lights.append(
+            _decode_lights(archive, drone, duration, MAX_LOOPED_COMMANDS // len(parsed_drones), decoded_programs)
+        )
+        _check_piece_count(len(parsed_drones) * len(lights[-1].times), f"{drone['location']}, lights")
+    names = [drone["name"] for drone in parsed_drones]
     if len(set(names)) < len(names):
         checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_location)
     environment = show.get("environment") or {}
@@ -92,10 +94,10 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
         lights=Lights.stack(lights),
         cues=_parse_cues(archive, settings.get("cues"), f"{file_location}, cues"),
         settings={name: value for name, value in settings.items() if name != "cues"},
-        homes=np.stack([drone["home"] for drone in parsed]),
-        landings=np.stack([drone["landing"] for drone in parsed]),
-        parameters=tuple(drone["parameters"] for drone in parsed),
-        encodings=tuple(drone["encoding"] for drone in parsed),
+        homes=np.stack([drone["home"] for drone in parsed_drones]),
+        landings=np.stack([drone["landing"] for drone in parsed_drones]),
+        parameters=tuple(drone["parameters"] for drone in parsed_drones),
+        encodings=tuple(drone["encoding"] for drone in parsed_drones),
         environment=kind,
         meta=checks.require_object(show.get("meta") or {}, f"{file_location}, meta"),
     )
@@ -126,7 +128,7 @@ def _parse_drone(archive: Archive, value: object, location: str, index: int) -> 
         )
     name = settings.get("name")
     return {
-        "at": location,
+        "location": location,
         "name": f"drone_{index}" if name is None else checks.require_text(name, f"{location}, name"),
         "trajectory": trajectory,
         "encoding": encoding,
@@ -172,19 +174,19 @@ def _parse_cues(archive: Archive, value: object, location: str) -> tuple[Cue, ..
 
 
 def _decode_lights(
-    archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded: dict[str, Lights]
+    archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded_programs: dict[str, Lights]
 ) -> Lights:
     """Return the lights of one drone; equal programs are decoded once."""
     if drone["lights"] is None:
         return Lights.constant()
-    value, location = archive.resolve(drone["lights"], f"{drone['at']}, lights")
+    value, location = archive.resolve(drone["lights"], f"{drone['location']}, lights")
     value = checks.require_object(value, location)
     checks.require_version_one(value, location)
     if value.get("data") is not None:
         data = checks.require_text(value["data"], f"{location}, data", 2**22)
-        if data not in decoded:
-            decoded[data] = decode_lights(data, until, location, min(max_looped, MAX_REPEATED_COMMANDS))
-        return decoded[data]
+        if data not in decoded_programs:
+            decoded_programs[data] = decode_lights(data, until, location, min(max_looped, MAX_REPEATED_COMMANDS))
+        return decoded_programs[data]
     if value.get("colors") is not None:
         return parse_colors(value["colors"], f"{location}, colors")
     return Lights.constant()
@@ -193,8 +195,8 @@ def _decode_lights(
 def parse_colors(value: object, location: str) -> Lights:
     """Return the lights of the lab's ``colors``, in either form.
 
-    The newer form is ``[[time, [red, green, blue]], ...]``, each colour from its time on, the older
-    ``[["red, green, blue", duration], ...]``; colours are 0 to 255, times s.
+    The newer form is ``[[time, [red, green, blue]], ...]``, with the start time of each colour. The older form is
+    ``[["red, green, blue", duration], ...]``. Colours are 0 to 255, times are in s.
 
     Args:
         value: The JSON array.
@@ -238,8 +240,8 @@ def save_show(show: Show, path: str | Path) -> None:
     """Write a show as a ``.skyc`` file, which Skybrush reads too.
 
     Skybrush itself accepts curves of degree 1 to 3 and no yaw: a yaw that is zero throughout is left out, and curves
-    have the lowest degree of their encoding that reproduces them. Lights are byte code; those without fades are written
-    as ``colors`` as well.
+    have the lowest degree of their encoding that reproduces them. Lights are byte code; lights without fades are
+    written as ``colors`` as well.
 
     Args:
         show: Show.
@@ -257,8 +259,8 @@ def save_show(show: Show, path: str | Path) -> None:
         folder = f"drones/drone_{i}"
         trajectory = show.trajectory(i)
         c = np.asarray(trajectory.coefficients, float)
-        yaw = bool(np.any(c[:, 3] != 0))
-        files[f"{folder}/trajectory.json"] = format_trajectory(trajectory, show.encodings[i], yaw)
+        has_yaw = bool(np.any(c[:, 3] != 0))
+        files[f"{folder}/trajectory.json"] = format_trajectory(trajectory, show.encodings[i], has_yaw)
         files[f"{folder}/lights.json"] = _format_lights(show.light(i))
         settings = {
             "trajectory": {"$ref": f"./{folder}/trajectory.json#"},

@@ -24,11 +24,12 @@ from crazysim.trajectories import Trajectory
 RECORDING_RATES = (50, 25, 10, 5)
 """Rates at which a flight may be recorded, Hz; the first that divides the physics' rate and fits is used."""
 MAX_RECORDED_POSES = 20_000_000
-"""Most poses of a recording, which take 28 bytes each."""
+"""Largest number of poses in a recording; each pose takes 28 bytes."""
 CHUNK_SAMPLES = 250
 """Number of samples that one compiled call simulates."""
 
 Progress = Callable[[Iterable[int], str], Iterable[int]]
+"""Function that yields items and shows a progress bar with a label."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +77,18 @@ def fly_show(show: Show, seconds: float | None = None, progress: Progress | None
     times = np.arange(n + 1) / rate
 
     fly_chunk = _compile_chunk(sim, sim.freq // rate)
-    jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
+    jax.block_until_ready(planned_positions(show.trajectories, jnp.asarray(times)))  # compile before the clock starts
     show.lights.colors(times)
     start_time = time.perf_counter()
     data = sim.data
-    recorded = [[np.asarray(x)[None, 0] for x in _poses(data)]]
+    recorded = [[np.asarray(x)[None, 0] for x in _get_poses(data)]]
     chunks = range(0, n, CHUNK_SAMPLES)
     for _ in chunks if progress is None else progress(chunks, "flying"):
         data, samples = fly_chunk(data)
         recorded.append([np.asarray(x)[:, 0] for x in samples])
     sim.data = data
     pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
-    planned = np.asarray(planned_at(show.trajectories, jnp.asarray(times)))
+    planned = np.asarray(planned_positions(show.trajectories, jnp.asarray(times)))
     colors = show.lights.colors(times)
     return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - start_time)
 
@@ -133,18 +134,18 @@ def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData,
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
         data = step(data, n_steps, zeros)
-        return data, _poses(data)
+        return data, _get_poses(data)
 
     return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK_SAMPLES)).lower(sim.data).compile()
 
 
-def _poses(data: SimData) -> tuple[Array, Array]:
+def _get_poses(data: SimData) -> tuple[Array, Array]:
     """Return positions and attitudes of the drones."""
     return data.states.pos, data.states.quat
 
 
 @jax.jit
-def planned_at(trajectories: Trajectory, times: Array) -> Array:
+def planned_positions(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
     points_at = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
     return jax.vmap(points_at, in_axes=(None, 0))(trajectories, times)

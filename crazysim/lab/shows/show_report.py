@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.lab.shows.flight import ShowFlight
 
 N_LISTED_COLLISIONS = 5
-"""Most collisions that a summary lists."""
+"""Largest number of collisions that a summary lists."""
 
 
 def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the least distance of every pair of drones, and the time at which it occurs.
 
     Between samples the drones are assumed to move at constant velocities, so that the squared distance is a parabola in
-    time. It is fitted through the closest sample and its neighbours.
+    time. The parabola is fitted through the closest sample and its neighbours.
 
     Args:
         times: Times of the samples, s, in equal steps. (n,)
@@ -71,7 +71,7 @@ def tracking_rms(flight: ShowFlight) -> dict[str, float]:
 
 
 def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
-    """Return the pairs of drones whose collision spheres touched, each with the time of the first contact, by time."""
+    """Return the pairs of drones whose collision spheres touched, with the time of first contact, sorted by time."""
     contact_distance = 2 * collision_radius(flight)
     distance, _ = sampled_approaches(flight.times, flight.pos)
     pairs = []
@@ -91,8 +91,8 @@ def collision_radius(flight: ShowFlight) -> float:
 def report(flight: ShowFlight) -> dict[str, Any]:
     """Return the figures of a flight as JSON, planned and flown separately.
 
-    Both have ``closest``, a list of ``{"drones": [name, name], "distance": m, "time": s}`` of every pair, the closest
-    first, and ``duration``, s; the flight also has ``tracking_rms``, m, by name.
+    The entries ``planned`` and ``flown`` have ``closest``, a list of ``{"drones": [name, name], "distance": m, "time":
+    s}`` of every pair, the closest first, and ``duration``, s; ``flown`` also has ``tracking_rms``, m, by name.
     """
     return {
         "planned": {"closest": _closest_pairs(flight, flight.planned), "duration": flight.duration},
@@ -118,7 +118,7 @@ def _closest_pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
 
 
 def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
-    """Return the figures of a flight for reading.
+    """Return the figures of a flight as text.
 
     Args:
         flight: Flight.
@@ -138,8 +138,10 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
         pairs = figures[kind]["closest"]
         if not pairs:
             continue
-        listed = ", ".join(f"{' and '.join(p['drones'])} {p['distance']:.2f} m at {p['time']:.1f} s" for p in pairs[:3])
-        lines.append(f"closest, {kind:8} {listed}")
+        pair_text = ", ".join(
+            f"{' and '.join(pair['drones'])} {pair['distance']:.2f} m at {pair['time']:.1f} s" for pair in pairs[:3]
+        )
+        lines.append(f"closest, {kind:8} {pair_text}")
         if isinstance(limit, (int, float)):
             n = sum(pair["distance"] < limit for pair in pairs)
             lines.append(f"                  {n} of {len(pairs)} pairs closer than the show's {limit:g} m")

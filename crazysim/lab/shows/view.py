@@ -27,13 +27,13 @@ from crazysim.sim.visualize import change_material, draw_label, draw_points
 GLOW_RADIUS_SHARE = 0.006
 """Radius of the glow around a light, as a fraction of the size of the show."""
 MIN_GLOW_RADIUS = 0.03
-"""Least radius of that glow, m."""
+"""Least radius of the glow around a light, m."""
 CAMERA_DISTANCE = 1.2
 """Distance of the camera, as a multiple of the size of the show."""
 MARK_DURATION = 0.7
 """Time for which a collision is marked, s."""
 COLLISION_COLOR = (1.0, 0.1, 0.1, 0.55)
-"""Colour of a mark."""
+"""Colour of the mark of a collision, rgba."""
 MAX_FPS = 60.0
 """Largest number of images per second of a window."""
 NIGHT_LIGHT = 0.1
@@ -105,7 +105,7 @@ def page(flight: ShowFlight) -> str:
 
 
 def media_flight(flight: ShowFlight) -> Flight:
-    """Return the poses of a flown show as ``crazysim.media`` plays them."""
+    """Return the poses of a flown show as a flight that ``crazysim.media`` can play."""
     states = SimpleNamespace(pos=flight.pos[:, None], quat=flight.quat[:, None])
     return flight_of(flight.sim, states, float(flight.times[1] - flight.times[0]))
 
@@ -161,7 +161,7 @@ def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
 
 
 def darken(sim: Sim) -> None:
-    """Dim the lights and the sky of a simulation's scene to a night, before its first image."""
+    """Dim the lights and the sky of a simulation's scene for a night; call it before the first image."""
     model = sim.mj_model
     head = model.vis.headlight
     for light in (model.light_diffuse, model.light_ambient, head.ambient, head.diffuse):
@@ -189,20 +189,20 @@ class ShowLights:
     """Process that sets the LEDs of drones to the colours of a show: ``live.add(ShowLights(show))``."""
 
     def __init__(self, show: Show):
-        """Create the process of a show, whose k-th drone is the simulation's k-th.
+        """Create the process of a show, whose k-th drone is the k-th drone of the simulation.
 
         Args:
             show: Show, which begins when the simulated time is zero.
         """
-        self._lights, self._n = show.lights, show.n_drones
+        self._lights, self._n_drones = show.lights, show.n_drones
 
     def __call__(self, live: Live) -> None:
         """Set the colours at the present time, equal in all worlds."""
-        live.lights[:, : self._n] = self._lights.colors([live.time])[0]
+        live.lights[:, : self._n_drones] = self._lights.colors([live.time])[0]
 
 
 def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
-    """Return a live simulation of a show; ``show`` a viewer and ``run`` it.
+    """Return a live simulation of a show; its methods ``show`` and ``run`` open a viewer and start it.
 
         with live_show(load_show("my_show.skyc")) as live:
             live.show(Browser())

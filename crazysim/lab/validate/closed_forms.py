@@ -62,8 +62,10 @@ def free_body(
 def with_states(data: SimData, **changes: Any) -> SimData:
     """Return the data with some states replaced, by values that are broadcast to all drones."""
     states = data.states
-    new = {k: np.broadcast_to(v, getattr(states, k).shape).astype(getattr(states, k).dtype) for k, v in changes.items()}
-    return data.replace(states=states.replace(**{k: jnp.asarray(v) for k, v in new.items()}))
+    new_values = {
+        k: np.broadcast_to(v, getattr(states, k).shape).astype(getattr(states, k).dtype) for k, v in changes.items()
+    }
+    return data.replace(states=states.replace(**{k: jnp.asarray(v) for k, v in new_values.items()}))
 
 
 def quat_from_rotvec(vector: NDArray) -> Array:
@@ -88,8 +90,8 @@ def free_fall_error(integrator: str) -> float:
     """Return the distance between simulated and exact position after a free fall of 1 s, m.
 
     The exact position is the closed form of the integration scheme itself. Under constant acceleration g the
-    displacement of a scheme is a sum: ``v0 t + g t^2 / 2``, minus ``g t dt / 2`` for explicit Euler and plus it for
-    symplectic Euler.
+    displacement of a scheme is a sum: ``v0 t + g t^2 / 2``, minus ``g t dt / 2`` for explicit Euler, and plus
+    ``g t dt / 2`` for symplectic Euler.
     """
     sim, t, dt = free_body(integrator), 1.0, 1 / 500
     sim.step(500)
@@ -247,9 +249,9 @@ def order_errors() -> dict[str, NDArray]:
         flights = {name: [flight(f, name) for f in freqs] for name, freqs in ORDER_TEST_FREQS.items()}
     return {
         name: np.array(
-            [[np.linalg.norm(x - e) for x, e in zip(state_pair, reference, strict=True)] for state_pair in by_freq]
+            [[np.linalg.norm(x - e) for x, e in zip(state_pair, reference, strict=True)] for state_pair in state_pairs]
         )
-        for name, by_freq in flights.items()
+        for name, state_pairs in flights.items()
     }
 
 

@@ -23,12 +23,12 @@ COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrl
 position, m, and of the yaw, degrees."""
 AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
 """A flight is compared from ``SETTLING_TIME`` seconds after its setpoint first rises above ``AIRBORNE_SHARE`` of its
-median height, until ``LANDING_TIME`` seconds before it last drops below it. The median is over the samples above half
-of the largest height."""
+median height, until ``LANDING_TIME`` seconds before its setpoint last drops below that height. The median is over the
+samples above half of the largest height."""
 MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
 MAX_LAG = 1.2
-"""Longest lag that is looked for, s."""
+"""Longest lag that is considered, s."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Flight:
 
     @property
     def compared_samples(self) -> slice:
-        """Samples that are compared."""
+        """Samples in which errors are computed."""
         height = self.setpoint[:, 2]
         airborne = np.flatnonzero(height > AIRBORNE_SHARE * np.median(height[height > 0.5 * height.max()]))
         return slice(airborne[0] + round(SETTLING_TIME * FREQ), airborne[-1] - round(LANDING_TIME * FREQ))
@@ -73,17 +73,17 @@ class Comparison:
     logged_error: float
     """Root mean square distance from the setpoint in the log, m."""
     simulated_error: float
-    """The same in the simulation, m."""
+    """Root mean square distance from the setpoint in the simulation, m."""
     logged_lag: float
     """Lag behind the setpoint in the log, s."""
     simulated_lag: float
-    """The same in the simulation, s."""
+    """Lag behind the setpoint in the simulation, s."""
     failed: bool
     """True if the real drone was farther than ``MAX_DISTANCE`` from its setpoint in a compared sample."""
 
     @property
     def ratio(self) -> float:
-        """Simulated error over the logged one."""
+        """Simulated error divided by the logged error."""
         return self.simulated_error / self.logged_error
 
 
@@ -134,7 +134,7 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
 def laboratory_estimator(quat_deviation: float = 0.06) -> Estimator:
     """Return the firmware's Kalman filter with the settings of a laboratory with motion capture.
 
-    The noise of positions is 0.1 mm, the most by which they scatter at rest in NanoBench's logs. The default of
+    The noise of positions is 0.1 mm, their largest scatter at rest in NanoBench's logs. The default of
     ``quat_deviation``, rad, is the value in Bitcraze's examples for motion capture (crazyflie-lib-python,
     examples/mocap/qualisys_hl_commander.py).
     """
@@ -148,7 +148,7 @@ def simulate_flights(
     """Return the positions of simulated drones that follow the setpoints of flights, m. (n, n_flights, 3)
 
     The controller is the firmware's ``"pid"``. Each drone starts on the floor, at the horizontal position at which the
-    real one started. Shorter flights continue with their last setpoint until the longest one ends.
+    real drone started. Shorter flights continue with their last setpoint until the longest flight ends.
 
     Args:
         flights: Flights.

@@ -19,12 +19,13 @@ from crazysim.plugins.vehicles.car_params import SLIP_SPEED, CarParams
 from crazysim.pytree import as_parameter
 
 REFERENCE = "CommonRoad, BMW 320i"
+"""Reference in the rows."""
 INTEGRATION_STEP, DURATION, INITIAL_SPEED = 0.005, 6.0, 15.0
 """Step of Runge-Kutta and duration of the drives, s, and their speed at the start, m/s."""
 
 
 def commonroad_params(car: Any) -> CommonRoadParams:
-    """Return our parameters of a vehicle of CommonRoad."""
+    """Return the parameters of a CommonRoad vehicle for ``commonroad_single_track``."""
     numbers = {
         "friction": car.tire.p_dy1,
         "stiffness": [-car.tire.p_ky1 / car.tire.p_dy1] * 2,
@@ -49,7 +50,7 @@ def commonroad_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadPar
 
 
 def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
-    """Return the rates by ``single_track``, the model of our cars, which has tyres with limited grip. (7,)
+    """Return the rates by ``single_track``, the model of crazysim's cars, whose tyres have limited grip. (7,)
 
     Steering angle and acceleration follow the commands within CommonRoad's limits.
     """
@@ -81,7 +82,7 @@ def simulate_drive(rates: Callable[[NDArray, list[float]], ArrayLike], initial_s
     """Return the state after a lane change, by Runge-Kutta of order 4.
 
     Args:
-        rates: Rates of a state under a command.
+        rates: Function that returns the rates of a state under a command.
         initial_state: State at the start.
         rate: Rate of the steering angle, rad/s.
     """
@@ -104,12 +105,12 @@ def compare_with_commonroad() -> Iterable[Row]:
     x = rng.uniform([-9, -9, -max_steer, 0.5, -3, -1, -0.3], [9, 9, max_steer, max_speed, 3, 1, 0.3], (n, 7))
     x[:25, 2], x[25:50, 3] = max_steer, max_speed  # at the stops of the steering angle and of the speed
     u = rng.uniform([-2, -2], [2, 2], (n, 2)) * [car.steering.v_max, car.longitudinal.a_max]
-    theirs = np.array([model(list(row), list(command), car) for row, command in zip(x, u, strict=True)])
+    reference_rates = np.array([model(list(row), list(command), car) for row, command in zip(x, u, strict=True)])
     with jax.enable_x64(True):
         params = commonroad_params(car)
-        ours = np.asarray(commonroad_rates(x, u, params))
+        own_rates = np.asarray(commonroad_rates(x, u, params))
         # rounding of float64 in differences of terms up to 1,000 times as large
-        difference = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
+        difference = float(np.max(np.abs(own_rates - reference_rates) / (1 + np.abs(reference_rates))))
         yield Row("rates of 500 states, commands beyond the limits", REFERENCE, difference, "", (0, 1e-11))
         rate_laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
         initial_state = np.array([0.0, 0, 0, INITIAL_SPEED, 0, 0, 0])

@@ -29,6 +29,7 @@ FREQ, POSITION_PERIOD = 500, 5
 RECORDINGS = Path(crazysim.__file__).parents[1] / "tests"
 """Folder with the recorded outputs; it exists in a checkout of the sources only."""
 FILTERED_AIRFRAME = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
+"""Airframe with derivative gains of position and velocity, so that their filters have an effect."""
 CASES: dict[str, tuple[Any, str, AirframeSource]] = {
     "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
     "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
@@ -42,9 +43,9 @@ CASES: dict[str, tuple[Any, str, AirframeSource]] = {
 """Controller, command level and airframe, by name of the recording."""
 MAX_TRUNCATION = 5.0
 """Largest loss of a motor by the firmware's integer arithmetic, PWM: roll, pitch, yaw and motor lose less than one
-each, and where all motors are lowered by the excess of the highest, the difference of two motors counts."""
+each. Where all motors are lowered by the excess of the highest motor, the loss of the highest motor is subtracted."""
 MAX_ROUNDING = 3.0
-"""Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
+"""Largest difference by rounding, PWM; yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
 
 
 def recorded_pwm(name: str) -> NDArray:
@@ -67,7 +68,7 @@ def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
 
 
 def compare_controllers() -> Iterable[Row]:
-    """Yield the largest differences of the motors from the compiled firmware's."""
+    """Yield the largest differences of the PWM of motors from the compiled firmware."""
     for name, (controller, mode, drone) in CASES.items():
         airframe_text = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
         for whole_numbers, bound in ((False, MAX_TRUNCATION + MAX_ROUNDING), (True, 1.0 + MAX_ROUNDING)):
@@ -79,10 +80,10 @@ def compare_controllers() -> Iterable[Row]:
 
 
 def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
-    """Return states (n_ticks, n, 13) and commands (n_ticks, n, k): from gentle to wild, across yaw +-180 degrees.
+    """Return states, (n_ticks, n, 13), and commands, (n_ticks, n, k), of n flights from gentle to wild.
 
-    A state is pos, vel, quat, ang_vel. Thrust is in PWM, and zero for a while in some flights. State commands change
-    at the ticks of the position loop.
+    A state is pos, vel, quat, ang_vel; the yaw crosses +-180 degrees. Thrust is in PWM, and zero for a while in some
+    flights. State commands change at the ticks of the position loop.
     """
     rng = np.random.default_rng(seed)
     amplitude = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
@@ -96,7 +97,7 @@ def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray,
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
     tilt, yaw = smooth_signal(2, 1.2 * amplitude, 0.5) * [1.0, 0.5], 3.0 + smooth_signal(1, 2.0, 0.9)
     quat = np.array(
-        [[quat_of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
+        [[quat_from_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
     )
     ang_vel = smooth_signal(3, 10 * amplitude, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
@@ -123,7 +124,7 @@ def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray,
     return states, commands
 
 
-def quat_of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
+def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
     """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), xyzw."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(np.array([roll, pitch, yaw]) / 2), np.sin(np.array([roll, pitch, yaw]) / 2)
     return (

@@ -1,4 +1,4 @@
-"""Our versions of the firmware's filters against recorded outputs of the compiled C sources."""
+"""Crazysim's versions of the firmware's filters against recorded outputs of the compiled C sources."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from crazysim.plugins.estimators import complementary as law
 from crazysim.plugins.estimators import error_state, updates
 
 FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
+"""Folder with the recorded outputs of filters."""
 MEASUREMENT_KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
 """Kinds of measurements of the Kalman filter, one for each recording."""
 ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
 """Positions of the anchors, m."""
 DIODE_OFFSET = np.array([0.015, 0.0075, 0.0], np.float32)
+"""Position of the Lighthouse sensor's diode, body frame, m."""
 PROCESS_VARIANCE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
+"""Variances of the process noise of one loop of 1 ms: position, velocity and attitude error. (9,)"""
 
 
 def update_with_measurements(
@@ -41,18 +44,22 @@ def update_with_measurements(
         k: Number of the loop, from 1. ()
         measurement: Measurements of the loop. (9,)
         gyro: Angular velocity, body frame, rad/s. (3,)
-        estimate: The estimate before.
+        estimate: Estimate before the measurements.
         rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
         stations: Positions, m, (2, 3), and attitudes, station to world, (2, 3, 3), of the two Lighthouse stations.
     """
     if kind in ("position", "ground"):
         return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, measurement[:3], 0.01), estimate)
     if kind == "pose":
-        updated = updates.update_quat(updates.update_pos(estimate, measurement[:3], 0.01), measurement[3:7], 0.05)
-        return error_state.select_estimate(k % 10 == 0, updated, estimate)
+        updated_estimate = updates.update_quat(
+            updates.update_pos(estimate, measurement[:3], 0.01), measurement[3:7], 0.05
+        )
+        return error_state.select_estimate(k % 10 == 0, updated_estimate, estimate)
     if kind in ("flow", "range"):
-        updated = updates.update_flow(estimate, rot, 0.1 * measurement[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
-        estimate = error_state.select_estimate(k % 10 == 0, updated, estimate)
+        updated_estimate = updates.update_flow(
+            estimate, rot, 0.1 * measurement[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2
+        )
+        estimate = error_state.select_estimate(k % 10 == 0, updated_estimate, estimate)
         has_range = (k % 25 == 10) & (kind == "range")
         return error_state.select_estimate(
             has_range, updates.update_range(estimate, rot, measurement[2], 0.02), estimate
@@ -61,24 +68,25 @@ def update_with_measurements(
         estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, measurement[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            updated = updates.update_sweep(
+            updated_estimate = updates.update_sweep(
                 estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, measurement[0], 0.001
             )
-            estimate = error_state.select_estimate(k % 8 == first, updated, estimate)
+            estimate = error_state.select_estimate(k % 8 == first, updated_estimate, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
     if kind == "distance":
-        updated = updates.update_distance(estimate, anchors[a], measurement[0], 0.25)
+        updated_estimate = updates.update_distance(estimate, anchors[a], measurement[0], 0.25)
     else:
-        updated = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], measurement[0], 0.15)
-    return error_state.select_estimate(k % 5 == 0, updated, estimate)
+        updated_estimate = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], measurement[0], 0.15)
+    return error_state.select_estimate(k % 5 == 0, updated_estimate, estimate)
 
 
 def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
-    """Return states and covariances of our Kalman filter and of the firmware's, every 0.1 s of a recording of 4 s.
+    """Return states and covariances of crazysim's and the firmware's Kalman filter, every 0.1 s of a 4 s recording.
 
     Args:
-        kind: One of ``MEASUREMENT_KINDS``. In ``"ground"`` the drone is on the ground, in the others it flies fast.
+        kind: One of ``MEASUREMENT_KINDS``. In ``"ground"`` the drone is on the ground, in other recordings it flies
+            fast.
 
     Returns:
         Position, m, velocity, body frame, m/s, attitude error, rad, quaternion, wxyz, and the upper triangle of the
@@ -112,7 +120,7 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
-    """Return states of our complementary filter and of the firmware's, every 20 ms of a recording of 2 s.
+    """Return states of crazysim's and the firmware's complementary filter, every 20 ms of a 2 s recording.
 
     Args:
         kind: Source of the height: ``"pressure"`` or ``"ground"``.
@@ -130,13 +138,15 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
         attitude_update = *attitude_update, law.inertial_climb(climb, attitude_update[0], accel, 0.004)
         quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(attitude_update, carry[:3], strict=True))
         shift = 0.01 * climb
-        by_pressure = law.filtered_height(height, row[6:7], shift)
+        pressure_height = law.filtered_height(height, row[6:7], shift)
         is_useful = row[8:] <= 1000 * law.MAX_RANGE_AGE
-        new_height, new_over = law.height_over_surface(height, by_pressure, row[7:8], is_useful, over_surface, shift)
+        new_height, new_over_surface = law.height_over_surface(
+            height, pressure_height, row[7:8], is_useful, over_surface, shift
+        )
         is_height_tick = k % 10 == 0
         climb_rate, over_surface = (
             jnp.where(is_height_tick, (new_height - height) / 0.01, climb_rate),
-            jnp.where(is_height_tick, new_over, over_surface),
+            jnp.where(is_height_tick, new_over_surface, over_surface),
         )
         height = jnp.where(is_height_tick, new_height, height)
         return (quat, integral, climb, height, climb_rate, over_surface), jnp.concatenate([quat, height, climb_rate])
@@ -148,7 +158,7 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def compare_filters() -> Iterable[Row]:
-    """Yield the largest differences between the states of our filters and of the compiled firmware."""
+    """Yield the largest differences between the states of crazysim's filters and of the compiled firmware."""
     for kind in MEASUREMENT_KINDS:
         estimates, recorded = kalman_states(kind)
         difference = np.abs(estimates - recorded)

@@ -42,9 +42,10 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
 
 
 def open_loop(folder: Path) -> Iterable[Row]:
-    """Yield mean errors of predictions of a flight from its rotor speeds, and published ones after 0.1 and 0.5 s.
+    """Yield mean errors of predictions of a flight from its rotor speeds, and published errors.
 
-    The predictions are for ``HORIZONS``, from the first flight named melon in the folder of IDSIA's logs.
+    The predictions are for ``HORIZONS``, from the first flight named melon in the folder of IDSIA's logs. The published
+    errors are after 0.1 and 0.5 s.
     """
     path = find_logs(folder, "melon*")[0]
     log = read_log(path)

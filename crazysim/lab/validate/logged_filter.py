@@ -22,8 +22,8 @@ from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.kalman import MEASUREMENT_STD
 
 SAMPLE_PERIOD, LOOPS_PER_SAMPLE = 0.01, 10
-"""Time between samples of a log, s, and the number of the filter's loops in that time, each
-of which adds process noise."""
+"""Time between samples of a log, s, and the number of loops of the filter in that time; each loop adds process
+noise."""
 PROCESS_NOISE_STD = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
 """Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
 SETTLING_TIME = 2.0
@@ -31,9 +31,10 @@ SETTLING_TIME = 2.0
 
 
 def read_filter_log(path: Path) -> dict[str, NDArray]:
-    """Return a log of NanoBench from its first setpoint to its last: ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and
-    ``quat`` of motion capture (see ``thrust_attitudes``), ``est_pos`` and ``est_quat`` of the filter on board, and
-    ``goal``, m. (n, k)
+    """Return a log of NanoBench from its first setpoint to its last, as arrays by name. (n, k) each
+
+    The names are ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and ``quat`` of motion capture (see ``thrust_attitudes``),
+    ``est_pos`` and ``est_quat`` of the filter on board, and ``goal``, m.
 
     Raises:
         ConfigError: If a column is missing, or there is no setpoint.
@@ -65,7 +66,7 @@ def thrust_attitudes(pos: NDArray, quat: NDArray) -> NDArray:
 
     Args:
         pos: Position of the tracked body, world frame, m. (n, 3)
-        quat: Its attitude, body to world, xyzw. (n, 4)
+        quat: Attitude of the tracked body, body to world, xyzw. (n, 4)
     """
     accel = np.gradient(np.gradient(pos, SAMPLE_PERIOD, axis=0), SAMPLE_PERIOD, axis=0) + [0, 0, GRAVITY_MAGNITUDE]
     force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[
@@ -111,7 +112,7 @@ def estimate_errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tup
 
 
 def compare_filter(folder: Path) -> Iterable[Row]:
-    """Yield the ratio of our filter's errors to the on-board filter's for each flight that did not crash."""
+    """Yield the errors of crazysim's filter divided by the on-board filter's, for each flight that did not crash."""
     flights = {}
     for path in find_logs(folder, "*"):
         try:
@@ -124,11 +125,11 @@ def compare_filter(folder: Path) -> Iterable[Row]:
             continue
         size = len(log["pos"])  # all logs are padded to one length, so that the filter compiles once
         padded_columns = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
-        our_errors = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded_columns)))
+        own_errors = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded_columns)))
         board_errors = estimate_errors(log, log["est_pos"], log["est_quat"])
-        for quantity, unit, our_error, board_error in zip(
-            ("position", "attitude"), ("m", "degrees"), our_errors, board_errors, strict=True
+        for quantity, unit, own_error, board_error in zip(
+            ("position", "attitude"), ("m", "degrees"), own_errors, board_errors, strict=True
         ):
-            yield Row(f"{name}: {quantity}", "filter on board", our_error / board_error, "", (0, 1.1),
-                      f"on board {board_error:.3g} {unit}, here {our_error:.3g} {unit}", series=quantity,
+            yield Row(f"{name}: {quantity}", "filter on board", own_error / board_error, "", (0, 1.1),
+                      f"on board {board_error:.3g} {unit}, here {own_error:.3g} {unit}", series=quantity,
                       x=name.partition("_")[2])  # fmt: skip

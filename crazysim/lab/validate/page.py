@@ -12,22 +12,23 @@ INTRODUCTION = """
 # Validation
 
 Comparisons of crazysim with closed forms, other simulators, the Crazyflie's firmware and real flights. Rows with bad
-figures stay. This page is written, in a checkout of the sources, by
+figures are kept. In a checkout of the sources, these commands write this page:
 
 ```sh
 pip install -e {packages}
 crazysim validate --data FOLDER --out docs/validation.md
 ```
 
-and each section names the command that repeats it, which writes `validation.md`. Sections whose package is not
+Each section names the command that measures it again and writes it to `validation.md`. Sections whose package is not
 installed are left out, and so are rows of simulators that are not installed. In Python
 `crazysim.lab.validate.validate(only=["mujoco"])` returns the rows.
 
 FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim, and keeps the policies of *Sim to
 sim*:
 
-- `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. In a clone of
-  [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and pyarrow,
+- `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. These commands
+  write it in a clone of [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and
+  pyarrow:
 
     ```sh
     git checkout b0cf4b3
@@ -36,12 +37,12 @@ sim*:
     log[250:6750].to_csv('melon_20251017_run1.csv', index=False)"
     ```
 
-    writes it. Figures of this page are of the same samples rounded to float32, and differ by up to 2%.
+    The figures of this page are of the same samples rounded to float32, and differ by up to 2%.
 - `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
   [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
 - `policies/` holds or receives the trainings; without FOLDER, they are not kept.
 
-A figure passes if it is within the range in its row; rows without a range only report.
+A figure passes if it is within the range in its row; figures without a range always pass.
 """
 """Introduction at the top of the page, in which ``packages`` is filled in."""
 TABLE_COLUMNS: Mapping[str, Callable[[Row], str]] = {

@@ -16,7 +16,7 @@ from crazysim.lab.validate.rows import Row
 
 
 def mujoco_differences() -> dict[str, float]:
-    """Return the largest differences of a thrown body under a constant wrench from C MuJoCo's after 0.5 s.
+    """Return the largest differences from C MuJoCo in the state of a thrown body under a constant wrench after 0.5 s.
 
     Both programs use fourth-order Runge-Kutta methods with steps of 1 ms, in float64.
 
@@ -38,9 +38,14 @@ def mujoco_differences() -> dict[str, float]:
         sim.step(500)
         s = read_state(sim)
     quat = np.roll(s["quat"], 1)
-    ours = {"pos": s["pos"], "vel": s["vel"], "quat": quat * np.sign(quat @ data.qpos[3:]), "ang_vel": s["ang_vel"]}
+    own_state = {
+        "pos": s["pos"],
+        "vel": s["vel"],
+        "quat": quat * np.sign(quat @ data.qpos[3:]),
+        "ang_vel": s["ang_vel"],
+    }
     reference = {"pos": data.qpos[:3], "vel": data.qvel[:3], "quat": data.qpos[3:], "ang_vel": data.qvel[3:]}
-    return {k: float(np.max(np.abs(x - reference[k]))) for k, x in ours.items()}
+    return {k: float(np.max(np.abs(x - reference[k]))) for k, x in own_state.items()}
 
 
 def compare_with_mujoco() -> Iterable[Row]:
@@ -55,20 +60,20 @@ def compare_with_mujoco() -> Iterable[Row]:
 
 
 def compare_with_crazyflow() -> Iterable[Row]:
-    """Yield the distance between our drone and Crazyflow's after 2 s under Crazyflow's controllers, in float32."""
+    """Yield the distance between crazysim's and Crazyflow's drone, in float32 and with Crazyflow's controllers."""
     weight = 0.0434 * GRAVITY_MAGNITUDE
     state = np.zeros((1, 1, 16), np.float32)
     state[..., [0, 1, 2, 12]] = 0.5, -0.3, 5.2, 1.0
     commands = {"attitude": np.asarray([[[0.1, -0.15, 0.2, 1.02 * weight]]], np.float32), "state": state}
     for level, command in commands.items():
-        ends = []
+        end_positions = []
         for package, settings in (("crazysim", {"controller": "crazyflow"}), ("crazyflow", {})):
             sim: Any = importlib.import_module(f"{package}.sim").Sim(n_worlds=1, control=level, freq=500, **settings)
             sim.data = with_states(sim.data, pos=[0, 0, 5.0])
             getattr(sim, f"{level}_control")(command)
             sim.step(1000)
-            ends.append(np.asarray(sim.data.states.pos)[0, 0])
-        distance = np.linalg.norm(ends[1] - [0, 0, 5.0])
+            end_positions.append(np.asarray(sim.data.states.pos)[0, 0])
+        distance = np.linalg.norm(end_positions[1] - [0, 0, 5.0])
         # rounding of float32 in 1,000 steps, as between the peer's own precisions (tests/golden)
         yield Row(f"{level} commands, 2 s, {distance:.2f} m from the start: distance", "Crazyflow, `cf21B_500`",
-                  float(np.linalg.norm(ends[0] - ends[1])), "m", (0, 1e-3))  # fmt: skip
+                  float(np.linalg.norm(end_positions[0] - end_positions[1])), "m", (0, 1e-3))  # fmt: skip

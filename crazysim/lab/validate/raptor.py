@@ -40,10 +40,10 @@ DELAYS = (0, 2, 4, 6, 8, 10, 12)
 
 
 class RaptorPolicy:
-    """RAPTOR for a batch of drones, called as the authors' firmware calls it.
+    """RAPTOR for a batch of drones, called in the same way as by the authors' firmware.
 
-    Its recurrent state advances every 10 ms, as in training, and calls in between leave it unchanged; the previous
-    action that it observes is the mean since the last advance (rl-tools, ``inference/executor`` and
+    Its recurrent state advances every 10 ms, as in training; calls in between leave the state unchanged. The previous
+    action that the policy observes is the mean since the last advance (rl-tools, ``inference/executor`` and
     ``inference/applications/l2f``).
 
     Args:
@@ -78,7 +78,7 @@ class RaptorPolicy:
 def hold_goal(
     policy: RaptorPolicy, period: int, observe: Callable[[], np.ndarray], apply_action: Callable[[np.ndarray], None]
 ) -> np.ndarray:
-    """Return which drones stay within 0.3 m of their goal in the last second of a flight. (n,)
+    """Return True for drones that stay within 0.3 m of their goal in the last second of a flight. (n,)
 
     Args:
         policy: Policy.
@@ -98,7 +98,7 @@ def hold_goal(
 def hold_in_simulation(
     sim: Sim, max_rotor_vel: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int
 ) -> np.ndarray:
-    """Return which drones of a simulation, one per world, RAPTOR holds at their goal. (n_worlds,)
+    """Return True for drones that RAPTOR holds at their goal, in a simulation with one drone per world. (n_worlds,)
 
     Args:
         sim: Simulation with rotor commands, whose drones start within 0.5 m of the goal along each axis.
@@ -110,7 +110,7 @@ def hold_in_simulation(
     n, goal = sim.n_worlds, np.array([0, 0, 3.0])
     start = np.random.default_rng(0).uniform(-0.5, 0.5, (N_STARTS, 1, 3))
 
-    def speeds(action: np.ndarray) -> np.ndarray:
+    def to_speeds(action: np.ndarray) -> np.ndarray:
         return np.asarray(max_rotor_vel * (action + 1) / 2, np.float32)[:, None]
 
     def observe() -> np.ndarray:
@@ -120,11 +120,11 @@ def hold_in_simulation(
         return np.concatenate([pos - goal, *others], axis=-1)
 
     def apply_action(action: np.ndarray) -> None:
-        sim.rotor_vel_control(speeds(action))
+        sim.rotor_vel_control(to_speeds(action))
         sim.step(period // STEP_MS)
 
-    sim.data = with_states(sim.data, pos=np.resize(start, (n, 1, 3)) + goal, rotor_vel=speeds(action))
-    sim.rotor_vel_control(speeds(action))
+    sim.data = with_states(sim.data, pos=np.resize(start, (n, 1, 3)) + goal, rotor_vel=to_speeds(action))
+    sim.rotor_vel_control(to_speeds(action))
     sim.add(Latency(delay))
     return hold_goal(RaptorPolicy(period, action), period, observe, apply_action)
 
@@ -179,13 +179,13 @@ class Quadrotors:
         return Quadrotors(mass, thrust, arm, inertia[:, None] * ratio, lag, draw(0.005, 0.05, n))
 
     @property
-    def hover(self) -> np.ndarray:
+    def hover_action(self) -> np.ndarray:
         """Action, from -1 to 1, of rotors that carry the weight. (n, 4)"""
         return np.repeat((2 * np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
 
 
 def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
-    """Return which quadrotors RAPTOR holds in crazysim. (n,)
+    """Return True for quadrotors that RAPTOR holds at their goal in crazysim. (n,)
 
     Args:
         quadrotors: Quadrotors, one per world.
@@ -194,25 +194,25 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
     """
     q, n, max_rotor_vel = quadrotors, len(quadrotors.mass), 20_000.0
     sim = Sim(n, drone="cf21B_500", control="rotor_vel", integrator="rk4")
-    params, per_world = sim.data.params, (n, 1)
+    params, world_shape = sim.data.params, (n, 1)
     thrust_curve = np.zeros((n, 1, 1, 3))
     thrust_curve[..., 2] = (q.thrust / max_rotor_vel**2)[:, None, None]
     inertia = np.eye(3) * q.inertia[:, None, None]
     lag = np.zeros((n, 1, 1, 4))
     lag[..., ::2] = 1 / q.lag[:, None, None]
     changes = {
-        "mass": q.mass.reshape(*per_world, 1), "L": q.arm.reshape(*per_world, 1),
+        "mass": q.mass.reshape(*world_shape, 1), "L": q.arm.reshape(*world_shape, 1),
         "J": inertia, "J_inv": np.linalg.inv(inertia), "rpm2thrust": thrust_curve,
         "rpm2torque": thrust_curve * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
         "drag_matrix": np.zeros((3, 3)), "prop_inertia": np.zeros(1), "rotor_vel_min": np.zeros(1),
         "rotor_vel_max": np.full(1, max_rotor_vel),
     }  # fmt: skip
     sim.data = sim.data.replace(params=params.replace(**{k: np.asarray(x, np.float32) for k, x in changes.items()}))
-    return hold_in_simulation(sim, np.asarray(max_rotor_vel), q.hover, delay, period)
+    return hold_in_simulation(sim, np.asarray(max_rotor_vel), q.hover_action, delay, period)
 
 
 def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
-    """Return which quadrotors RAPTOR holds in l2f, the simulator of its training. (n,)
+    """Return True for quadrotors that RAPTOR holds at their goal in l2f, the simulator of its training. (n,)
 
     Args:
         quadrotors: As many quadrotors as one of l2f's batches has.
@@ -242,10 +242,14 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
         parameter_file["dynamics"] |= {name: np.asarray(value).tolist() for name, value in parameters_of_drone.items()}
         l2f.parameters_from_json(device, world.environments[i], json.dumps(parameter_file), parameters.parameters[i])
         drone = state.states[i]
-        drone.position, drone.orientation, drone.rpm = start[i].tolist(), [1, 0, 0, 0], ((q.hover[i] + 1) / 2).tolist()
+        drone.position, drone.orientation, drone.rpm = (
+            start[i].tolist(),
+            [1, 0, 0, 0],
+            ((q.hover_action[i] + 1) / 2).tolist(),
+        )
         drone.linear_velocity = drone.angular_velocity = [0, 0, 0]
     observed = np.zeros((n, world.OBSERVATION_DIM), np.float32)
-    actions = [q.hover] * delay
+    actions = [q.hover_action] * delay
 
     def observe() -> np.ndarray:
         batch.observe(device, world, parameters, state, observed, rng)
@@ -257,7 +261,7 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
             batch.step(device, world, parameters, state, actions.pop(0).astype(np.float32), next_state, rng)
             state.assign(next_state)
 
-    return hold_goal(RaptorPolicy(period, q.hover), period, observe, apply_action)
+    return hold_goal(RaptorPolicy(period, q.hover_action), period, observe, apply_action)
 
 
 def compare_training_airframes() -> Iterable[Row]:
@@ -265,10 +269,10 @@ def compare_training_airframes() -> Iterable[Row]:
     quadrotors = Quadrotors.sample()
     for period in PERIODS:
         for delay in (0, 2, 6, 10):
-            ours, theirs = (
+            own_share, l2f_share = (
                 100 * np.mean(hold(quadrotors, delay // STEP_MS, period)) for hold in (hold_in_crazysim, hold_in_l2f)
             )
             # rounding decides about quadrotors at the edge of stability: 5 of 256 are 2 percentage points
             yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim and l2f",
-                      "256 quadrotors of the training", float(abs(ours - theirs)), "points", (0, 2),
-                      f"{ours:.1f} % here, {theirs:.1f} % in l2f")  # fmt: skip
+                      "256 quadrotors of the training", float(abs(own_share - l2f_share)), "points", (0, 2),
+                      f"{own_share:.1f} % here, {l2f_share:.1f} % in l2f")  # fmt: skip

@@ -21,7 +21,7 @@ from crazysim.plugins.effects import RotorAerodynamics, Wind
 from crazysim.sim.sim import Sim
 
 FREQ, PERIOD = 1000, 0.1
-"""Rate of our steps, Hz, and time between two commands, s."""
+"""Rate of crazysim's steps, Hz, and time between two commands, s."""
 WIND = np.array([3.0, -1.0, 0.5])
 """Wind of the flights in moving air, world frame, m/s."""
 INITIAL_STATES = {
@@ -32,7 +32,7 @@ INITIAL_STATES = {
 """States at the start, m, m/s, rad/s."""
 
 States = list[dict[str, NDArray]]
-"""States at several times; variables have our names."""
+"""States at several times; variables have crazysim's names."""
 
 
 def hover_speed(params: dict[str, Any]) -> float:
@@ -73,10 +73,10 @@ def rotor_aerodynamics(params: dict[str, Any]) -> RotorAerodynamics:
     return RotorAerodynamics(drag=params["k_d"], inflow=params["k_z"], hub_height=0.0)
 
 
-def crazysim_flight(
+def fly_crazysim(
     params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] = (), drag: bool = False
 ) -> States:
-    """Return our states after each command.
+    """Return the states of a flight in crazysim after each command.
 
     Args:
         params: Parameters.
@@ -96,8 +96,8 @@ def crazysim_flight(
     return states
 
 
-def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
-    """Return RotorPy's states after each command, in our names and units.
+def fly_rotorpy(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
+    """Return the states of a flight in RotorPy after each command, with crazysim's names and units.
 
     Args:
         params: Parameters.
@@ -117,7 +117,7 @@ def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False
     for command in commands:
         state = drone.step(state, {"cmd_motor_speeds": command}, PERIOD)
         names = {"pos": "x", "vel": "v", "quat": "q", "ang_vel": "w", "rotor_vel": "rotor_speeds"}
-        states.append({ours: np.asarray(state[name]) for ours, name in names.items()})
+        states.append({own_name: np.asarray(state[name]) for own_name, name in names.items()})
         states[-1]["rotor_vel"] = states[-1]["rotor_vel"] / RPM_TO_RAD_S
     return states
 
@@ -128,8 +128,8 @@ def state_differences(a: dict[str, NDArray], b: dict[str, NDArray]) -> dict[str,
     return differences | {"quat": math.degrees(angle_between(a["quat"], b["quat"]))}
 
 
-def air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
-    """Return the additional forces and torques of the air in ``n`` states, ours and RotorPy's.
+def compute_air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
+    """Return the additional forces and torques of the air in ``n`` states, in crazysim and in RotorPy.
 
     Args:
         params: Parameters.
@@ -137,7 +137,7 @@ def air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[ND
         n: Number of states.
 
     Returns:
-        Force, N, and torque, N m, body frame. (n, 6)
+        Force, N, and torque, N m, body frame, of crazysim, and of RotorPy. (n, 6) each
     """
     rng = np.random.default_rng(1)
     vel, rate = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
@@ -149,14 +149,14 @@ def air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[ND
     )
     s = stage("drone")(plugin.influence)(moving_data).states
     drag = vel @ np.asarray(sim.data.params.drag_matrix).reshape(3, 3)
-    ours = np.concatenate([np.asarray(s.force)[:, 0] + drag, np.asarray(s.torque)[:, 0]], axis=-1)
+    own_values = np.concatenate([np.asarray(s.force)[:, 0] + drag, np.asarray(s.torque)[:, 0]], axis=-1)
     multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
     rotorpy, rotorpy_without_drag = multirotor(params), multirotor(params, aero=False)
-    theirs = [
+    reference_values = [
         np.concatenate(rotorpy.compute_body_wrench(*x)) - np.concatenate(rotorpy_without_drag.compute_body_wrench(*x))
         for x in zip(rate, speeds, vel, strict=True)
     ]
-    return ours, np.stack(theirs)
+    return own_values, np.stack(reference_values)
 
 
 def compare_with_rotorpy() -> Iterable[Row]:
@@ -164,38 +164,38 @@ def compare_with_rotorpy() -> Iterable[Row]:
     params = importlib.import_module("rotorpy.vehicles.crazyflie_params").quad_params
     commands = hover_speed(params) * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (20, 4)))
     with jax.enable_x64(True):
-        ours, theirs = crazysim_flight(params, commands[:10]), rotorpy_flight(params, commands[:10])
-        differences = state_differences(ours[-1], theirs[-1])
-        drag_only = crazysim_flight(params, commands, [Wind(WIND)], drag=True)
-        ours = crazysim_flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
-        theirs = rotorpy_flight(params, commands, aero=True)
-        slow, fast = (air_wrenches(params, speed) for speed in (0.1, 3.0))
+        own_values, reference_values = fly_crazysim(params, commands[:10]), fly_rotorpy(params, commands[:10])
+        differences = state_differences(own_values[-1], reference_values[-1])
+        drag_only = fly_crazysim(params, commands, [Wind(WIND)], drag=True)
+        own_values = fly_crazysim(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
+        reference_values = fly_rotorpy(params, commands, aero=True)
+        slow, fast = (compute_air_wrenches(params, speed) for speed in (0.1, 3.0))
     # RotorPy's integrator has a relative tolerance of 1e-10 in each of about 100 steps
     for name, quantity, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
                                     ("ang_vel", "angular velocity", "rad/s", 1e-8),
                                     ("rotor_vel", "rotor speeds", "rpm", 1e-4)):  # fmt: skip
         yield Row(f"flight without air, 1 s: {quantity}", "RotorPy", differences[name], unit, (0, bound))
-    our_wrench, their_wrench = fast
+    own_wrench, reference_wrench = fast
     for quantity, axes, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
-        remark = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
+        remark = f"RotorPy: up to {np.abs(reference_wrench[:, axes]).max():.2g} {unit}"
         yield Row(
             f"air at up to 3 m/s: {quantity}",
             "RotorPy",
-            float(np.abs(our_wrench - their_wrench)[:, axes].max()),
+            float(np.abs(own_wrench - reference_wrench)[:, axes].max()),
             unit,
             (0, 1e-15),
             remark,
         )
-    for speed, (our_wrench, their_wrench) in ((0.1, slow), (3.0, fast)):
+    for speed, (own_wrench, reference_wrench) in ((0.1, slow), (3.0, fast)):
         for quantity, axes, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
-            remark = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
-            difference = float(np.abs(our_wrench - their_wrench)[:, axes].max())
+            remark = f"RotorPy: up to {np.abs(reference_wrench[:, axes]).max():.2g} {unit}"
+            difference = float(np.abs(own_wrench - reference_wrench)[:, axes].max())
             yield Row(f"air at up to {speed:g} m/s: {quantity}", "RotorPy", difference, unit, None, remark)
     for seconds in (1, 2):
         k = round(seconds / PERIOD) - 1
         differences, drag_only_differences = (
-            state_differences(ours[k], theirs[k]),
-            state_differences(drag_only[k], theirs[k]),
+            state_differences(own_values[k], reference_values[k]),
+            state_differences(drag_only[k], reference_values[k]),
         )
         for name, quantity, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
             remark = f"linear drag alone: {drag_only_differences[name]:.3g} {unit}"

@@ -32,7 +32,7 @@ class Row:
     problem: str = ""
     """Reason why the comparison failed to run."""
     series: str = ""
-    """Name of the points or the line that the figure belongs to in the section's picture; empty for none."""
+    """Name of the line or the points in the section's picture that include the figure; empty for none."""
     x: float | str = ""
     """Coordinate along the horizontal axis of that picture: a number or the name of a group."""
     section: str = ""
@@ -58,16 +58,16 @@ class Section:
     title: str
     """Heading on the page."""
     text: str
-    """Paragraph below it: data and method."""
+    """Paragraph below the heading: data and method."""
     checks: Sequence[Callable[[], Iterable[Row]]]
     """Functions that measure rows."""
     packages: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Modules that must be importable, with the requirement for pip of each."""
     peers: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Modules of other simulators, with the requirement for pip of each. Rows of those that are not importable are left
-    out."""
+    """Modules of other simulators, with the requirement for pip of each. Rows of simulators that are not importable are
+    left out."""
     data_problem: str = ""
-    """Reason why the section's data are missing; empty if it has them."""
+    """Reason why the section's data are missing; empty if they are not."""
     needs_logs: bool = False
     """True if the section needs logs of real flights."""
     axes: tuple[str, str] = ("", "")
@@ -80,12 +80,12 @@ class Section:
 
     @property
     def missing_peers(self) -> str:
-        """Command that installs the simulators whose rows are left out, or an empty string if none are."""
+        """Command that installs the simulators whose rows are left out; empty if no rows are left out."""
         return _install_advice(self.peers)
 
 
 def _install_advice(packages: Mapping[str, str]) -> str:
-    """Return advice to install the packages that are not importable, or an empty string if all are."""
+    """Return advice to install the packages that are not importable; an empty string if all are importable."""
     missing = [name for package, name in packages.items() if importlib.util.find_spec(package) is None]
     return f"run `pip install {shlex.join(missing)}`" if missing else ""
 

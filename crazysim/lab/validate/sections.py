@@ -33,7 +33,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
     """Return the sections of the page.
 
     Args:
-        data: Folder with logs in ``idsia`` and ``nanobench``; None for none.
+        data: Folder with logs in ``idsia`` and ``nanobench``; None for no logs.
     """
     idsia, nanobench = ((data or Path()) / name for name in ("idsia", "nanobench"))
 
@@ -69,9 +69,9 @@ def sections(data: Path | None = None) -> Sequence[Section]:
         Section(
             "rotorpy", "RotorPy",
             "RotorPy's Crazyflie 2.0, in float64, with commands of the rotors within 2% of hover that change every 0.1 "
-            "s. In moving air ours has `RotorAerodynamics` with RotorPy's coefficients. Forces across the rotors are "
-            "the same. Along them RotorPy's thrust falls linearly with the velocity, and ours follows momentum theory, "
-            "with the lift of forward flight. The wind is (3, -1, 0.5) m/s.",
+            "s. In moving air crazysim's drone has `RotorAerodynamics` with RotorPy's coefficients. Forces across the "
+            "rotors are the same. Along the rotors RotorPy's thrust falls linearly with the velocity, and crazysim's "
+            "thrust follows momentum theory, with the lift of forward flight. The wind is (3, -1, 0.5) m/s.",
             (rotorpy_flights.compare_with_rotorpy,), packages={"rotorpy": "rotorpy==3.0.0"},
         ),
         Section(
@@ -90,10 +90,10 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "2d921b5. Its rigid body keeps the body rates of the start, since `models/models.py` multiplies the "
             "angular acceleration by zero: compare it with our rows at constant body rates, where the airframe gives "
             "the forces alone.\n\n"
-            "With its own torques `cf21B_500` loses the attitude within 0.25 s. In these flights the torque of the "
-            "rotors about x and y is, below 1 Hz, 15 to 27 times what the angular acceleration takes, 2 to 3 times "
-            "in those of squares: it balances a torque of the air that grows with the velocity, which that airframe "
-            "does not have, so that its prediction turns over. "
+            "With its own torques `cf21B_500` loses the attitude within 0.25 s. Below 1 Hz, the torque of the rotors "
+            "about x and y is 15 to 27 times the torque that the angular acceleration needs; in flights of squares it "
+            "is 2 to 3 times that torque. It balances a torque of the air that grows with the velocity. The airframe "
+            "does not have this torque of the air, so its prediction turns over. "
             "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
             "`cf21B_500_idsia` is off, too.",
             (partial(flights.open_loop, idsia),), data_problem=data_problem(idsia), needs_logs=True,
@@ -102,8 +102,8 @@ def sections(data: Path | None = None) -> Sequence[Section]:
         Section(
             "nanobench", "Real flights, closed loop",
             "A Crazyflie 2.1: NanoBench. The simulated drone `cf2x_L250` follows the logged setpoints with the "
-            "firmware's controller and filter. The figure is its RMS distance from the setpoint over that of the real "
-            "drone.",
+            "firmware's controller and filter. The figure is the RMS distance of the simulated drone from the "
+            "setpoint, divided by the RMS distance of the real drone.",
             (partial(flights.closed_loop, nanobench),), data_problem=data_problem(nanobench), needs_logs=True,
             axes=("", "error of the simulation over that of the flight"),
         ),
@@ -111,13 +111,15 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "filter", "Real flights, the filter",
             "The firmware's Kalman filter, with its default deviations of motion capture (0.01 m, 0.0045 rad), on the "
             "logged accelerometer, gyroscope and motion capture of NanoBench. The figure is its RMS error against "
-            "motion capture over that of the filter on board, whose deviations are not published. Here the attitude of "
-            "motion capture is a measurement, too. Flights more than 2 m from their setpoint are left out.\n\n"
+            "motion capture, divided by the RMS error of the filter on board, whose deviations are not published. Here "
+            "the attitude of motion capture is a measurement, too. Flights more than 2 m from their setpoint are left "
+            "out.\n\n"
             "The z axis of the tracked body is off the axis of the thrust by 0.4 to 4.2 degrees, 1.1 in the median, "
-            "differently in each flight. Attitudes of motion capture are turned by this angle before they are measured "
-            "and before both filters are compared with them, which lowers the attitude error of the filter on board in "
-            "each flight, from 2.1 to 1.6 degrees in the median. The angle is that of the mean thrust over the whole "
-            "flight, which no filter in flight has: with that of the first 3 s in the air the largest ratio is 1.17.",
+            "differently in each flight. Attitudes of motion capture are turned by this angle before the filter "
+            "measures them and before both filters are compared with them. This lowers the attitude error of the "
+            "filter on board in each flight, from 2.1 to 1.6 degrees in the median. The angle is computed from the "
+            "mean thrust over the whole flight, which no filter has in flight. With the thrust of the first 3 s in the "
+            "air the largest ratio is 1.17.",
             (partial(logged_filter.compare_filter, nanobench),), data_problem=data_problem(nanobench), needs_logs=True,
             axes=("", "error over that of the filter on board"),
         ),

@@ -53,8 +53,8 @@ All airframes have the mass, the inertia and the largest thrust of `cf21B_500`. 
 
 - crazysim: our default controller, 500 Hz. Drag of 0.022 N s/m across the rotors and 0.025 along them. The time
   constant of small changes of the rotor speeds is about 59 ms.
-- C MuJoCo: our default controller in the loop, 500 Hz. No drag, with which `track` was trained. Thrusts follow their
-  commands with a time constant of 59 ms; rotors have no inertia.
+- C MuJoCo: our default controller in the loop, 500 Hz. No drag, although `track` was trained with drag. Thrusts follow
+  their commands with a time constant of 59 ms; rotors have no inertia.
 - Crazyflow: the same airframe, with Crazyflow's controller, 500 Hz.
 - RotorPy: its brushless Crazyflie, whose thrust is proportional to the square of the speed, with a lag of 50 ms, a
   drag in hover of 0.046 N s/m across and 0.11 along the rotors, and translational lift. Its controller of attitudes
@@ -68,7 +68,7 @@ All airframes have the mass, the inertia and the largest thrust of `cf21B_500`. 
 """Paragraphs of the section: method and differences of the simulators."""
 
 PolicyFunction = Callable[[NDArray], NDArray]
-"""Policy: from observations (n, n_obs) to actions (n, k), float32."""
+"""Function that returns actions, (n, k), for observations, (n, n_obs), in float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,8 +98,8 @@ class FlightResult:
     crashed: float
     """Fraction of flights that ended early: the task terminated, or a state became non-finite."""
     error: float
-    """Mean error of the other flights over the last ``task.hold`` seconds, m; NaN if there are none."""
-    observed: NDArray
+    """Mean error of the flights that did not end early over the last ``task.hold`` seconds, m; NaN if all did."""
+    observations: NDArray
     """Observations of all flights. (n_steps, n_starts, n_obs)"""
 
 
@@ -147,12 +147,12 @@ def compile_header(header: Path, n_obs: int, n_actions: int) -> PolicyFunction:
     subprocess.run(command, check=True, capture_output=True)
     act: Any = ctypes.CDLL(str(library)).act
 
-    def actions(obs: NDArray) -> NDArray:
+    def compute_actions(obs: NDArray) -> NDArray:
         obs, out = np.ascontiguousarray(obs, np.float32), np.empty((len(obs), n_actions), np.float32)
         act(len(obs), *(x.ctypes.data_as(ctypes.c_void_p) for x in (obs, out)))
         return out
 
-    return actions
+    return compute_actions
 
 
 def _load_onnx(path: Path) -> PolicyFunction:
@@ -171,7 +171,7 @@ def fly_task(
 
     Args:
         task: Name of the task.
-        command: Policy: from observations (n, n_obs) to attitude commands (n, 4).
+        command: Policy, a function that returns attitude commands, (n, 4), for observations, (n, n_obs).
         simulator: The simulator.
         n_starts: Number of starts.
     """
@@ -188,7 +188,7 @@ def fly_task(
         name: np.asarray(getattr(data.states, name), np.float64)[:, 0] for name in ("pos", "quat", "vel", "ang_vel")
     }
     flights = simulator(states)
-    is_done, errors, observed = np.zeros(n_starts, bool), [], []
+    is_done, errors, observations = np.zeros(n_starts, bool), [], []
     for _ in range(env.max_steps):
         obs = np.asarray(assess_all(data)[0])[:, 0]
         states = flights.fly_period(command(obs))
@@ -198,13 +198,13 @@ def fly_task(
         _, error, terminated = assess_all(data)
         is_done |= np.asarray(terminated) | ~np.all([np.isfinite(x).all(axis=-1) for x in states.values()], axis=0)
         errors.append(np.asarray(error)[:, 0])
-        observed.append(obs)
+        observations.append(obs)
         if is_done.all():
             break
     last_errors = np.stack(errors[-round(env.task.hold / COMMAND_PERIOD) :])
     is_settled, completed_errors = np.all(last_errors < env.task.tolerance, axis=0) & ~is_done, last_errors[:, ~is_done]
     mean = float(completed_errors.mean()) if completed_errors.size else float("nan")
-    return FlightResult(float(is_settled.mean()), float(is_done.mean()), mean, np.stack(observed))
+    return FlightResult(float(is_settled.mean()), float(is_done.mean()), mean, np.stack(observations))
 
 
 def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
@@ -233,7 +233,7 @@ def compare_policy(name: str, simulator: str, folder: Path | None = None) -> Ite
     remark = remark if np.isnan(result.error) else f"mean error {result.error:.2g} m, {remark}"
     yield Row(f"{quantity}: success", simulator, 100 * result.success, "%", None, remark)
     if simulator == "crazysim":
-        obs = result.observed.reshape(-1, result.observed.shape[-1])
+        obs = result.observations.reshape(-1, result.observations.shape[-1])
         difference = float(np.abs(policy.c(obs) - policy.onnx(obs)).max())
         # actions are in [-1, 1], and sums of 64 products are rounded in another order
         yield Row(f"{quantity}: actions of the C header", "ONNX file", difference, "", (0, 1e-5))

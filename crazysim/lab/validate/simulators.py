@@ -1,8 +1,8 @@
 """Other simulators that fly attitude commands: C MuJoCo, Crazyflow, RotorPy and gym-pybullet-drones.
 
-Each flies one drone per start, with the mass, the inertia and the largest thrust of our airframe. Drag, lag, gravity
-and the controller that follows the commands are the simulator's own, except that C MuJoCo has our controller and lag,
-and ``RotorPyRotors`` our controller.
+Each simulator flies one drone per start, with the mass, the inertia and the largest thrust of crazysim's airframe.
+Drag, lag, gravity and the controller that follows the commands are the simulator's own, with two exceptions: C MuJoCo
+has the controller and the lag of crazysim, and ``RotorPyRotors`` has the controller of crazysim.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ CONTROL_PERIOD = 0.004
 """Period of the controllers of RotorPy and gym-pybullet-drones, s."""
 
 States = dict[str, NDArray]
-"""``pos``, ``quat``, ``vel`` and ``ang_vel`` of all drones, with our frames, units and components. (n, k) each"""
+"""``pos``, ``quat``, ``vel`` and ``ang_vel`` of all drones, in crazysim's frames, units and components. (n, k) each"""
 
 
 class Simulator(Protocol):
-    """Drones in flight, one per start."""
+    """Drones in flight, one for each start."""
 
     module: ClassVar[str] = ""
     """Module that must be importable; empty for none."""
@@ -87,7 +87,7 @@ class Crazyflow(Simulator):
 
 
 class AttitudeController:
-    """Our default controller in the loop of another simulator: from attitude commands to thrusts of the rotors."""
+    """Crazysim's default controller for another simulator: it turns attitude commands into thrusts of the rotors."""
 
     def __init__(self, n: int) -> None:
         """Create the controllers of ``n`` drones at rest."""
@@ -131,7 +131,7 @@ class AttitudeController:
 
 
 class Mujoco(Simulator):
-    """C MuJoCo: a free body whose rotors are actuators with a first-order lag, flown by our default controller."""
+    """C MuJoCo: a free body whose rotors are actuators with first-order lag, flown by crazysim's default controller."""
 
     def __init__(self, start: States) -> None:
         self._controller = AttitudeController(len(start["pos"]))
@@ -189,14 +189,14 @@ class RotorPy(Simulator):
 
     def _states(self) -> States:
         names = {"pos": "x", "vel": "v", "quat": "q", "ang_vel": "w"}
-        return {ours: self._state[theirs].numpy() for ours, theirs in names.items()}
+        return {name: self._state[rotorpy_name].numpy() for name, rotorpy_name in names.items()}
 
     def _tensor(self, x: NDArray) -> Any:
         return self._torch.tensor(np.asarray(x, np.float64))
 
 
 class RotorPyRotors(RotorPy):
-    """RotorPy's brushless Crazyflie, flown by our default controller, which commands the thrusts of the rotors."""
+    """RotorPy's brushless Crazyflie, with rotor thrusts that are commanded by crazysim's default controller."""
 
     level = "cmd_motor_thrusts"
 
@@ -265,10 +265,10 @@ class PyBullet(Simulator):
             pwm, quat = (speed - controller.PWM2RPM_CONST) / controller.PWM2RPM_SCALE, s["quat"][k]
             for _ in range(round(COMMAND_PERIOD / CONTROL_PERIOD)):
                 rpm = controller._dslPIDAttitudeControl(CONTROL_PERIOD, pwm, quat, angles[k], np.zeros(3))
-                observed = self._env.step(rpm[None])[0][0]
-                quat = observed[3:7]
-            s["pos"][k], s["quat"][k], s["vel"][k] = observed[:3], quat, observed[10:13]
-            ang_vel[k] = observed[13:16]
+                observation = self._env.step(rpm[None])[0][0]
+                quat = observation[3:7]
+            s["pos"][k], s["quat"][k], s["vel"][k] = observation[:3], quat, observation[10:13]
+            ang_vel[k] = observation[13:16]
         s["ang_vel"] = np.array(rotation.rotate_inverse(jnp.asarray(s["quat"]), jnp.asarray(ang_vel)), np.float64)
         return {name: x.copy() for name, x in s.items()}
 
@@ -329,7 +329,7 @@ def _thrust_max(airframe: Airframe) -> float:
 
 
 def _torque_per_thrust(airframe: Airframe) -> float:
-    """Return the drag torque over the thrust of a rotor at its largest speed, m."""
+    """Return the drag torque divided by the thrust of a rotor at its largest speed, m."""
     max_speed = airframe.rotor_vel_limits[1].max()
     thrust, torque = (
         np.asarray(airframe.value(f"rotors.{name}_curve", (3,)), np.float64) for name in ("thrust", "torque")
@@ -344,7 +344,7 @@ def _hover_speed(sim: Sim) -> NDArray:
 
 
 def _world_rows(states: States) -> States:
-    """Return states of one drone per world. (n, 1, k) each"""
+    """Return states with an axis for the only drone of each world. (n, 1, k) each"""
     return {name: x[:, None] for name, x in states.items()}
 
 

@@ -29,7 +29,7 @@ def results():
 @pytest.mark.long("compiles the step, the controller in the loop, and the task")
 def test_a_pilot_flies_in_mujoco_as_in_crazysim(results):
     """Same starts, same goals, nearly the same flight: MuJoCo has no drag and the rotors another lag."""
-    ours, theirs = (result.observed for result in results)
+    ours, theirs = (result.observations for result in results)
     np.testing.assert_array_equal(ours[0], theirs[0])
     distance = np.linalg.norm(ours[0, :, 3:6], axis=-1)
     assert distance.min() > 0.3
@@ -57,7 +57,7 @@ def test_drones_that_fall_have_crashed():
     result = sim_to_sim.fly_task("hover", lambda obs: np.zeros((len(obs), 4)), Falling, 3)
     assert (result.success, result.crashed) == (0, 1)
     assert np.isnan(result.error)
-    assert len(result.observed) < 50  # 1.9 m of free fall, from at most 0.5 m/s upwards, take less than 0.7 s
+    assert len(result.observations) < 50  # 1.9 m of free fall, from at most 0.5 m/s upwards, take less than 0.7 s
 
 
 def test_simulators_that_are_not_installed_are_left_out(tmp_path, monkeypatch, capsys):
