@@ -13,11 +13,11 @@ ANGLE = 0.3 * np.sin(T)
 """Roll, rad."""
 RATE = 0.3 * np.cos(T)
 LATERAL_POS = 9.81 * ANGLE
-"""Position along y, m: roll accelerates a drone by ``-g roll``, which this is twice the integral of."""
+"""Position along y, m: its second derivative is ``-g roll``, the acceleration of a drone with this roll, m/s^2."""
 
 
 def write_crazyflie(path, version=2, pause=(), damaged=False):
-    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, all others at 50 Hz, and two rare events."""
+    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, other variables at 50 Hz, two rare events."""
     kinds = {
         1: ("start", ["x", "y"]),
         3: ("fast", ["gyro.x", "gyro.y", "gyro.z"]),
@@ -68,7 +68,7 @@ COLUMNS = Columns(
 def write_ulog(path, leave_out=(), slow=(), old=False):
     """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html); slow messages come every 0.25 s.
 
-    Old ones have the body rates in the message of the attitude.
+    Old logs have the body rates in the message of the attitude.
     """
     formats = {
         "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
@@ -121,7 +121,7 @@ def swing(t):
 
 
 def drift(t):
-    """Return position, m, and velocity, m/s, along y that follow from that roll."""
+    """Return the position, m, and velocity, m/s, along y of a drone with the roll of ``swing``."""
     return (
         9.81 * (0.3 * np.sin(t) + 0.1 / 2.7**2 * np.sin(2.7 * t)),
         9.81 * (0.3 * np.cos(t) + 0.1 / 2.7 * np.cos(2.7 * t)),
@@ -160,7 +160,7 @@ def write_blackbox(path, explorer=False, damaged=0, leave_out=()):
 
 
 def create_mocap(offset=0.0, reverse=False):
-    """Return motion capture of the same swing at 100 Hz, on a clock that is behind by an offset, s."""
+    """Return motion capture of ``swing`` at 100 Hz, on a clock that is behind by an offset, s."""
     angle, _ = swing(T)
     if reverse:
         angle = np.cumsum(np.random.default_rng(0).normal(size=N)) * 0.03
@@ -179,7 +179,7 @@ def create_mocap(offset=0.0, reverse=False):
 def write_bag(path, leave_out=(), odometry=True, storage="sqlite3", seconds=4.0):
     """Write a bag: pose or odometry and rotor speeds at 100 Hz, gyroscope at 200 Hz, all with headers.
 
-    The storage is that of ROS 2, ``"sqlite3"`` or ``"mcap"``, or ``"bag"``, the file of ROS 1.
+    The storage is ``"sqlite3"`` or ``"mcap"`` for ROS 2, or ``"bag"`` for ROS 1.
     """
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -218,7 +218,7 @@ def write_bag(path, leave_out=(), odometry=True, storage="sqlite3", seconds=4.0)
 
         def write(topic, t, message):
             if topic in topics:
-                # The bag's own time is late; that of the header counts.
+                # The bag's own time is late; readers use the time in the header.
                 writer.write(topics[topic], round(1e9 * (t + 0.3)), serialize(message, kinds[topic]))
 
         for k, t in enumerate(np.arange(5.0, 5.0 + seconds, 0.005)):

@@ -21,7 +21,7 @@ from crazysim.lab.identify.columns import without_huge_numbers
 N_MUTATIONS = 10 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
 """Mutated files of each kind."""
 MAX_MEMORY = 64 * 2**20
-"""Most memory that reading a file of some 200 kB takes, bytes."""
+"""Largest amount of memory that reading a file of some 200 kB may take, bytes."""
 HANG_TIMEOUT = 60
 """Processor time after which a reader counts as hanging, s: a valid file takes a tenth of a second."""
 INTEGERS = [0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1]
@@ -29,7 +29,7 @@ CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "x", 
 
 
 class HangError(BaseException):
-    """Raised by the alarm; no ``Exception``, which readers turn into errors of their own."""
+    """Error raised by the alarm; it is no ``Exception``, because readers would turn that into their own errors."""
 
 
 def create_table():
@@ -87,23 +87,23 @@ def draw_offset(rng, n):
 
 
 def damage_bytes(rng, data):
-    """Return the bytes with one damage."""
+    """Return the bytes with one random change: a flipped bit, other, missing or repeated bytes, or another number."""
     at, length = draw_offset(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
-    how = rng.randrange(8)
-    if how == 0:
+    change = rng.randrange(8)
+    if change == 0:
         return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
-    if how == 1:
+    if change == 1:
         return data[:at] + rng.randbytes(length) + data[at + length :]
-    if how in (2, 3):
+    if change in (2, 3):
         layout = rng.choice(["<B", "<H", "<I", "<Q", ">I", "<d", "<f"])
         limit = struct.calcsize(layout)
         value = rng.choice([np.nan, np.inf, 1e30, -1.0]) if layout[1] in "df" else rng.choice(INTEGERS) % 256**limit
         return data[:at] + struct.pack(layout, value) + data[at + limit :]
-    if how == 4:
+    if change == 4:
         return data[:at]
-    if how == 5:
+    if change == 5:
         return data[:at] + data[at + length :]
-    if how == 6:
+    if change == 6:
         return data[:at] + data[at : at + length] + data[at:]
     other = draw_offset(rng, len(data))
     return data[:at] + data[other : other + length] + data[at + length :]
@@ -115,19 +115,19 @@ def damage_table(rng, text):
     k = rng.choice([0, rng.randrange(len(lines))])
     cells = lines[k].split(",")
     j = rng.randrange(len(cells))
-    how = rng.randrange(5)
-    if how == 0:
+    change = rng.randrange(5)
+    if change == 0:
         cells[j] = rng.choice(CELLS)
-    elif how == 1:
+    elif change == 1:
         value, step = rng.choice(CELLS), rng.choice([1, 2, 50])  # in many rows
         for i in range(1, len(lines), step):
             row = lines[i].split(",")
             row[min(j, len(row) - 1)] = value
             lines[i] = ",".join(row)
         return "\n".join(lines)
-    elif how == 2:
+    elif change == 2:
         del cells[j]
-    elif how == 3:
+    elif change == 3:
         cells[j] = rng.choice(cells)
     else:
         other = rng.randrange(len(lines))
@@ -151,7 +151,7 @@ def damage_archive(rng):
 
 
 def mutate_file(rng, kind, k, data):
-    """Return the file of a kind after one to three mutations; the number says which kind of them."""
+    """Return the file of a kind after one to three mutations; its number ``k`` chooses how it is mutated."""
     if kind == "npz" and k % 2:
         return damage_archive(rng)
     for _ in range(rng.randint(1, 3)):
@@ -164,7 +164,7 @@ def mutate_file(rng, kind, k, data):
 
 @pytest.fixture(scope="module")
 def valid_files(tmp_path_factory):
-    """Return a valid file of each kind, which is read."""
+    """Return the content of a valid file of each kind."""
     pytest.importorskip("rosbags")
     folder, valid_files = tmp_path_factory.mktemp("seeds"), {}
     for kind, (name, write, columns, motion) in READERS.items():
@@ -174,13 +174,13 @@ def valid_files(tmp_path_factory):
     return valid_files
 
 
-def refusal(path, columns, motion):
+def read_refusal_message(path, columns, motion):
     """Return the message with which a log is refused, None if it is read; fail for anything else."""
 
-    def hang(*_):
+    def raise_hang_error(*_):
         raise HangError
 
-    before = signal.signal(signal.SIGVTALRM, hang)
+    previous_handler = signal.signal(signal.SIGVTALRM, raise_hang_error)
     signal.setitimer(signal.ITIMER_VIRTUAL, HANG_TIMEOUT)
     tracemalloc.reset_peak()
     start, _ = tracemalloc.get_traced_memory()
@@ -195,7 +195,7 @@ def refusal(path, columns, motion):
         assert len(message) < 3000
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        signal.signal(signal.SIGVTALRM, before)
+        signal.signal(signal.SIGVTALRM, previous_handler)
     assert not warned, str(warned[0])
     assert tracemalloc.get_traced_memory()[1] - start < MAX_MEMORY
     return message
@@ -220,7 +220,7 @@ def test_a_mutated_log_is_read_or_refused(kind, valid_files, tmp_path, capfd, tr
         path = tmp_path / f"{k}-{name}"
         path.write_bytes(mutate_file(rng, kind, k, valid_files[kind]))
         try:
-            outcomes[refusal(path, columns, motion) is None] += 1
+            outcomes[read_refusal_message(path, columns, motion) is None] += 1
         except BaseException as error:
             error.add_note(f"of the mutation {k} of {kind} with CRAZYSIM_FUZZ_SEED={seed}")
             raise
@@ -230,7 +230,7 @@ def test_a_mutated_log_is_read_or_refused(kind, valid_files, tmp_path, capfd, tr
 
 
 def test_bytes_that_are_signalling_nans_are_missing_numbers(tmp_path):
-    """NumPy warns where it converts one."""
+    """NumPy would warn when it converts a signalling NaN."""
     signalling = np.frombuffer(np.array([0x7FA00000, 0x3F800000], np.uint32).tobytes(), np.float32)
     np.testing.assert_array_equal(without_huge_numbers(signalling), [np.nan, 1.0])
     path, columns = tmp_path / "a.npz", create_table()
@@ -253,7 +253,7 @@ def archive(data=b"", method=0, flags=0):
 
 
 def npy(header):
-    """Return an array of eight bytes below a header of its own."""
+    """Return an ``.npy`` file of eight bytes of data with a header."""
     return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode() + bytes(8)
 
 
@@ -295,7 +295,7 @@ def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, cap
         pytest.importorskip("rosbags")
     name, data, expected = HOSTILE[case]
     (tmp_path / name).write_bytes(data)
-    message = refusal(tmp_path / name, None, None)
+    message = read_refusal_message(tmp_path / name, None, None)
     assert re.search(expected, message), message
     assert message.endswith(".")
     assert capfd.readouterr() == ("", "")
@@ -305,7 +305,9 @@ def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, cap
 def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, traced):
     with (tmp_path / name).open("wb") as file:
         file.truncate(2**40)  # takes no room on the disk
-    assert "expected a log of at most 2147483648 bytes, got 1099511627776" in refusal(tmp_path / name, None, None)
+    assert "expected a log of at most 2147483648 bytes, got 1099511627776" in read_refusal_message(
+        tmp_path / name, None, None
+    )
 
 
 def test_a_blackbox_log_without_a_motor_or_with_a_strange_setting_is_refused_or_read(valid_files, tmp_path):

@@ -33,7 +33,7 @@ N_FLIGHTS = 6
 
 @pytest.fixture(scope="module")
 def flights():
-    """Columns of simulated flights of a drone that differs from cf21B_500, sampled at 250 Hz."""
+    """Return columns of simulated flights of a drone that differs from cf21B_500, sampled at 250 Hz."""
     base = load_airframe("cf21B_500")
     inertia = np.diag(base.inertia) * [FACTORS["inertia x"], FACTORS["inertia y"], 1]
     curve = base.value("rotors.thrust_curve") * FACTORS["thrust factor"]
@@ -98,9 +98,9 @@ def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, r
 
 
 def test_of_one_prediction_the_mean_is_the_root_mean_square(flights, result):
-    """The root mean square is of the chord 2 sin(a / 2) of an angle."""
+    """The root mean square of attitudes is computed from the chord 2 sin(a / 2) of an angle."""
     log = read_log(flights[-1])
-    n = round(0.5 / log.dt) + 4  # one window and a sample beside each end
+    n = round(0.5 / log.dt) + 4  # one window, and one more sample at each end
     fields = ("t", "pos", "quat", "vel", "ang_vel", "rotor_vel")
     log = replace(log, **{key: getattr(log, key)[:n] for key in fields})
     errors = prediction_errors([log], result.model)
@@ -188,7 +188,7 @@ def test_spikes_of_rotor_speeds_are_interpolated(flights):
 
 
 def test_lost_values_are_gaps(flights):
-    """0.08 s of NaN, and of zero quaternions, as of a lost motion capture; 0.008 s are interpolated."""
+    """0.08 s of NaN or of zero quaternions, as when motion capture loses the drone, are a gap; 0.008 s are filled."""
     for names, value in (("x",), np.nan), (("qx", "qy", "qz", "qw"), 0.0):
         log = {k: x.copy() for k, x in flights[0].items()}
         for name in names:
@@ -211,7 +211,7 @@ def test_jumps_of_the_time_cost_their_samples_alone(flights):
     read = read_log(flights[0] | {"t": t})
     assert len(read.t) == len(t) - 4
     assert "dropped 4 samples" in read.repairs[0]
-    assert read.gaps.tolist() == [149, 298]  # those of 0.008 s that are left
+    assert read.gaps.tolist() == [149, 298]  # the remaining intervals of 0.008 s
 
 
 def test_jitter_is_no_gap_and_lost_time_beside_it_is_one(flights):
@@ -250,7 +250,7 @@ def test_wrong_units_and_signs_are_refused(flights, factors, remedy):
 
 
 def test_factors_of_columns_are_applied(flights):
-    """Those that the errors name."""
+    """These are factors that the errors name."""
     log = {
         k: x * {"t": 1e3, "x": 1e3, "y": 1e3, "z": 1e3, "vx": 10, "vy": 10, "vz": 10}.get(k, 1)
         for k, x in flights[0].items()
@@ -339,15 +339,15 @@ def test_angles_that_wrap_are_interpolated_across_the_wrap(flights):
     np.testing.assert_allclose(table["yaw"], yaw[: len(table["t"])], atol=1e-9)
 
 
-def in_a_row(flights):
-    """Return three flights as one of 6 s."""
+def concatenate_flights(flights):
+    """Return three flights as one flight of 6 s."""
     parts = range(3)
     return {k: np.concatenate([flights[i][k] + (2.0 * i if k == "t" else 0) for i in parts]) for k in flights[0]}
 
 
 def test_time_on_the_ground_is_left_out(flights):
     """Three seconds before a flight of 6 s and two after it, with rotors at 0.3 of their speeds, and a spike."""
-    flight, table = in_a_row(flights), {}
+    flight, table = concatenate_flights(flights), {}
     for key, x in flight.items():
         rest = {"t": 0.004 * np.arange(1, 751), "qw": np.ones(750)}.get(key, np.zeros(750))
         before, after = (x[0] - rest[::-1], x[-1] + rest) if key == "t" else (rest, rest)
@@ -356,7 +356,7 @@ def test_time_on_the_ground_is_left_out(flights):
         table[key] = np.r_[before, x, after[:500]]
     table["rpm1"][100] = 1e6
     log = read_log(table)
-    assert (log.t[0], log.t[-1]) == pytest.approx((1.0, 5.0), abs=0.15)  # a second beside the ground, too
+    assert (log.t[0], log.t[-1]) == pytest.approx((1.0, 5.0), abs=0.15)  # a second next to the ground is left out, too
     assert "on the ground" in log.repairs[0]
     rotors = {k: (0 * x if k.startswith("rpm") else x) for k, x in table.items()}
     with pytest.raises(ConfigError, match="rotors at rest"):
@@ -387,7 +387,7 @@ def test_drift_at_rest_is_no_wrong_unit(flights):
 
 def test_a_gyroscope_that_fails_is_left_out(flights):
     """A rate that grows to 200 rad/s in the last 0.4 s, of pieces of 2 s of three flights in a row."""
-    log = in_a_row(flights)
+    log = concatenate_flights(flights)
     log["wx"][1000:] += np.linspace(50, 200, 500)
     read = read_log(log)
     assert "without an angular velocity that turns the attitude" in read.repairs[0]

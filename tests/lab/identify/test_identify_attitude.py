@@ -17,7 +17,7 @@ RATE, SECONDS = 100, 30
 
 @pytest.fixture(scope="module")
 def flight():
-    """Columns of a simulated flight of cf2x_L250 with the fitted model, that starts in hover."""
+    """Return columns of a simulated flight of cf2x_L250 with the fitted model, which starts in hover."""
     sim = Sim(drone="cf2x_L250", dynamics=MODEL, control="attitude", freq=1000, attitude_freq=RATE, integrator="rk4")
     airframe, rng = load_airframe("cf2x_L250"), np.random.default_rng(0)
     hover = float(airframe.value("rigid_body.mass")) * 9.81 / float(airframe.value(f"fitted.{MODEL}.cmd_f_coef"))
@@ -39,14 +39,14 @@ def flight():
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
-def columns(flight, *names):
+def stack_columns(flight, *names):
     return np.stack([flight[name] for name in names], axis=-1)
 
 
 def test_names_of_crazyflow_find_the_parameters(flight):
-    data = {"time": flight["t"], "cmd_f": flight["thrust_command"], "pos": columns(flight, *"xyz")}
-    data |= {"quat": columns(flight, "qx", "qy", "qz", "qw")}
-    data |= {"cmd_rpy": columns(flight, "roll_command", "pitch_command", "yaw_command")}
+    data = {"time": flight["t"], "cmd_f": flight["thrust_command"], "pos": stack_columns(flight, *"xyz")}
+    data |= {"quat": stack_columns(flight, "qx", "qy", "qz", "qw")}
+    data |= {"cmd_rpy": stack_columns(flight, "roll_command", "pitch_command", "yaw_command")}
     log, airframe = derivatives_svf(preprocessing(data)), load_airframe("cf2x_L250")
     found = sys_id_translation(MODEL, float(airframe.value("rigid_body.mass")), log)
     true = {key: airframe.value(f"fitted.{MODEL}.{key}") for key in ("cmd_f_coef", "thrust_dyn_coef")}
@@ -82,7 +82,7 @@ def test_the_true_model_predicts_its_own_flight(flight):
     errors = prediction_errors([read_log(flight)], model)
     assert np.all(errors["position"] < 0.03 * errors["position at constant velocity"])
     assert np.all(errors["attitude"] < 0.01 * errors["attitude unchanged"])
-    # RMSE, and mean, of one distribution.
+    # The mean of a distribution is below its RMSE.
     for name in ("position", "attitude"):
         assert np.all(errors[f"{name} (mean)"] < errors[name])
 

@@ -16,7 +16,7 @@ NOISE_STD = np.repeat([1e-3, 1e-3, 1e-2, 1e-2], [3, 4, 3, 3])
 
 
 def draw_airframe(rng, folder, k):
-    """Return a file of what is known of an airframe, the airframe, and its factors and numbers."""
+    """Return the file of an estimated airframe, a random airframe near it, and the true parameters by name."""
     mass = float(np.exp(rng.uniform(np.log(0.03), np.log(5))))
     propeller = 0.127 * (mass / 0.6) ** (1 / 3) * rng.uniform(0.85, 1.2)
     known = {"arm": propeller * rng.uniform(0.75, 1.2), "thrust_to_weight": rng.uniform(1.8, 5)}
@@ -47,7 +47,7 @@ def draw_airframe(rng, folder, k):
 def fly_airframes(airframes, seconds, rng, *, at_samples):
     """Return flights of drones that tilt, turn and climb at random, as columns at 100 Hz.
 
-    Commands come at samples of the log, or at any time between them, as of a program that does not wait for it.
+    Commands change at samples of the log, or, without ``at_samples``, at random times between them.
     """
     n = len(airframes)
     sim, drones = Sim(drone=airframes, control="attitude", integrator="rk4"), [load_airframe(a) for a in airframes]
@@ -79,7 +79,7 @@ def fly_airframes(airframes, seconds, rng, *, at_samples):
 
 
 def find_missed_parameters(folder, n, seconds, seed, *, at_samples):
-    """Return numbers further than three deviations from the truth, of fits with and without noise, and how many are."""
+    """Return the fitted numbers that are off by more than three deviations, and the number of all fitted numbers."""
     rng = np.random.default_rng(seed)
     paths, airframes, truths = zip(*(draw_airframe(rng, folder, k) for k in range(n)), strict=True)
     wrong, total = [], 0

@@ -60,7 +60,7 @@ def test_angles_after_a_sample_that_is_missing_are_kept():
 
 
 def test_compressed_attitudes_are_unpacked():
-    """The components below, packed by the definition of quatcompress.h: three of ten bits after the largest's index."""
+    """The quaternions are packed as in quatcompress.h: the index of the largest component, then 10 bits for others."""
     bits = {1: [(2, 0), (0, 255), (1, 511), (0, 511)], 2: [(3, 0), (0, 0), (1, 100), (0, 1)]}
     packed = [
         (b[0][0] << 30) | sum(((s << 9) | m) << (20 - 10 * k) for k, (s, m) in enumerate(b[1:])) for b in bits.values()

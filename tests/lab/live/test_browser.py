@@ -27,7 +27,7 @@ MAGENTA = (1, 0, 1)
 
 @pytest.fixture(scope="module")
 def sim(plain_scene):
-    """Two magenta drones that hover at 1 m, 2 m apart."""
+    """Return a simulation of two magenta drones that hover at 1 m, 2 m apart."""
     sim = Sim(n_drones=2, control="state", xml_path=plain_scene)
     sim.mj_model.mat_rgba[:] = [1, 0, 1, 1]
     pos = np.array([[[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]])
@@ -38,7 +38,7 @@ def sim(plain_scene):
 
 @pytest.fixture
 def live(sim):
-    """A running loop, paused, with a page."""
+    """Return a paused loop without a viewer."""
     sim.reset()
     live = Live(sim, fps=10)  # the browser of the tests draws without a GPU
     live.command[..., 2] = 1.0
@@ -63,7 +63,7 @@ class Running:
         self.live.close()
 
 
-def pixel(chromium, point, size):
+def project_point(chromium, point, size):
     """Return column and row of a point in the first view of the page's camera."""
     position, target = np.array([0.0, -0.9 * size, 0.6 * size + 0.5]), np.array([0, 0, 0.5])
     ahead = (target - position) / np.linalg.norm(target - position)
@@ -110,15 +110,15 @@ def test_a_page_shows_the_simulation_and_commands_it(chromium, live, caplog):
 
         # The left drone is drawn at its position.
         live.post(lambda live: live.select(0, 0))
-        left, right = pixel(chromium, [-1, 0, 1], SIZE), pixel(chromium, [1, 0, 1], SIZE)
+        left, right = project_point(chromium, [-1, 0, 1], SIZE), project_point(chromium, [1, 0, 1], SIZE)
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) > 40)
         columns = np.sort(chromium.mask(MAGENTA)[1])
         assert abs(columns[0] - left[0]) < 4 * MAX_PIXEL_DISTANCE
         np.testing.assert_allclose(columns[-1], right[0], atol=4 * MAX_PIXEL_DISTANCE)
 
-        # A click on the right one selects it, one on the ground is reported in the world's frame.
+        # A click on the right drone selects it; a click on the ground is reported in the world's frame.
         wait_for(lambda: (click(chromium, right), time.sleep(0.3), live.selected == (0, 1))[-1])
-        click(chromium, pixel(chromium, [-0.5, -1.0, 0.0], SIZE))
+        click(chromium, project_point(chromium, [-0.5, -1.0, 0.0], SIZE))
         wait_for(lambda: clicked)
         assert clicked[0][0] == 0
         np.testing.assert_allclose(clicked[0][1], [-0.5, -1.0, 0.0], atol=0.05)
@@ -175,7 +175,7 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
         def pick(point, expected):
-            pixel_pos = pixel(chromium, point, size)
+            pixel_pos = project_point(chromium, point, size)
             wait_for(lambda: (click(chromium, pixel_pos), time.sleep(0.3), live.followed == expected)[-1])
 
         pick([2.5, -0.5, 0.08], (1, "cars", 0))
@@ -192,7 +192,7 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
         assert len(chromium.mask(MAGENTA)[0]) == 0
         live.selected = None  # without the mark around it
         live.lights[1, 0] = [1.0, 0.0, 1.0]
-        pixel_pos = pixel(chromium, [1.5, 0.0, 1.5], size)
+        pixel_pos = project_point(chromium, [1.5, 0.0, 1.5], size)
         np.testing.assert_allclose(chromium.find(MAGENTA, pixel_pos), pixel_pos, atol=MAX_PIXEL_DISTANCE)
         live.lights[:] = 0.0
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) == 0)

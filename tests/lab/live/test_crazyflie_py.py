@@ -124,7 +124,7 @@ def test_streamed_hover_setpoints(script):
 
 
 def test_a_landing_ends_on_the_floor_although_the_controller_has_an_offset(script):
-    """The default controller has an offset, as has a controller with a load."""
+    """The default controller has an offset, as controllers with a load do."""
     timeHelper, cf = script.timeHelper, script.allcfs.crazyflies[0]
     cf.takeoff(targetHeight=0.5, duration=1.5)
     timeHelper.sleep(2.0)

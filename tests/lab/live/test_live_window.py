@@ -137,7 +137,7 @@ def test_leds_have_the_colours_of_the_picture():
 
 
 def test_a_double_click_reports_the_body_below_it():
-    """A click on a wheel reports its car, one on a fixed geom its point, and one on nothing is not reported."""
+    """A click on a wheel reports its car, a click on a fixed geom its point; a click on nothing is not reported."""
     sim = Sim(n_drones=2, control="state")
     sim.add(Cars(2))
     sim.scene.compile_if_edited()

@@ -240,7 +240,7 @@ def test_a_broken_viewer_is_closed_and_named(live, caplog):
 
 
 class Equal(Counter):
-    """A viewer that equals every other, as two windows with the same settings do."""
+    """A viewer that equals every other viewer, as two windows with the same settings do."""
 
     def __eq__(self, other):
         return True

@@ -79,7 +79,7 @@ class HostileSource(MocapSource):
 
 
 def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog):
-    """The rest continues: drones hold their setpoints, and twins of valid bodies follow them."""
+    """Everything else continues: drones hold their setpoints, and twins of valid bodies follow these bodies."""
     sim = Sim(n_drones=1, control="state")
     sim.scene.add("box", "wall", pos=[5, 5, 0])
     twins = Twins(sim, HostileSource(), {"": Twin("box", {"size": (0.1, 0.1, 0.1)})}, ["a", "b"])

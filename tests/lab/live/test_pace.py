@@ -55,7 +55,7 @@ def test_a_lag_beyond_the_limit_is_not_caught_up(clock):
 
 
 def test_quantiles_of_lateness(clock):
-    """999 of 1000 steps on time, one 7 ms late."""
+    """999 of 1000 steps are on time, and one step is 7 ms late."""
     pace = Pace(1.0, 1.0, clock)
     for k in range(1000):
         clock.now = 10.0 + k + (0.007 if k == 500 else 0.0)

@@ -133,7 +133,7 @@ def test_points_are_read_from_text(tmp_path):
 
 
 def test_the_command_flies_to_typed_and_to_listed_goals(folder, tmp_path, capsys):
-    """Once with a goal on the standard input, recorded, and once with a file of points."""
+    """The command flies once to a goal on the standard input, with a recording, and once to the points in a file."""
     read_end, write_end = os.pipe()
     os.write(write_end, b"0.4 0.2 1.1\n")
     os.close(write_end)

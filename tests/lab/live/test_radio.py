@@ -27,7 +27,7 @@ def create_swarm(control, **settings):
 
 
 class RecordedRadio:
-    """A swarm behind cflib whose packets are recorded, as a radio would send them."""
+    """A swarm that cflib reaches through a driver that records the packets."""
 
     def __init__(self, control):
         self.swarm = create_swarm(control)

@@ -184,7 +184,7 @@ def test_waiting_commands_are_bounded(monkeypatch):
 
 
 def test_commands_that_arrive_during_a_call_wait_for_the_next_call():
-    """A producer as fast as the consumer: it adds a command whenever one of the first nine is removed."""
+    """Queue with a producer as fast as the consumer: it adds a command when one of the first nine is removed."""
     queue = CommandQueue()
     queue._enqueue(Land(1))
     take = queue._queue.get_nowait
@@ -217,7 +217,7 @@ def test_many_clients_at_once(server):
 
 @contextlib.contextmanager
 def lab_server(*messages, leaves=False):
-    """A server of a stream, as the lab's, that sends messages to its first client and collects the answers."""
+    """Run a server like the lab's stream server, which sends messages to its first client and collects the answers."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         answers = bytearray()
 

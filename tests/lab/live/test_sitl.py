@@ -83,7 +83,7 @@ def free_port(kind):
 
 
 def create_disturbed_sim(**settings):
-    """Return a simulation whose drone hangs in the air, turned and beside its goal."""
+    """Return a simulation whose drone starts in the air, turned and away from its goal."""
     sim = Sim(control="rotor_vel", **settings)
     states = sim.data.states
     pos, quat = np.array(states.pos), np.array(states.quat)
@@ -102,7 +102,7 @@ def assert_at_goal(sim):
 
 
 class LockstepBetaflight(Betaflight):
-    """Waits for each answer, so that the flight does not depend on how fast the machine is."""
+    """The stand-in waits for each answer, so that the flight does not depend on the speed of the machine."""
 
     lockstep = True
 

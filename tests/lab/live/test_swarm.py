@@ -104,7 +104,7 @@ def test_a_landing_continues_if_the_drone_is_still_too_high():
 
 
 def test_commands_are_in_the_frame_of_the_estimate():
-    """A drone at (1, 2) with yaw 0.5 whose estimate is (5, 5) with yaw 0.5 + pi / 2: forward is to the left there."""
+    """The drone is at (1, 2) with yaw 0.5; its estimate is (5, 5) with yaw 0.5 + pi / 2, a quarter turn to the left."""
     commander = flying()
     commander.set_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
     commander.go_to([5.0, 6.0, 0.5], 0.5 + np.pi / 2, 1.0)

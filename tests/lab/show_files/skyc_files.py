@@ -7,7 +7,7 @@ import json
 import zipfile
 
 RED_3_S = base64.b64encode(bytes([0x04, 255, 0, 0, 0x96, 0x01, 0x00])).decode()
-"""Red for 150 ticks of 20 ms, then the end: the code of the lab's samples."""
+"""Light program of the lab's samples: red for 150 units of 20 ms, then the end."""
 
 
 def archive(files):
@@ -139,7 +139,7 @@ ALL = {"lab": lab, "lab_poly4d": lab_poly4d, "lab_older": lab_older, "studio": s
 
 
 def changed(files, name, path, value):
-    """Return the files with one value exchanged, at a path of keys and indices."""
+    """Return the files with another value at a path of keys and indices."""
     files = copy.deepcopy(files)
     holder = files[name]
     for key in path[:-1]:

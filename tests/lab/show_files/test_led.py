@@ -14,7 +14,7 @@ RED, GREEN, WHITE, BLACK = (1, 0, 0), (0, 1, 0), (1, 1, 1), (0, 0, 0)
 
 
 LONG = Lights.of_pieces(np.arange(64.0), np.zeros((64, 3)))
-"""Lights with as many pieces as those of any test: stacked with it, all are evaluated by one program."""
+"""Lights with as many pieces as any test needs; lights stacked with it are all evaluated by one compiled function."""
 
 
 def colors(program, *times, **options):

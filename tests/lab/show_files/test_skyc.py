@@ -21,7 +21,7 @@ from crazysim.trajectories.files.pieces import trajectory_pieces
 
 
 def positions(trajectory, t):
-    """Position, m, and yaw, rad, from the coefficients in float64. (n, 4)"""
+    """Return position, m, and yaw, rad, from the coefficients in float64. (n, 4)"""
     ends, c = trajectory_pieces(trajectory)
     begins = np.concatenate([[0.0], ends[:-1]])
     t = np.clip(t, 0, ends[-1])
@@ -31,7 +31,7 @@ def positions(trajectory, t):
 
 
 def bernstein(points, t):
-    """The same from the file's control points, by SciPy, degrees to radians. (n, 4)"""
+    """Return position, m, and yaw, rad, from the file's control points, by SciPy. (n, 4)"""
     begins, last, out = points[0][0], points[0][1], np.zeros((len(t), 4))
     for end, point, inner in points[1:]:
         curve = BPoly(np.array([last, *inner, point], float)[:, None], [begins, end])
@@ -271,7 +271,7 @@ def test_damaged_archives_are_loaded_or_refused(name, changes, cut):
 
 
 def places(value, path=()):
-    """All paths of keys and indices in a JSON document."""
+    """Yield all paths of keys and indices in a JSON document."""
     yield path
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in items:

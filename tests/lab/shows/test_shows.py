@@ -46,7 +46,7 @@ SHOW = Show(
     lights=Lights.stack(LIGHTS),
     settings={"validation": {"minDistance": 0.3}},
 )
-"""Two drones that meet head-on after 1 s, 2 cm beside each other, and a third beside them."""
+"""Two drones that meet head-on after 1 s, with 2 cm between their paths, and a third drone next to them."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def flight():
 
 
 def test_closest_approach_of_straight_lines():
-    """Between samples: two drones at 1 m/s each, which pass 0.3 m beside each other at 1.234 s."""
+    """Two drones at 1 m/s each pass at a distance of 0.3 m at 1.234 s, which is between two samples."""
     t = np.arange(0.0, 3.0, 0.1)
     x = t - 1.234
     pos = np.stack([np.stack([x, 0 * x, 0 * x], -1), np.stack([-x, 0 * x + 0.3, 0 * x], -1)], axis=1)

@@ -37,7 +37,7 @@ def write_log(path, setpoint, pos, rest=0.06, before=100):
 
 
 def test_a_flight_of_the_simulation_is_matched(circling_flight, tmp_path):
-    """The same flight again: position within interpolation, error and lag alike; the filter adds little of either."""
+    """The simulation repeats its own flight: equal positions, error and lag; the filter adds little error and lag."""
     path = write_log(tmp_path / "own.npz", *circling_flight)
     flight = read_flight(path)
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ from crazysim.lab.validate import raptor
 
 
 class FakePolicy:
-    """Policy of the interface of RAPTOR, which returns its own count of steps and what it observed."""
+    """Policy with the interface of RAPTOR that returns its count of steps and its observation."""
 
     def __init__(self):
         self.state, self.observed_actions = 0, []

@@ -28,7 +28,7 @@ def results():
 
 @pytest.mark.long("compiles the step, the controller in the loop, and the task")
 def test_a_pilot_flies_in_mujoco_as_in_crazysim(results):
-    """Same starts, same goals, nearly the same flight: MuJoCo has no drag and the rotors another lag."""
+    """Flights from equal starts to equal goals are nearly the same; in MuJoCo drag is missing and the lag differs."""
     ours, theirs = (result.observations for result in results)
     np.testing.assert_array_equal(ours[0], theirs[0])
     distance = np.linalg.norm(ours[0, :, 3:6], axis=-1)

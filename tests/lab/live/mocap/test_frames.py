@@ -22,7 +22,7 @@ def test_y_up_by_hand():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_points_turn_alike_in_both_frames(convention):
-    """A point of the body has the same place, whichever frame the turn is computed in."""
+    """A point of the body has the same position, whichever frame its rotation is computed in."""
     rng = np.random.default_rng(0)
     quat, point = rng.normal(size=(20, 4)), rng.normal(size=(20, 3))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)

@@ -18,7 +18,7 @@ def create_frame(t, received=None, quat=LEVEL_QUAT, **places):
 
 
 def create_tracker(n=40, freq=100.0):
-    """Return a tracker that has followed a body at 1 m/s and a resting one."""
+    """Return a tracker that has followed a body at 1 m/s and a resting body."""
     tracker = Tracker(["a", "b"])
     for k in range(n):
         assert tracker.accept(create_frame(k / freq, a=(k / freq, 0, 1), b=(0, 5, 0)))

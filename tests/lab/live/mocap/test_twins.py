@@ -28,7 +28,7 @@ BALL = Twin("sphere", {"radius": 0.1})
 
 
 class ManualSource(MocapSource):
-    """A source of frames that a test gives."""
+    """Source of the frames that a test sends."""
 
     def __init__(self):
         self.t, self.waiting = 0.0, []
@@ -48,7 +48,7 @@ def sim():
 
 
 def create_meeting(source, *settings):
-    """Return drones that measure and hit balls which the poses of a source move, and the plugins that do so."""
+    """Return a simulation with two moving balls, its twins, and plugins with which drones measure and hit the balls."""
     sim = Sim(n_worlds=2, n_drones=1, control="state")
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 1.0])))
@@ -59,7 +59,7 @@ def create_meeting(source, *settings):
 
 @pytest.fixture(scope="module")
 def step():
-    """Return the step of every such simulation, which is compiled once."""
+    """Return the compiled step of the simulations of ``create_meeting``."""
     return create_meeting(ManualSource())[0].build_step_fn()
 
 
@@ -206,7 +206,7 @@ def test_simulated_drones_measure_report_and_hit_a_real_one(step):
     np.testing.assert_allclose(rays.read(sim.data).distance, 1.0, atol=0.01)
     assert not sim.contact_report(twins.handles["cf1"]).objects.any()
     hit, touched = 0.0, False
-    for k in range(100):  # the real one flies at 1 m/s through the place of the simulated one
+    for k in range(100):  # the real drone flies at 1 m/s through the simulated drone
         source.send(cf1=(1.1 - 0.01 * k, 0, 1))
         twins.update(sim)
         for _ in range(5):
@@ -279,7 +279,7 @@ def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path, step):
 
 
 def test_playback_moves_objects_in_the_compiled_step():
-    """Every world replays the stream from a start of its own; drones measure the objects within the step."""
+    """Every world replays the stream from its own start time; drones measure the objects within the step."""
     sim = Sim(n_worlds=3, n_drones=1, control="state")
     sim.scene.add("box", "fixed_by_handle", pos=[0.0, -5.0, 0.0])
     states = sim.data.states
