@@ -24,7 +24,7 @@ class Circles:
         """Create circles that pass above the drones' present positions.
 
         Args:
-            live: Loop.
+            live: Loop of the simulation.
             piloted: True to leave the first drone of the first world to a pilot once it has risen.
         """
         self._initial_pos = np.asarray(live.sim.data.states.pos, float).copy()

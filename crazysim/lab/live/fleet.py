@@ -90,10 +90,10 @@ class Fleet:
         sim.build_default_data()
 
     def apply(self, commands: Iterable[Command]) -> int:
-        """Carry out commands between two steps, and return the number of those that succeeded.
+        """Carry out commands between two steps, and return the number of commands that succeeded.
 
         Args:
-            commands: Commands, in order; one that cannot be carried out is logged.
+            commands: Commands, in order; a command that cannot be carried out is logged.
         """
         n_succeeded = 0
         for command in commands:
@@ -105,7 +105,7 @@ class Fleet:
         return n_succeeded
 
     def reset(self) -> None:
-        """Make every drone hover at its position; received trajectories stay. Call it after ``sim.reset()``."""
+        """Make every drone hover at its position; received trajectories are kept. Call it after ``sim.reset()``."""
         self._awaits_first_trajectory = [True] * self.sim.n_drones
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
@@ -134,7 +134,7 @@ class Fleet:
             show = command.show
             if show.n_drones > self.sim.n_drones:
                 raise ConfigError(f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}")
-            trajectories = [_without_padding(show.trajectory(i)) for i in range(show.n_drones)]
+            trajectories = [_remove_padding(show.trajectory(i)) for i in range(show.n_drones)]
             for trajectory in trajectories:
                 self._check_trajectory(trajectory)
             for drone, trajectory in enumerate(trajectories):
@@ -239,7 +239,7 @@ def _vertical_trajectory(point: NDArray, height: float) -> Trajectory:
     return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
 
 
-def _without_padding(trajectory: Trajectory) -> Trajectory:
+def _remove_padding(trajectory: Trajectory) -> Trajectory:
     """Return one trajectory of a stacked record without the zero-length pieces that pad its end."""
     ends = np.asarray(trajectory.ends, float)
     n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)

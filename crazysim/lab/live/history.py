@@ -35,14 +35,14 @@ class History:
         self._latest: deque[Snapshot] = deque(maxlen=length)
 
     def add(self, snapshot: Snapshot) -> None:
-        """Add a snapshot, unless there is one of its step or a later one, as after a jump back."""
+        """Add a snapshot, unless the history has one of the same or a later step, as after a jump back."""
         if self._first is None:
             self._first = snapshot
         elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:
             self._latest.append(snapshot)
 
     def rewind(self, step: int) -> Snapshot | None:
-        """Remove the snapshots after a control step, and return the latest of the others; None if there is none."""
+        """Remove the snapshots after a control step, and return the latest remaining snapshot; None if none remains."""
         while self._latest and self._latest[-1].step > step:
             self._latest.pop()
         if self._latest:

@@ -56,7 +56,7 @@ class Process:
     longest_call: float = 0.0
     """Duration of the longest call, s."""
     longest_call_time: float = 0.0
-    """Simulated time at which it began, s."""
+    """Simulated time at which the longest call began, s."""
     failures: int = 0
     """Number of errors that were reported."""
     _may_warn: RateLimit = field(default_factory=RateLimit, repr=False)

@@ -265,11 +265,11 @@ def _log_errors(name: str) -> Iterator[None]:
 def _read_messages(
     peer: socket.socket, stop_event: threading.Event, timeout: float
 ) -> Iterator[Message | Request | ShowFile]:
-    """Yield the messages of a connection until it ends, or the server stops.
+    """Yield the messages of a connection until it ends, or ``stop_event`` is set.
 
     Raises:
-        FramingError: If the client sends something else.
-        TimeoutError: If the client does not finish a message.
+        FramingError: If the other side sends bytes that are not a message.
+        TimeoutError: If the other side does not finish a message in time.
     """
     buffer, deadline = MessageBuffer(), None
     peer.settimeout(POLL_INTERVAL)
