@@ -10,7 +10,7 @@ RED_3_S = base64.b64encode(bytes([0x04, 255, 0, 0, 0x96, 0x01, 0x00])).decode()
 """Light program of the lab's samples: red for 150 units of 20 ms, then the end."""
 
 
-def archive(files):
+def pack_archive(files):
     """Return a zip archive of JSON documents, or of bytes as they are."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
@@ -19,10 +19,11 @@ def archive(files):
     return buffer.getvalue()
 
 
-def show_json(n, **settings):
+def create_show_json(n, **settings):
+    """Return the ``show.json`` of a show with n drones."""
     drones = []
     for i in range(n):
-        own = {
+        drone_settings = {
             "trajectory": {"$ref": f"./drones/drone_{i}/trajectory.json#"},
             "lights": {"$ref": f"./drones/drone_{i}/lights.json#"},
             "home": [float(i), 0.0, 0.0],
@@ -30,7 +31,7 @@ def show_json(n, **settings):
             "landAt": [float(i), 0.0, 0.1],
             "name": f"cf{i}",
         }
-        drones.append({"type": "generic", "settings": own | settings})
+        drones.append({"type": "generic", "settings": drone_settings | settings})
     validation = {"maxAltitude": 2.0, "maxVelocityXY": 2.0, "maxVelocityZ": 1.5, "minDistance": 0.8}
     return {
         "version": 1,
@@ -45,8 +46,8 @@ def show_json(n, **settings):
 CUES = {"version": 1, "items": [{"time": 4.0, "name": "land"}, {"time": 0.0, "name": "start"}]}
 
 
-def compressed(x=0.0):
-    """Three curves of degrees 1, 3 and 7 with yaw, degrees."""
+def create_compressed_trajectory(x=0.0):
+    """Return a trajectory of three curves of degrees 1, 3 and 7 with yaw, degrees."""
     return {
         "version": 1,
         "points": [
@@ -61,8 +62,8 @@ def compressed(x=0.0):
     }
 
 
-def poly4d(x=0.0):
-    """Curves of degree 5 with the lab's tables for an onboard LQR."""
+def create_poly4d_trajectory(x=0.0):
+    """Return a trajectory with curves of degree 5 and with the lab's tables for an onboard LQR."""
     inner = [[x, 0.0, 0.0, 0.0]] * 2 + [[x, 0.0, 1.0, 0.0]] * 2
     return {
         "version": 1,
@@ -75,38 +76,41 @@ def poly4d(x=0.0):
     }
 
 
-def lab(n=2):
-    """A show of the lab: compressed, with yaw and the older form of colours."""
+def create_lab_show(n=2):
+    """Return a show of the lab: compressed, with yaw and the older form of colours."""
     lights = {"version": 1, "data": RED_3_S, "colors": [["255, 0, 0", 3.0]]}
-    files = {"show.json": show_json(n), "cues.json": CUES}
+    files = {"show.json": create_show_json(n), "cues.json": CUES}
     for i in range(n):
-        files[f"drones/drone_{i}/trajectory.json"] = compressed(float(i))
+        files[f"drones/drone_{i}/trajectory.json"] = create_compressed_trajectory(float(i))
         files[f"drones/drone_{i}/lights.json"] = lights
     return files
 
 
-def lab_poly4d(n=2):
-    """A show of the lab: POLY4D, parameters, and the newer form of colours alone."""
+def create_lab_poly4d_show(n=2):
+    """Return a show of the lab: POLY4D, parameters, and the newer form of colours alone."""
     lights = {"version": 1, "colors": [[0.0, [0, 0, 255]], [1.0, [255, 255, 0]]]}
-    files = {"show.json": show_json(n, parameters=[[0.5, "stabilizer.controller", 6]]), "cues.json": CUES}
+    files = {"show.json": create_show_json(n, parameters=[[0.5, "stabilizer.controller", 6]]), "cues.json": CUES}
     for i in range(n):
-        files[f"drones/drone_{i}/trajectory.json"] = poly4d(float(i))
+        files[f"drones/drone_{i}/trajectory.json"] = create_poly4d_trajectory(float(i))
         files[f"drones/drone_{i}/lights.json"] = lights
     return files
 
 
-def lab_older(n=2):
-    """An older show of the lab: no lights, start yaw, yaw or types."""
-    files = {"show.json": show_json(n), "cues.json": CUES}
+def create_older_lab_show(n=2):
+    """Return an older show of the lab: no lights, start yaw, yaw or types."""
+    files = {"show.json": create_show_json(n), "cues.json": CUES}
     for i, drone in enumerate(files["show.json"]["swarm"]["drones"]):
         del drone["settings"]["lights"], drone["settings"]["startYaw"]
-        points = [[t, point[:3], [x[:3] for x in inner]] for t, point, inner in compressed(float(i))["points"]]
+        points = [
+            [t, point[:3], [x[:3] for x in inner]]
+            for t, point, inner in create_compressed_trajectory(float(i))["points"]
+        ]
         files[f"drones/drone_{i}/trajectory.json"] = {"version": 1, "points": points}
     return files
 
 
-def studio():
-    """A show of Skybrush Studio: names by index, take-off time, yaw control, lights as code alone, and no cues."""
+def create_studio_show():
+    """Return a show of Skybrush Studio: names by index, take-off time, yaw control, lights only as code, no cues."""
     trajectory = {
         "version": 1,
         "points": [
@@ -135,10 +139,15 @@ def studio():
     }
 
 
-ALL = {"lab": lab, "lab_poly4d": lab_poly4d, "lab_older": lab_older, "studio": studio}
+ALL = {
+    "lab": create_lab_show,
+    "lab_poly4d": create_lab_poly4d_show,
+    "lab_older": create_older_lab_show,
+    "studio": create_studio_show,
+}
 
 
-def changed(files, name, path, value):
+def replace_value(files, name, path, value):
     """Return the files with another value at a path of keys and indices."""
     files = copy.deepcopy(files)
     holder = files[name]

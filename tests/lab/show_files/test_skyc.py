@@ -20,7 +20,7 @@ from crazysim.lab.show_files.skyc import parse_show
 from crazysim.trajectories.files.pieces import trajectory_pieces
 
 
-def positions(trajectory, t):
+def evaluate_positions(trajectory, t):
     """Return position, m, and yaw, rad, from the coefficients in float64. (n, 4)"""
     ends, c = trajectory_pieces(trajectory)
     begins = np.concatenate([[0.0], ends[:-1]])
@@ -30,30 +30,32 @@ def positions(trajectory, t):
     return (c[k] * u ** np.arange(c.shape[2])).sum(-1)
 
 
-def bernstein(points, t):
+def evaluate_control_points(points, t):
     """Return position, m, and yaw, rad, from the file's control points, by SciPy. (n, 4)"""
-    begins, last, out = points[0][0], points[0][1], np.zeros((len(t), 4))
+    start, last_point, values = points[0][0], points[0][1], np.zeros((len(t), 4))
     for end, point, inner in points[1:]:
-        curve = BPoly(np.array([last, *inner, point], float)[:, None], [begins, end])
-        now = (t >= begins) & (t <= end)
-        out[now, : len(point)] = curve(t[now])
-        begins, last = end, point
-    out[:, 3] = np.deg2rad(out[:, 3])
-    return out
+        curve = BPoly(np.array([last_point, *inner, point], float)[:, None], [start, end])
+        is_inside = (t >= start) & (t <= end)
+        values[is_inside, : len(point)] = curve(t[is_inside])
+        start, last_point = end, point
+    values[:, 3] = np.deg2rad(values[:, 3])
+    return values
 
 
-@pytest.mark.parametrize("make", [skyc_files.lab, skyc_files.lab_poly4d, skyc_files.lab_older])
+@pytest.mark.parametrize(
+    "make", [skyc_files.create_lab_show, skyc_files.create_lab_poly4d_show, skyc_files.create_older_lab_show]
+)
 def test_trajectories_are_the_curves_of_the_file(make):
     files = make()
-    show = parse_show(skyc_files.archive(files))
+    show = parse_show(skyc_files.pack_archive(files))
     points = files["drones/drone_1/trajectory.json"]["points"]
     t = np.linspace(0.0, points[-1][0], 91)
-    np.testing.assert_allclose(positions(show.trajectory(1), t), bernstein(points, t), atol=3e-6)
+    np.testing.assert_allclose(evaluate_positions(show.trajectory(1), t), evaluate_control_points(points, t), atol=3e-6)
     assert show.duration == pytest.approx(points[-1][0])
 
 
 def test_the_lab_show_is_read():
-    show = parse_show(skyc_files.archive(skyc_files.lab()))
+    show = parse_show(skyc_files.pack_archive(skyc_files.create_lab_show()))
     assert show.names == ("cf0", "cf1")
     assert [(cue.time, cue.name) for cue in show.cues] == [(0.0, "start"), (4.0, "land")]
     assert show.settings["validation"]["minDistance"] == 0.8
@@ -66,7 +68,7 @@ def test_the_lab_show_is_read():
 
 
 def test_poly4d_show():
-    show = parse_show(skyc_files.archive(skyc_files.lab_poly4d()))
+    show = parse_show(skyc_files.pack_archive(skyc_files.create_lab_poly4d_show()))
     assert show.encodings == ("POLY4D", "POLY4D")
     change = show.parameters[1][0]
     assert (change.time, change.name, change.value) == (0.5, "stabilizer.controller", 6.0)
@@ -74,16 +76,16 @@ def test_poly4d_show():
 
 
 def test_show_without_lights_is_white():
-    show = parse_show(skyc_files.archive(skyc_files.lab_older()))
+    show = parse_show(skyc_files.pack_archive(skyc_files.create_older_lab_show()))
     np.testing.assert_array_equal(show.lights.colors([0.0, 1.0]), np.ones((2, 2, 3)))
 
 
 def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
-    show = parse_show(skyc_files.archive(skyc_files.studio()))
+    show = parse_show(skyc_files.pack_archive(skyc_files.create_studio_show()))
     assert show.names == ("drone_0",)
     assert show.environment == "outdoor"  # as in Skybrush
     assert show.duration == pytest.approx(11.66 + 2.5)
-    at = positions(show.trajectory(0), np.array([0.0, 6.0, 11.66, 11.91, 12.0, 12.16, 13.5, 14.16]))
+    at = evaluate_positions(show.trajectory(0), np.array([0.0, 6.0, 11.66, 11.91, 12.0, 12.16, 13.5, 14.16]))
     np.testing.assert_allclose(at[:3, :3], [[17.5, 10, 1]] * 3, atol=1e-5)
     np.testing.assert_allclose(at[3, :3], [17.5, 10, 1.36], atol=1e-4)
     np.testing.assert_allclose(np.rad2deg(at[:, 3]), [0, 45, 87.45, 89.325, 90, 70.8, -90, -90], atol=1e-3)
@@ -91,7 +93,7 @@ def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
 
 @pytest.mark.parametrize("make", skyc_files.ALL.values(), ids=skyc_files.ALL)
 def test_saved_show_is_the_same(make, tmp_path):
-    show = parse_show(skyc_files.archive(make()))
+    show = parse_show(skyc_files.pack_archive(make()))
     save_show(show, tmp_path / "again.skyc")
     again = load_show(tmp_path / "again.skyc")
     assert again.names == show.names
@@ -105,7 +107,9 @@ def test_saved_show_is_the_same(make, tmp_path):
     assert again.duration == show.duration
     t = np.linspace(0.0, show.duration, 301)
     for i in range(show.n_drones):
-        np.testing.assert_allclose(positions(again.trajectory(i), t), positions(show.trajectory(i), t), atol=1e-5)
+        np.testing.assert_allclose(
+            evaluate_positions(again.trajectory(i), t), evaluate_positions(show.trajectory(i), t), atol=1e-5
+        )
     t = np.arange(0.0, show.duration, 0.013)
     np.testing.assert_allclose(again.lights.colors(t), show.lights.colors(t), atol=1e-4)
     save_show(again, tmp_path / "third.skyc")
@@ -114,12 +118,12 @@ def test_saved_show_is_the_same(make, tmp_path):
 
 
 def test_saved_files_have_the_structure_of_skybrush(tmp_path):
-    save_show(parse_show(skyc_files.archive(skyc_files.lab())), tmp_path / "a.skyc")
+    save_show(parse_show(skyc_files.pack_archive(skyc_files.create_lab_show())), tmp_path / "a.skyc")
     with zipfile.ZipFile(tmp_path / "a.skyc") as file:
         names = set(file.namelist())
         written = {name: json.loads(file.read(name)) for name in names}
-    assert names == set(skyc_files.lab())
-    before = skyc_files.lab()
+    assert names == set(skyc_files.create_lab_show())
+    before = skyc_files.create_lab_show()
     assert written["cues.json"]["version"] == 1
     assert (
         written["show.json"]["swarm"]["drones"][0]["settings"]
@@ -135,7 +139,7 @@ def test_saved_files_have_the_structure_of_skybrush(tmp_path):
 
 
 def test_curves_without_yaw_are_written_without(tmp_path):
-    save_show(parse_show(skyc_files.archive(skyc_files.lab_older())), tmp_path / "a.skyc")
+    save_show(parse_show(skyc_files.pack_archive(skyc_files.create_older_lab_show())), tmp_path / "a.skyc")
     with zipfile.ZipFile(tmp_path / "a.skyc") as file:
         points = json.loads(file.read("drones/drone_0/trajectory.json"))["points"]
     assert {len(point[1]) for point in points} == {3}
@@ -174,10 +178,10 @@ WRONG = {
 
 @pytest.mark.parametrize(("name", "path", "value", "message"), WRONG.values(), ids=WRONG)
 def test_wrong_shows_are_refused_with_the_place(name, path, value, message):
-    files = skyc_files.lab()
-    files = skyc_files.changed(files, name, path, value) if path else files | {name: value}
+    files = skyc_files.create_lab_show()
+    files = skyc_files.replace_value(files, name, path, value) if path else files | {name: value}
     with pytest.raises(ConfigError, match=message) as refused:
-        parse_show(skyc_files.archive(files), "my.skyc")
+        parse_show(skyc_files.pack_archive(files), "my.skyc")
     assert "my.skyc" in str(refused.value)
 
 
@@ -185,62 +189,66 @@ def test_files_that_are_no_shows(tmp_path):
     for name, content in {
         "empty": b"",
         "text": b"no zip",
-        "damaged": skyc_files.archive(skyc_files.lab())[:-40],
+        "damaged": skyc_files.pack_archive(skyc_files.create_lab_show())[:-40],
     }.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ConfigError, match="zip archive"):
             load_show(tmp_path / name)
     with pytest.raises(ConfigError, match=r"show\.json"):
-        parse_show(skyc_files.archive({"cues.json": "{}"}))
+        parse_show(skyc_files.pack_archive({"cues.json": "{}"}))
     with pytest.raises(ConfigError, match="JSON"):
-        parse_show(skyc_files.archive({"show.json": "{"}))
+        parse_show(skyc_files.pack_archive({"show.json": "{"}))
     with pytest.raises(ConfigError, match="existing file"):
         load_show(tmp_path / "nowhere.skyc")
     with pytest.raises(ConfigError, match="existing file"):
         load_show(tmp_path)
     with pytest.raises(ConfigError, match=r"\.skyc"):
-        save_show(parse_show(skyc_files.archive(skyc_files.lab())), tmp_path / "show.zip")
+        save_show(parse_show(skyc_files.pack_archive(skyc_files.create_lab_show())), tmp_path / "show.zip")
 
 
 def test_archives_that_decompress_to_too_much_are_refused():
     zeros = b"0" * (17 * 2**20)
     with pytest.raises(ConfigError, match="at most 16777216 bytes"):
-        parse_show(skyc_files.archive({"show.json": zeros}))
-    bomb = skyc_files.archive({"show.json": zeros * 8})
+        parse_show(skyc_files.pack_archive({"show.json": zeros}))
+    bomb = skyc_files.pack_archive({"show.json": zeros * 8})
     tracemalloc.start()
     with pytest.raises(ConfigError, match="at most 16777216 bytes"):
         parse_show(bomb)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * 2**24  # not the whole of it
-    small = Archive(skyc_files.archive({f"{k}": b'"' + b"0" * 2**24 + b'"' for k in range(5)}), "small.skyc")
+    small = Archive(skyc_files.pack_archive({f"{k}": b'"' + b"0" * 2**24 + b'"' for k in range(5)}), "small.skyc")
     with pytest.raises(ConfigError, match="at most 16777216 bytes, 67108864 in all"):
         [small.json(f"{k}") for k in range(5)]
-    lying = bytearray(skyc_files.archive({"show.json": zeros}))
+    lying = bytearray(skyc_files.pack_archive({"show.json": zeros}))
     for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # both state a size of 10 bytes
         at = lying.index(signature) + offset
         lying[at : at + 4] = (10).to_bytes(4, "little")
     with pytest.raises(ConfigError):
         parse_show(bytes(lying))
     with pytest.raises(ConfigError, match="JSON"):
-        parse_show(skyc_files.archive({"show.json": b"[" * 10**6}))
+        parse_show(skyc_files.pack_archive({"show.json": b"[" * 10**6}))
     points = [[k / 100, [0, 0, 0], []] for k in range(20_001)]
     with pytest.raises(ConfigError, match="at most 20000 entries"):
-        parse_show(skyc_files.archive(skyc_files.changed(skyc_files.lab(), TRAJECTORY, ["points"], points)))
+        parse_show(
+            skyc_files.pack_archive(
+                skyc_files.replace_value(skyc_files.create_lab_show(), TRAJECTORY, ["points"], points)
+            )
+        )
     with pytest.raises(ConfigError, match="at most 20100 files"):
-        Archive(skyc_files.archive({f"{k}": b"" for k in range(20_101)}), "many.skyc")
+        Archive(skyc_files.pack_archive({f"{k}": b"" for k in range(20_101)}), "many.skyc")
     # One long trajectory would pad those of all other drones.
-    many = skyc_files.lab(1)
+    many = skyc_files.create_lab_show(1)
     drone = many["show.json"]["swarm"]["drones"][0]
     many["show.json"]["swarm"]["drones"] = [copy.deepcopy(drone) for _ in range(301)]
     for i, other in enumerate(many["show.json"]["swarm"]["drones"]):
         other["settings"]["name"] = f"cf{i}"
     many[TRAJECTORY]["points"] = [[k / 100, [0, 0, 0, 0], []] for k in range(7000)]
     with pytest.raises(ConfigError, match="padded to the longest"):
-        parse_show(skyc_files.archive(many))
+        parse_show(skyc_files.pack_archive(many))
 
 
-SAMPLES = {name: skyc_files.archive(make()) for name, make in skyc_files.ALL.items()}
+SAMPLES = {name: skyc_files.pack_archive(make()) for name, make in skyc_files.ALL.items()}
 JUNK = st.sampled_from(
     [None, True, -1, 0, 1e308, float("nan"), "", "x", [], [[]], {}, {"$ref": "./show.json"}, 10**400]
 )
@@ -270,12 +278,12 @@ def test_damaged_archives_are_loaded_or_refused(name, changes, cut):
     load_or_refuse(bytes(content[:cut]))
 
 
-def places(value, path=()):
+def list_paths(value, path=()):
     """Yield all paths of keys and indices in a JSON document."""
     yield path
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in items:
-        yield from places(child, (*path, key))
+        yield from list_paths(child, (*path, key))
 
 
 @settings(max_examples=200)
@@ -286,7 +294,7 @@ def test_mutated_json_is_loaded_or_refused(name, seed, value, remove):
         tables.pop("K", None)
     pick = random.Random(seed)
     member = pick.choice(sorted(files))
-    path = pick.choice([path for path in places(files[member]) if path])
+    path = pick.choice([path for path in list_paths(files[member]) if path])
     holder = files[member]
     for key in path[:-1]:
         holder = holder[key]
@@ -294,7 +302,7 @@ def test_mutated_json_is_loaded_or_refused(name, seed, value, remove):
         del holder[path[-1]]
     else:
         holder[path[-1]] = value
-    load_or_refuse(skyc_files.archive(files))
+    load_or_refuse(skyc_files.pack_archive(files))
 
 
 @given(st.binary(max_size=300))
@@ -302,11 +310,11 @@ def test_any_bytes_are_refused(content):
     with pytest.raises(ConfigError):
         parse_show(content)
     with pytest.raises(ConfigError):
-        parse_show(skyc_files.archive({"show.json": content}))
+        parse_show(skyc_files.pack_archive({"show.json": content}))
 
 
 def test_the_archive_reads_a_file_once():
-    archive = Archive(skyc_files.archive(skyc_files.lab()), "a.skyc")
+    archive = Archive(skyc_files.pack_archive(skyc_files.create_lab_show()), "a.skyc")
     assert archive.json("cues.json") is archive.json("cues.json")
     assert archive.resolve({"$ref": "./cues.json#"}, "x")[1] == "a.skyc: cues.json"
     with pytest.raises(ConfigError, match="whole file"):
