@@ -242,7 +242,7 @@ def test_bytes_that_are_signalling_nans_are_missing_numbers(tmp_path):
         read_log(path)
 
 
-def archive(data=b"", method=0, flags=0):
+def pack_archive(data=b"", method=0, flags=0):
     """Return an archive with one member ``t.npy``, whose headers state a method and flags (PKWARE's APPNOTE.TXT)."""
     sizes = struct.pack("<III", crc32(data), len(data), len(data))
     local = b"PK\3\4" + struct.pack("<HHHHH", 20, flags, method, 0, 0) + sizes + struct.pack("<HH", 5, 0) + b"t.npy"
@@ -252,22 +252,22 @@ def archive(data=b"", method=0, flags=0):
     return local + data + central + end
 
 
-def npy(header):
+def make_npy(header):
     """Return an ``.npy`` file of eight bytes of data with a header."""
     return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode() + bytes(8)
 
 
 HOSTILE = {
-    "foreign compression": ("a.npz", archive(method=99), "compression method is not supported"),
-    "encryption": ("a.npz", archive(flags=1), "is encrypted"),
+    "foreign compression": ("a.npz", pack_archive(method=99), "compression method is not supported"),
+    "encryption": ("a.npz", pack_archive(flags=1), "is encrypted"),
     "40 TB": (
         "a.npz",
-        archive(npy("{'descr': '<f8', 'fortran_order': False, 'shape': (5000000000000,), }\n")),
+        pack_archive(make_npy("{'descr': '<f8', 'fortran_order': False, 'shape': (5000000000000,), }\n")),
         r"an array of the 8 bytes that follow its header, got a header of shape \(5000000000000,\) in .*a\.npz: t\.npy",
     ),
     "negative": (
         "a.npz",
-        archive(npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }\n")),
+        pack_archive(make_npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }\n")),
         r"got a header of shape \(-1,\)",
     ),
     "columns": ("a.csv", b"t," * 200_000 + b"x\n" + b"1," * 200_000 + b"1\n", "at most 10000 columns, got 200001"),

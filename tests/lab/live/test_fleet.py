@@ -46,7 +46,7 @@ def sim(sim_and_data):
     return sim
 
 
-def pos(sim):
+def read_positions(sim):
     return np.asarray(sim.data.states.pos[0], float)
 
 
@@ -56,13 +56,13 @@ def test_flight_by_commands(sim):
     step, plan = sim.step_fn, sim.step_fn.plan(sim.data)
     assert fleet.apply([TakeOff(None, 0.8)]) == 1
     sim.step(1500)
-    np.testing.assert_allclose(pos(sim)[:, 2], 0.8, atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[:, 2], 0.8, atol=SETTLED)
 
-    start = pos(sim)[2]
+    start = read_positions(sim)[2]
     fleet.apply([Upload(7, line((5, 5, 5), (5, 6, 5), 2.0)), Start(7, relative=True)])
     sim.step(1500)
-    np.testing.assert_allclose(pos(sim)[2] - start, [0, 1, 0], atol=SETTLED)
-    np.testing.assert_allclose(pos(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[2] - start, [0, 1, 0], atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=SETTLED)
 
     fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8), 2.0)), Start(7)])
     sim.step(500)
@@ -72,11 +72,11 @@ def test_flight_by_commands(sim):
     np.testing.assert_allclose(staged_pos, setpoint[:3], atol=0.03)  # at most a control step apart
     assert 0.2 < setpoint[1] < 0.8
     sim.step(1000)
-    np.testing.assert_allclose(pos(sim)[2], setpoint[:3], atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[2], setpoint[:3], atol=SETTLED)
     fleet.apply([Land(None), SetParameter(7, "stabilizer.controller", 2.0)])
     assert fleet.parameters == [{}, {}, {"stabilizer.controller": 2.0}]
     sim.step(1500)
-    assert np.all(pos(sim)[:, 2] < SETTLED)
+    assert np.all(read_positions(sim)[:, 2] < SETTLED)
     assert sim.step_fn is step
     assert sim.step_fn.plan(sim.data) is plan
 
@@ -87,7 +87,7 @@ def test_show_by_commands(sim):
     fleet = Fleet(sim, max_pieces=8)
     assert fleet.apply([StartShow()]) == 0  # nothing to start
     fleet.apply([LoadShow(show)])
-    np.testing.assert_allclose(pos(sim)[:2], [[0, 0, 0.5], [1, 0, 0.5]])  # as the lab's simulator does
+    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 0, 0.5], [1, 0, 0.5]])  # as the lab's simulator does
     sim.step(250)
     np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))  # the show has not started
     assert fleet.apply([StartShow()]) == 1
@@ -96,8 +96,8 @@ def test_show_by_commands(sim):
     sim.step(600)
     np.testing.assert_array_equal(fleet.colors(), [BLUE, BLUE, OFF])  # 1.2 s later
     sim.step(900)
-    np.testing.assert_allclose(pos(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=SETTLED)
-    assert pos(sim)[2, 2] < SETTLED
+    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=SETTLED)
+    assert read_positions(sim)[2, 2] < SETTLED
     fleet.reset()
     np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))
 
@@ -116,7 +116,7 @@ def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     assert caplog.text.count("refused: expected") == len(wrong)
     assert sim.data is last_data
     assert fleet.apply([Upload(1, line((9, 9, 9), (9, 9, 8), 2.0))]) == 1
-    np.testing.assert_allclose(pos(sim), np.asarray(last_data.states.pos[0]))  # not moved
+    np.testing.assert_allclose(read_positions(sim), np.asarray(last_data.states.pos[0]))  # not moved
 
 
 def test_new_ids_get_the_next_free_drone(sim):
@@ -149,6 +149,6 @@ def test_commands_over_the_network_while_the_simulation_runs(sim):
             for _ in range(30):
                 fleet.apply(server.commands())
                 sim.step(50)
-                heights.append(pos(sim)[:, 2])
+                heights.append(read_positions(sim)[:, 2])
     np.testing.assert_allclose(heights[-1][:2], [0.6, 0.4], atol=SETTLED)
     assert heights[-1][2] < SETTLED

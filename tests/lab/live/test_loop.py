@@ -19,14 +19,14 @@ from crazysim.sim import Sim
 
 
 @pytest.fixture(scope="module")
-def shared():
+def sim():
     return Sim(n_drones=2, control="state", freq=500)
 
 
 @pytest.fixture
-def live(shared):
-    shared.reset()
-    with Live(shared, control_freq=100, speed="max") as live:
+def live(sim):
+    sim.reset()
+    with Live(sim, control_freq=100, speed="max") as live:
         yield live
 
 
@@ -295,10 +295,10 @@ def test_a_recording_has_every_sample_and_is_switched_on_and_off(live, tmp_path)
 def test_a_recording_that_cannot_be_written_ends_and_the_run_continues(live, tmp_path, monkeypatch, caplog):
     live.record(tmp_path / "a.journal")
 
-    def full(_file, _content):
+    def raise_disk_full(_file, _content):
         raise OSError(28, "No space left on device")
 
-    live.call_at(0.05, lambda live: monkeypatch.setattr("crazysim.media.journal.os.write", full))
+    live.call_at(0.05, lambda live: monkeypatch.setattr("crazysim.media.journal.os.write", raise_disk_full))
     report = live.run(0.2)
     monkeypatch.undo()
     assert report.simulated_s == pytest.approx(0.2)

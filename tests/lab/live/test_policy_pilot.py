@@ -26,7 +26,7 @@ def env():
 
 
 @pytest.fixture
-def flying(env):
+def live_and_pilot(env):
     """Return a loop with a pilot that flies from the start."""
     pilot = PolicyPilot(env, steer)
     with Live(env.sim, env.freq, speed="max") as live:
@@ -39,28 +39,28 @@ def folder(tmp_path_factory):
     return save_steering(tmp_path_factory.mktemp("run"))
 
 
-def positions(live):
+def read_positions(live):
     return np.asarray(live.sim.data.states.pos)[:, 0]
 
 
-def test_a_policy_flies_as_in_its_environment(env, flying):
-    live, _ = flying
+def test_a_policy_flies_as_in_its_environment(env, live_and_pilot):
+    live, _ = live_and_pilot
     state = jax.jit(env.reset)(jax.random.key(0))
     step = jax.jit(lambda state: env.step(state, steer(state.obs)))
     for _ in range(50):
         state = step(state)
     live.run(1.0)
-    np.testing.assert_allclose(positions(live), state.data.states.pos[:, 0], atol=1e-5)
+    np.testing.assert_allclose(read_positions(live), state.data.states.pos[:, 0], atol=1e-5)
 
 
-def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(flying, caplog):
-    live, pilot = flying
+def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(live_and_pilot, caplog):
+    live, pilot = live_and_pilot
     others = pilot.goals[1].copy()
     pilot.listen(live, ["0.5 -0.3, 1.2\n", "\n", "home\n", "1 2\n", "4 0 1\n", "0 0 nan\n", "0 0 -1\n"]).join()
     live.run(4.0)
     np.testing.assert_allclose(pilot.goals[0, 0], [0.5, -0.3, 1.2])
     np.testing.assert_array_equal(pilot.goals[1], others)
-    assert np.abs(positions(live)[0] - [0.5, -0.3, 1.2]).max() < 0.05
+    assert np.abs(read_positions(live)[0] - [0.5, -0.3, 1.2]).max() < 0.05
     refused = [record.getMessage() for record in caplog.records if "refused" in record.getMessage()]
     assert len(refused) == 5
     assert "expected x y z, m, got 'home'" in refused[0]
@@ -73,15 +73,15 @@ def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(flying, caplog):
     assert "expected a selected drone" in caplog.text
 
 
-def test_a_click_sets_the_goal_of_the_selected_drone_at_its_height(flying):
-    live, pilot = flying
+def test_a_click_sets_the_goal_of_the_selected_drone_at_its_height(live_and_pilot):
+    live, pilot = live_and_pilot
     height = pilot.goals[0, 0, 2]
     live.click(1, np.array([2.0, 2.0, 0.0]))  # the selected drone is in another world
     live.click(0, np.array([0.2, 0.4, 0.0]))
     np.testing.assert_allclose(pilot.goals[0, 0], [0.2, 0.4, height])
     assert pilot.goals[1, 0, 0] < 1.5
     live.run(4.0)
-    assert np.abs(positions(live)[0] - pilot.goals[0, 0]).max() < 0.05
+    assert np.abs(read_positions(live)[0] - pilot.goals[0, 0]).max() < 0.05
     live.reset()
     live.run(0.02)
     np.testing.assert_array_equal(pilot.goals, pilot._target_fn(live.sim.data))
@@ -96,7 +96,7 @@ def test_listed_points_are_passed_in_order(env):
         live.run(6.0)
         assert pilot.n_passed.tolist() == [[2], [2]]
         np.testing.assert_array_equal(pilot.goals[:, 0], [POINTS[1]] * 2)
-        assert np.linalg.norm(positions(live) - POINTS[1], axis=-1).max() < ARRIVAL_DISTANCE
+        assert np.linalg.norm(read_positions(live) - POINTS[1], axis=-1).max() < ARRIVAL_DISTANCE
         live.go_to(0.1)
         assert pilot.n_passed.tolist() == [[0], [0]]
         live.go_to(6.0)

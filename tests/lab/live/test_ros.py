@@ -32,39 +32,44 @@ class Part:
         self.fields[name] = value
 
 
-def vector():
+def make_vector():
     return Part(x=0.0, y=0.0, z=0.0)
 
 
-def quaternion():
+def make_quaternion():
     return Part(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
-def stamp():
+def make_stamp():
     return Part(sec=0, nanosec=0)
 
 
-def header():
-    return Part(stamp=stamp(), frame_id="")
+def make_header():
+    return Part(stamp=make_stamp(), frame_id="")
 
 
-def pose():
-    return Part(position=vector(), orientation=quaternion())
+def make_pose():
+    return Part(position=make_vector(), orientation=make_quaternion())
 
 
-def twist():
-    return Part(linear=vector(), angular=vector())
+def make_twist():
+    return Part(linear=make_vector(), angular=make_vector())
 
 
 STAND_IN = SimpleNamespace(
-    Time=stamp,
-    Clock=lambda: Part(clock=stamp()),
-    PoseStamped=lambda: Part(header=header(), pose=pose()),
-    QuaternionStamped=lambda: Part(header=header(), quaternion=quaternion()),
-    Twist=twist,
-    Odometry=lambda: Part(header=header(), child_frame_id="", pose=Part(pose=pose()), twist=Part(twist=twist())),
+    Time=make_stamp,
+    Clock=lambda: Part(clock=make_stamp()),
+    PoseStamped=lambda: Part(header=make_header(), pose=make_pose()),
+    QuaternionStamped=lambda: Part(header=make_header(), quaternion=make_quaternion()),
+    Twist=make_twist,
+    Odometry=lambda: Part(
+        header=make_header(), child_frame_id="", pose=Part(pose=make_pose()), twist=Part(twist=make_twist())
+    ),
     Imu=lambda: Part(
-        header=header(), orientation=quaternion(), angular_velocity=vector(), linear_acceleration=vector()
+        header=make_header(),
+        orientation=make_quaternion(),
+        angular_velocity=make_vector(),
+        linear_acceleration=make_vector(),
     ),
     Float64=lambda: Part(data=0.0),
 )
@@ -84,7 +89,7 @@ class Node:
         self.callbacks[topic] = lambda fill: callback(fill(kind()))
 
 
-def filled(fill):
+def make_converter(fill):
     def call(message):
         fill(message)
         return message
@@ -154,8 +159,8 @@ def test_messages_command_the_drones(swarm, bridge):
         message.pose.orientation.z, message.pose.orientation.w = 2 * math.sin(0.4), 2 * math.cos(0.4)
 
     for _ in range(100):
-        bridge.node.callbacks["/cf2/cmd_vel"](filled(climb))
-        bridge.node.callbacks["/cf1/cmd_pose"](filled(hold_position))
+        bridge.node.callbacks["/cf2/cmd_vel"](make_converter(climb))
+        bridge.node.callbacks["/cf1/cmd_pose"](make_converter(hold_position))
         swarm.advance(0.02)
     assert swarm.state("cf2").pos[2] > 0.7
     assert swarm.state("cf2").rpy[2] == pytest.approx(0.6, abs=0.1)
@@ -174,7 +179,7 @@ def test_messages_command_the_drones(swarm, bridge):
     ],
 )
 def test_wrong_commands_are_reported(swarm, bridge, topic, fill, reason):
-    bridge.node.callbacks[f"/cf1/{topic}"](filled(fill))
+    bridge.node.callbacks[f"/cf1/{topic}"](make_converter(fill))
     (report,) = swarm.reports.latest
     assert (report.kind, report.name) == ("refused", "cf1")
     assert reason in report.text
@@ -188,8 +193,8 @@ def test_attitudes_and_thrust():
         for name, value in zip("xyzw", from_rpy([0.1, -0.2, 0.3]), strict=True):
             setattr(message.quaternion, name, float(value))
 
-    bridge.node.callbacks["/cf1/cmd_thrust"](filled(lambda m: setattr(m, "data", 0.4)))
-    bridge.node.callbacks["/cf1/cmd_attitude"](filled(tilt))
+    bridge.node.callbacks["/cf1/cmd_thrust"](make_converter(lambda m: setattr(m, "data", 0.4)))
+    bridge.node.callbacks["/cf1/cmd_attitude"](make_converter(tilt))
     command = swarm["cf1"].tick(0.0, np.zeros(3), np.zeros(3), 0.0)
     np.testing.assert_allclose(command, [0.1, -0.2, 0.3, 0.4], atol=1e-9)
 

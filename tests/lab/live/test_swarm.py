@@ -20,7 +20,7 @@ OFFSET = 0.02
 """Distance that a drone may still be from its setpoint shortly after a move, m."""
 
 
-def flying(control="state", **commands):
+def create_flying_commander(control="state", **commands):
     """Return a commander in flight at (1, 2, 1)."""
     commander = Commander(Control(control))
     tick(commander, 10.0)
@@ -93,19 +93,19 @@ def test_motors_are_off_before_take_off_and_after_landing():
 
 def test_a_landing_continues_if_the_drone_is_still_too_high():
     """So it does with a controller that has an offset, with a load, or on a pad above the target."""
-    commander = flying(land=(0.04, 1.0))
+    commander = create_flying_commander(land=(0.04, 1.0))
     above = np.array([1.0, 2.0, 0.13])
     heights = [commander.tick(now, above, np.array([0, 0, -0.2]), 0.5)[2] for now in (11.0, 11.1, 11.3, 20.0)]
     np.testing.assert_allclose(heights, [0.04, 0.01, -0.05, -0.96], atol=1e-9)
     assert commander.tick(20.1, above * [1, 1, 0.05 / 0.13], np.array([0, 0, -0.2]), 0.5) is None
-    standing = flying(land=(0.04, 1.0))
+    standing = create_flying_commander(land=(0.04, 1.0))
     assert standing.tick(11.4, above, np.zeros(3), 0.5) is not None
     assert standing.tick(11.6, above, np.zeros(3), 0.5) is None
 
 
 def test_commands_are_in_the_frame_of_the_estimate():
     """The drone is at (1, 2) with yaw 0.5; its estimate is (5, 5) with yaw 0.5 + pi / 2, a quarter turn to the left."""
-    commander = flying()
+    commander = create_flying_commander()
     commander.set_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
     commander.go_to([5.0, 6.0, 0.5], 0.5 + np.pi / 2, 1.0)
     tick(commander, 11.0)
@@ -116,7 +116,7 @@ def test_commands_are_in_the_frame_of_the_estimate():
     estimate = commander.estimate(state)
     np.testing.assert_allclose([*estimate.pos, *estimate.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
     assert estimate.rpy[2] == pytest.approx(0.5 + np.pi / 2)
-    tilted = flying("attitude")
+    tilted = create_flying_commander("attitude")
     tilted.set_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
     tilted.command("attitude", [0.1, 0.2, 1.3, 0.4])
     np.testing.assert_allclose(tick(tilted, 10.1), [0.1, 0.2, 0.3, 0.4])
@@ -173,7 +173,7 @@ def test_lights_fade_and_shine_by_their_effect():
 
 
 def test_moves_continue_from_the_setpoint_in_force():
-    commander = flying(go_to=([2, 2, 1], 0.5, 2.0))
+    commander = create_flying_commander(go_to=([2, 2, 1], 0.5, 2.0))
     command = tick(commander, 11.0, pos=(9, 9, 9))
     velocity = command[3:6].copy()
     assert velocity[0] > 0.5
@@ -191,7 +191,7 @@ def test_a_mask_selects_the_groups_of_a_commander():
 
 def test_absolute_and_relative_trajectories_start_at_the_right_position():
     path = HostTrajectory.from_trajectory(line([0, 0, 1], [2, 0, 1], 4.0))
-    commander = flying(upload=(3, path), take_off=(1.0, 1.0))
+    commander = create_flying_commander(upload=(3, path), take_off=(1.0, 1.0))
     tick(commander, 12.0)
     commander.start_trajectory(3)
     np.testing.assert_allclose(tick(commander, 16.0)[:3], [3, 2, 1])
@@ -202,7 +202,7 @@ def test_absolute_and_relative_trajectories_start_at_the_right_position():
 
 
 def test_streamed_setpoints_take_precedence_until_they_stop():
-    commander = flying(go_to=([5, 0, 1], 0.0, 1.0))
+    commander = create_flying_commander(go_to=([5, 0, 1], 0.0, 1.0))
     commander.position([1, 1, 1], 0.1)
     np.testing.assert_allclose(tick(commander, 10.1)[:3], [1, 1, 1])
     commander.go_to([5, 0, 1], 0.0, 1.0)
@@ -235,7 +235,7 @@ def test_high_level_commands_begin_at_the_drone_while_setpoints_stream():
 
 
 def test_the_end_of_a_stream_holds_the_position_and_then_stops_the_motors():
-    commander = flying(velocity=([1, 0, 0], 0.0))
+    commander = create_flying_commander(velocity=([1, 0, 0], 0.0))
     assert tick(commander, 10.4)[0] == pytest.approx(1.4)
     hold_command = tick(commander, 10.6, pos=(3, 3, 3))
     np.testing.assert_allclose(hold_command[:6], [3, 3, 3, 0, 0, 0])
@@ -244,20 +244,20 @@ def test_the_end_of_a_stream_holds_the_position_and_then_stops_the_motors():
 
 
 def test_hover_setpoints_turn_with_the_drone():
-    commander = flying(hover=(0.5, 0.0, 0.0, 1.7))
+    commander = create_flying_commander(hover=(0.5, 0.0, 0.0, 1.7))
     command = tick(commander, 10.2)
     np.testing.assert_allclose(command[:3], [1 + 0.1 * np.cos(0.5), 2 + 0.1 * np.sin(0.5), 1.7])
     np.testing.assert_allclose(command[3:6], [0.5 * np.cos(0.5), 0.5 * np.sin(0.5), 0], atol=1e-12)
 
 
 def test_attitudes_integrate_the_yaw_rate():
-    commander = flying("attitude", attitude=(0.1, 0.2, 1.0, 0.4))
+    commander = create_flying_commander("attitude", attitude=(0.1, 0.2, 1.0, 0.4))
     np.testing.assert_allclose(tick(commander, 10.2), [0.1, 0.2, 0.7, 0.4])
     np.testing.assert_allclose(tick(commander, 10.9), [0.0, 0.0, 0.7, 0.4])
 
 
 def test_emergency_and_disarming():
-    commander = flying(go_to=([2, 2, 1], 0.5, 2.0))
+    commander = create_flying_commander(go_to=([2, 2, 1], 0.5, 2.0))
     commander.arm(False)
     assert tick(commander, 10.1) is None
     with pytest.raises(ConfigError, match="disarmed"):
@@ -287,7 +287,7 @@ def test_emergency_and_disarming():
     ],
 )
 def test_wrong_commands(name, arguments, error):
-    commander = flying()
+    commander = create_flying_commander()
     with pytest.raises(ConfigError, match=error):
         getattr(commander, name)(*arguments)
     assert tick(commander, 10.1) is None
@@ -308,7 +308,7 @@ calls = st.one_of(
 @settings(max_examples=200, deadline=None)
 @given(sequence=st.lists(st.tuples(st.floats(0.01, 3.0), calls), max_size=8))
 def test_setpoints_stay_finite_after_any_commands(sequence):
-    commander = flying(upload=(1, HostTrajectory.from_trajectory(circle(radius=0.5, period=2.0))))
+    commander = create_flying_commander(upload=(1, HostTrajectory.from_trajectory(circle(radius=0.5, period=2.0))))
     now = 10.0
     for dt, (name, arguments) in sequence:
         with contextlib.suppress(ConfigError):
