@@ -1,8 +1,8 @@
 """All use of JAX beyond its documented, stable interface; new releases of JAX should require changes here only.
 
 Most names have a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the newest
-JAX that are supported; others are tested with the code that uses them. How each use would be replaced if a release
-removed it, and whether the replacement is implemented:
+JAX that are supported; the other names are tested with the code that uses them. This list states how each use would be
+replaced if a release removed it, and whether the replacement is implemented:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
   ``jax.make_jaxpr``. Implemented here.
@@ -118,7 +118,7 @@ def close_jaxpr(jaxpr: Any) -> ClosedJaxpr:
 
 
 def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
-    """Return a jaxpr that takes only some of its inputs; the others must be unused.
+    """Return a jaxpr that takes only some of its inputs; the other inputs must be unused.
 
     Args:
         jaxpr: The jaxpr.
@@ -265,7 +265,7 @@ def primitive_by_platform(
         name: Its name.
         result_types: Function that returns the shapes and types of the results.
         functions: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all
-            others.
+            other platforms.
         differentiable_fn: The same function, written so that JAX can differentiate it.
         transpose_rule: Rule for a primitive that is linear in all operands except for the first ``n_nonlinear``, a
             parameter: function of the nonlinear operands and the cotangents of all results, which returns the

@@ -1,4 +1,4 @@
-"""Tables with the constants of airframes and vehicles: shapes and ranges of numbers, and tables that extend others."""
+"""Tables with the constants of airframes and vehicles: shapes and ranges of numbers, and tables that extend a base."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def _controller_rows(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[
 
 
 def _levels_text(missing_by_level: Mapping[str, str]) -> str:
-    """Return the levels for which nothing is missing, and the reasons why others are not followed."""
+    """Return the command levels with all parameters, and the missing parameters of other levels, as text."""
     followed = ", ".join(levels for levels, missing in missing_by_level.items() if not missing)
     reasons = [f"not {levels}: {missing}" for levels, missing in missing_by_level.items() if missing]
     return "; ".join([followed or "none", *reasons])

@@ -82,7 +82,7 @@ def has_several_hosts(options: argparse.Namespace) -> bool:
 
 
 def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
-    """Run a command on this host together with others, and return the exit status.
+    """Run a command on this host together with other hosts, and return the exit status.
 
     Args:
         command: The command. It runs in a separate process, which is connected with the other hosts.

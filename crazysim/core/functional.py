@@ -37,9 +37,9 @@ def state_control(
     """Stage a full-state setpoint for every drone.
 
     Pass either one vector of 16 numbers per drone as ``controls``, or ``pos`` and optionally ``vel``, ``acc`` and
-    ``yaw``. These broadcast by NumPy's rules, ``yaw`` to (n_worlds, n_drones) and the others to
+    ``yaw``. These broadcast by NumPy's rules, ``yaw`` to (n_worlds, n_drones) and the other parts to
     (n_worlds, n_drones, 3): a ``pos`` of shape (3,) is shared by all drones, (n_drones, 3) has one position per drone,
-    and (n_worlds, 1, 3) one per world. Omitted quantities are zero.
+    and (n_worlds, 1, 3) has one position per world. Omitted quantities are zero.
 
     Args:
         data: Data of a simulation built with ``control="state"``.
@@ -52,7 +52,7 @@ def state_control(
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2. None for the yaw rate of the
-            setpoint and zeros for the rest. Must be None if the controller has no feedforward, such as Crazyflow's.
+            setpoint and zeros otherwise. Must be None if the controller has no feedforward, such as Crazyflow's.
             (n_worlds, n_drones, 8)
     """
     command, feedforward = check_setpoint(
@@ -211,7 +211,7 @@ def staged_leaves(data: SimData) -> list[Any]:
 
 
 def default_feedforward(command: Any) -> Any:
-    """Return the default feedforward of a setpoint: its yaw rate, and zeros for the rest. (..., 8)"""
+    """Return the default feedforward of a setpoint: its yaw rate, and zeros otherwise. (..., 8)"""
     if isinstance(command, np.ndarray):
         feedforward = np.zeros((*command.shape[:-1], 8), command.dtype)
         feedforward[..., 6] = command[..., 15]

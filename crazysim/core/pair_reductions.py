@@ -150,5 +150,6 @@ def _reduce_for_all(
 
 
 reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batching_rule, _refuse_outside)
-"""The reduction as a primitive: its operands are the values that the function captures, then the published ones.
-``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_captured`` is the number of captured values."""
+"""The reduction as a primitive: its operands are the values that the function captures, then the published values.
+``jaxpr`` maps all of these and ``is_self`` to the results for one pair; ``n_captured`` is the number of captured
+values."""

@@ -182,7 +182,7 @@ class Plugin:
     """Name of the plugin: the key of its record in ``data.plugins``, and the name of its stage."""
     order: ClassVar[int] = 0
     """Influences are applied in ascending order, and by name within the same order. Plugins that replace commands
-    have a negative order, so that the others can limit the new commands."""
+    have a negative order, so that other plugins can limit the new commands."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
     reset_before: ClassVar[str | None] = None

@@ -20,7 +20,7 @@ MAX_ROTOR_VEL = 1e6
 MIN_SINGULAR_VALUE = 1e-3
 """Smallest singular value of the mixing matrix; a quadrotor in X has 2."""
 MAX_INERTIA_EXCESS, INERTIA_ROUNDING = 0.05, 1e-5
-"""Limits of the relative excess of the largest moment of inertia over the sum of the others. An excess up to
+"""Limits of the relative excess of the largest moment of inertia over the sum of the other two. An excess up to
 ``INERTIA_ROUNDING`` is ignored, and an excess up to ``MAX_INERTIA_EXCESS`` is only a warning, since moments that were
 measured separately can have it. RotorPy's Crazyflie has 1%."""
 
@@ -32,7 +32,7 @@ def check_airframe(airframe: Airframe) -> None:
         ConfigError: If no drone with these numbers can fly.
 
     Warns:
-        AirframeWarning: If the largest moment of inertia exceeds the sum of the others by up to 5%.
+        AirframeWarning: If the largest moment of inertia exceeds the sum of the other two by up to 5%.
     """
     for table in ("rigid_body", "rotors"):
         airframe.table(table)

@@ -123,8 +123,8 @@ def estimate_airframe(
         layout: ``"x"``: the nose is between two rotors, ``"+"``: the first rotor is at the nose.
         positions: Positions of the rotors from the centre of mass, m, instead of ``arm``; x ahead, y left, z up. (n, 3)
             or (n, 2)
-        spins: 1 for rotors that turn counter-clockwise seen from above, -1 for the others; by default they alternate,
-            beginning with 1. (n,)
+        spins: 1 for rotors that turn counter-clockwise seen from above, -1 for clockwise; by default the signs
+            alternate and begin with 1. (n,)
         thrust_to_weight: Largest thrust of all rotors over the weight.
         motor_table: Data sheet of motor and propeller instead of ``thrust_to_weight``: a CSV file, or a dict of
             columns, ``thrust_n`` or ``thrust_g``, and optionally ``rpm``, ``torque_nm``, ``power_w`` (electric) and

@@ -36,7 +36,7 @@ def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) ->
 
 
 def world_mask(tree: Tree) -> Tree:
-    """Return the tree with True in place of every leaf that has an axis over worlds, False in place of others."""
+    """Return a tree of the same structure with bools, True for leaves that have an axis over worlds."""
     return jax.tree.map(lambda scope: n_batch_axes(scope) > 0, scopes(tree))
 
 
