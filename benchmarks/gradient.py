@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
-    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="steps that the gradient goes through")
+    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps that are differentiated")
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
     for case in itertools.product(args.controls, args.worlds, args.steps):

@@ -3,7 +3,7 @@
     python benchmarks/live.py [--seconds 20] [--drones 30] [--only max recorded pictures jitter]
 
 - max: as fast as possible, setpoints of all drones renewed at every control step; simulated seconds per second
-- recorded: the same, with 50 samples per simulated second written to a file
+- recorded: like max, with 50 samples per simulated second written to a file
 - pictures: in real time, with a page in a server that one client reads, and 50 pictures a second
 - jitter: in real time without viewers; 99.9% of control steps are late by at most ``lateness_999_ms``
 

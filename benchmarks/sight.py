@@ -30,7 +30,7 @@ from crazysim.train.convolution import find_images
 from crazysim.train.networks import Policy, choose_network, init_weights
 
 N_TREES, AREA_OF_TREE = 200, 16.0
-"""Trees of a world, and the area for each of them, m^2."""
+"""Number of trees in a world, and the area of ground for each tree, m^2."""
 CORRIDOR = 16.0
 """Width of the corridor of ``forest``, m."""
 LIDAR_FREQ = 10

@@ -342,7 +342,7 @@ def time_text(row: dict[str, Any]) -> str:
 
 
 def check_success(runs: list[dict[str, Any]]) -> list[str]:
-    """Return a message for each run whose success is too low: by two standard errors below the least in the table."""
+    """Return a message for each run whose success is below the least in the table by more than two standard errors."""
     least_success = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
     failures = []
     for run in runs:

@@ -41,7 +41,7 @@ class PackCache:
 
 
 def _are_on_one_cpu(arrays: list[Any]) -> bool:
-    """Return True if all arrays are on the same device, and it is a CPU."""
+    """Return True if all arrays are on one CPU device."""
     devices = {device for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
 

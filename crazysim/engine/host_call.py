@@ -58,7 +58,7 @@ class HostLeaves:
         if i not in self._jax_arrays:
             self._jax_arrays.setdefault(
                 i, jaxcompat.put_host_array(self.array(i), self._sharding)
-            )  # another thread may make the same array: the first one stays
+            )  # if another thread makes the array too, the first array stays
         return self._jax_arrays[i]
 
     def array(self, i: int) -> NDArray:
@@ -158,7 +158,7 @@ class HostCall:
         """Prepare the memory and the calls of some kernels.
 
         Args:
-            kernels: Kernels of the programs, for which ``is_host_call_possible`` holds.
+            kernels: Kernels of the programs; ``is_host_call_possible`` must be True for them.
             owned: For each program the indices of the leaves that it updates; None for all leaves that it writes.
             leaves: Leaves of the data, for their shapes and types.
             nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.

@@ -146,11 +146,11 @@ class Step:
         self._last_false_flag: Any = None
 
     def without_stages(self, names: Collection[str]) -> Step:
-        """Return the step without some stages."""
+        """Return a step without the stages of some names."""
         return self.with_stages([stage for stage in self.stages if stage.__name__ not in names])
 
     def with_stages(self, stages: Sequence[Stage]) -> Step:
-        """Return the step of other stages, with the same engine and devices."""
+        """Return a step of other stages, with the engine and the devices of this step."""
         names = [stage.__name__ for stage in stages]
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise ConfigError(f"expected stages of different names, got {', '.join(repeated)} twice. Rename yours.")

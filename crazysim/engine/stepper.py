@@ -129,7 +129,7 @@ class Stepper:
         return self.step
 
     def advance(self, n_steps: int) -> None:
-        """Advance the data; any number of steps uses the same compilation."""
+        """Advance the data. One compilation serves all numbers of steps."""
         self.count_steps(n_steps)
         is_first, self._compiled_step = self._compiled_step is not self.step, self.step
         with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCEMENT_DELAY) if is_first else nullcontext():

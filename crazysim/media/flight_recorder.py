@@ -223,7 +223,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
 
 @jax.jit
 def _replace_in_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
-    """Return arrays with new values in some worlds. Where their last axis is shorter, the rest stays."""
+    """Return arrays with new values in some worlds. New values may have a shorter last axis: its rest is unchanged."""
     return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
 

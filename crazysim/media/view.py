@@ -153,7 +153,7 @@ class View:
                 if self.inset is not None:
                     _draw_inset(tile, self.inset(sim, world))
         except Exception:
-            sim.overlays.restore(saved_overlays)  # they are kept for the next image
+            sim.overlays.restore(saved_overlays)  # for the next image
             raise
         return image
 

@@ -251,7 +251,7 @@ def create_mesh(shapes: list[VisualGeom]) -> Any:
 
 
 def _create_geom_mesh(shape: VisualGeom) -> Any:
-    """Return a geom as triangles, in its own frame."""
+    """Return a geom as a trimesh mesh, in the frame of the geom."""
     import trimesh
 
     radius, half = float(shape.size[0]), float(shape.size[1])

@@ -62,7 +62,7 @@ def test_a_kernel_for_arm_computes_the_numbers_of_this_machine(tmp_path):
     sim, scales = Sim(n_worlds=37), np.linspace(0.5, 1, 37, dtype=np.float32)
     sim.attitude_control(scales[:, None, None] * np.tile(np.float32([0.05, -0.1, 0.2, 0.4]), (37, 1, 1)))
     flat = Step(sim.step_pipeline, "lanes").flatten(sim.data)
-    source = kernel.write(flat.plan.program, "host")
+    source = kernel.write_kernel(flat.plan.program, "host")
     inputs = [np.asarray(flat.leaves[i]) for i in source.inputs]
     outputs = [np.empty(flat.leaves[i].shape, flat.leaves[i].dtype) for i in source.outputs] + [np.empty((37, 1), bool)]
     *after, flags = run_on_arm(tmp_path, source.text, 37, 20, inputs, outputs)

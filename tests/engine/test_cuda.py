@@ -33,7 +33,7 @@ OLD, NEW = Gpu("8.6", 0), Gpu("9.0", 1)
 @pytest.fixture(scope="module")
 def source():
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    return kernel.write(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "cuda")
+    return kernel.write_kernel(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "cuda")
 
 
 def test_an_architecture_is_that_of_the_device():
@@ -81,7 +81,7 @@ def test_worlds_whose_drones_act_on_each_other_fill_warps_or_blocks(n_drones, th
     """A warp reads registers; a block reads records in its memory, four numbers at a time, between two barriers."""
     sim = Sim(n_worlds=2, n_drones=n_drones, control="attitude", engine="lanes")
     sim.add(Downwash())
-    gpu_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    gpu_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
     assert (gpu_kernel.threads, gpu_kernel.lanes) == (threads, lanes)
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
@@ -95,7 +95,7 @@ def test_a_wider_block_has_more_whole_worlds():
     """Worlds of three drones: 20 of them in 64 threads, 80 in 256."""
     sim = Sim(n_worlds=2, n_drones=3, control="attitude", engine="lanes")
     sim.add(Downwash())
-    gpu_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    gpu_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
     wide_kernel = gpu_kernel.with_threads(256)
     assert (wide_kernel.threads, wide_kernel.lanes) == (256, 240)
     assert ".maxntid 256" in cuda.ptx(wide_kernel, cuda.DEFAULT_ARCHITECTURE)
@@ -104,7 +104,7 @@ def test_a_wider_block_has_more_whole_worlds():
 def test_long_kernels_on_a_gpu_read_shared_numbers_where_they_use_them(source):
     """A kernel with an estimator has too few registers for them. In a short kernel, reads would cost more."""
     sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
-    long_kernel = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    long_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
     texts = [k.text[k.text.index(" advance(") :] for k in (long_kernel, source)]
     assert ["SHARED(p" in text for text in texts] == [True, False]
     assert cuda.ptx(long_kernel, cuda.DEFAULT_ARCHITECTURE).count("ld.global.nc.f32 %f") > 100
@@ -117,7 +117,7 @@ def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
     with pytest.raises(
         UnsupportedError, match="the 1025 drones of a world read each other's numbers; on a GPU at most 1024 can"
     ):
-        kernel.write(program, "cuda")
+        kernel.write_kernel(program, "cuda")
 
 
 def test_records_that_do_not_fit_into_a_block_are_refused():
@@ -144,7 +144,7 @@ def test_integers_wrap(name, remains):
     test = builder.add("lt", (result, a), bool) if name == "sub" else builder.add("rem", (result, a), np.int32)
     leaves = (Leaf("a", "drone", (2, 1), np.dtype(np.int32)), Leaf("b", "drone", (2, 1), test.dtype))
     segment = Segment("drone", ("one",), "each", builder.finish([test]), ((0, 0),), ((1, 0),))
-    gpu_kernel = kernel.write(Program(leaves, 1, (segment,)), "cuda")
+    gpu_kernel = kernel.write_kernel(Program(leaves, 1, (segment,)), "cuda")
     assert f"{name}_(" in gpu_kernel.text.split("n_steps;")[-1]
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")

@@ -207,13 +207,13 @@ def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
     reverse_program = reverse.reverse_program(
         program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"]
     )
-    text = cuda.ptx(reverse.write(reverse_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
+    text = cuda.ptx(reverse.write_kernel(reverse_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
     stored = sum(program.leaves[i].size for i in reverse_program.perturbed) + len(reverse_program.carry)
     assert text.count("st.global") >= stored
     tangent_program = add_tangents(program, reverse_program.perturbed)
     verify(tangent_program)
     assert all(tangent_program.leaves[i].name.startswith("tangent of ") for i in tangent_program.written_leaves)
-    assert "st.global" in cuda.ptx(kernel.write(tangent_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
+    assert "st.global" in cuda.ptx(kernel.write_kernel(tangent_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():

@@ -128,7 +128,7 @@ def test_an_operation_without_source_is_refused_when_the_step_is_planned(data, m
     monkeypatch.setitem(ops.TABLE, "sin", dataclasses.replace(ops.TABLE["sin"], source=""))
     program = optimise(lower_stages([sway], data))
     with pytest.raises(UnsupportedError, match=r"primitive 'sin'.*stage 'sway', jax") as error:
-        kernel.write(program, "host")
+        kernel.write_kernel(program, "host")
     assert (error.value.stage, error.value.primitive) == ("sway", "sin")
 
 
@@ -139,7 +139,7 @@ def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
     x = builder.input(np.int64)
     program, _ = make_program(builder.finish([x]), [np.zeros(3, np.int64)], 3)
     with pytest.raises(UnsupportedError, match=r"type int64, which .* has"):
-        kernel.write(program, "cuda")
+        kernel.write_kernel(program, "cuda")
 
 
 # Differences ---------------------------------------------------------------------------------------------------------

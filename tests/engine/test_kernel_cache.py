@@ -95,10 +95,10 @@ def test_a_folder_in_one_of_another_user_is_refused(cache):
 def test_a_file_of_another_user_is_not_loaded(cache):
     """Such a file may have been written before the folder became private."""
     folder = kernel_cache.folder()
-    library = kernel_cache.store(folder, "key", b"library", ".so")
-    assert list(kernel_cache.find(folder, "key")) == [library]
+    library = kernel_cache.store_file(folder, "key", b"library", ".so")
+    assert list(kernel_cache.find_files(folder, "key")) == [library]
     os.chown(library, OTHER_USER, OTHER_USER)
-    assert not list(kernel_cache.find(folder, "key"))
+    assert not list(kernel_cache.find_files(folder, "key"))
     assert library.exists()
 
 
@@ -152,7 +152,7 @@ def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
         make_remains("crazysim-mine", day),
     ]
     for pattern in ("*.tmp", "crazysim-*"):
-        kernel_cache.sweep(tmp_path, pattern)
+        kernel_cache.remove_abandoned_files(tmp_path, pattern)
     assert sorted(tmp_path.iterdir()) == sorted(needed)
     assert not any(path.exists() for path in remains)
 

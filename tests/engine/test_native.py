@@ -32,7 +32,7 @@ def source():
     """Return the source of a kernel that compiles fast: only the count of steps."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     clock = {"increment_steps": sim.step_pipeline["increment_steps"]}
-    return kernel.write(Step(clock, "lanes").plan(sim.data).program, "host")
+    return kernel.write_kernel(Step(clock, "lanes").plan(sim.data).program, "host")
 
 
 @pytest.fixture
@@ -136,7 +136,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
         str(folder / "other.so"),
     ]
     subprocess.run(other, check=True)
-    kernel_cache.store(cache_folder, key, (folder / "other.so").read_bytes(), ".so")
+    kernel_cache.store_file(cache_folder, key, (folder / "other.so").read_bytes(), ".so")
 
     assert register_anew(source) != f"crazysim_advance_{key}"
     assert len(list(cache_folder.iterdir())) == 2
@@ -165,7 +165,7 @@ def test_a_library_that_does_not_load_here_is_compiled_again(source, cache_folde
     key = native.register_kernel(source).removeprefix("crazysim_advance_")
     (library,) = cache_folder.iterdir()
     library.unlink()
-    foreign = kernel_cache.store(cache_folder, key, b"\x7fELF of another machine", ".so")
+    foreign = kernel_cache.store_file(cache_folder, key, b"\x7fELF of another machine", ".so")
     register_anew(source)
     assert compilations() == 2
     assert foreign.exists()
@@ -184,7 +184,7 @@ def test_a_kernel_that_cannot_be_written_says_so(source, cache_folder, compilati
     def raise_no_space(*args):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(kernel_cache, "store", raise_no_space)
+    monkeypatch.setattr(kernel_cache, "store_file", raise_no_space)
     with pytest.raises(KernelError, match=r"cannot be written: .*No space left on device; make room, or set TMPDIR"):
         native.register_kernel(source)
 

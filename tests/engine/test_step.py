@@ -547,7 +547,7 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     step = Step(sim.step_pipeline, "fused", "gpu")
     plan = step.plan(sim.data)
     assert plan.engine == "fused"
-    source = kernel.write(plan.program, "cuda")
+    source = kernel.write_kernel(plan.program, "cuda")
     text = cuda.ptx(source, cuda.DEFAULT_ARCHITECTURE)
     parameters = text.split(".entry advance(")[1].split(")")[0]
     assert parameters.count(".param") == 2 + len(source.inputs) + len(source.outputs) + 1  # sizes, count, ..., flags

@@ -189,7 +189,7 @@ def test_a_table_is_read_where_it_is_and_never_selected_from():
 def test_the_source_for_gpus_is_well_formed():
     """One kernel has all cases; NVRTC compiles it if it is installed."""
     program = optimise(lower_stages(as_stages({"total": sum_stage(KERNEL_CASES)}), make_data()))
-    text = kernel.write(program, "cuda").text
+    text = kernel.write_kernel(program, "cuda").text
     assert "TABLE f32 t" in text
     assert text.count("lookup(p") > 20
     assert "lookup_four(p" in text

@@ -131,7 +131,7 @@ def test_a_kernel_agrees_with_the_interpreter(all_operations, expected):
 
 def test_nvidia_compiles_every_operation(all_operations):
     program, _ = all_operations
-    text = kernel.write(program, "cuda")
+    text = kernel.write_kernel(program, "cuda")
     if cuda.nvrtc() is None:
         pytest.skip("NVRTC is not here")
     assert ".entry advance(" in cuda.ptx(text, cuda.DEFAULT_ARCHITECTURE)

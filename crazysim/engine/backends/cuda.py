@@ -45,7 +45,7 @@ THREADS_TO_TRY = (512, 384)
 
 LARGE_KERNEL_THREADS = 256
 """Threads per block for kernels larger than the instruction cache, from ``RESIDENT_LANES`` lanes on. The threads of a
-block execute the same code, so more of them share each fetched instruction."""
+block execute the same code, so in a larger block more threads share each fetched instruction."""
 
 INSTRUCTION_CACHE_BYTES = 96 * 2**10
 """Size of a compiled kernel from which it exceeds the instruction cache of a multiprocessor; measured on an H100."""
@@ -266,13 +266,13 @@ def compile_source(source: str, arch: str, kind: str) -> bytes:
     library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     key = kernel_cache.digest(source, arch, kind, *NVRTC_OPTIONS, f"{major.value}.{minor.value}")
     cache_folder = kernel_cache.folder()
-    for path in kernel_cache.find(cache_folder, key):
+    for path in kernel_cache.find_files(cache_folder, key):
         with contextlib.suppress(OSError):  # another process has removed it
             return path.read_bytes()
     image = _compile_with_nvrtc(library, source, arch, kind)
     if cache_folder != kernel_cache.temporary_folder():
         with contextlib.suppress(OSError):  # its disk is full
-            kernel_cache.store(cache_folder, key, image, f".{kind.lower()}")
+            kernel_cache.store_file(cache_folder, key, image, f".{kind.lower()}")
     return image
 
 

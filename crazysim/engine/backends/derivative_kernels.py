@@ -57,7 +57,7 @@ class DerivativeKernels:
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and the shapes and types of
         the tangents after the steps. It returns the tangents after the steps.
         """
-        compiled = self._compile("jvp", add_tangents, kernel.write, perturbed, platform)
+        compiled = self._compile("jvp", add_tangents, kernel.write_kernel, perturbed, platform)
         return None if compiled is None else partial(_launch_tangents, self, *compiled)
 
     def cotangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
@@ -66,7 +66,7 @@ class DerivativeKernels:
         It takes all leaves, cotangents of the written floats by leaf, the number of steps, and the number of batches.
         It returns cotangents by leaf. The cotangent of a leaf that all drones share has one row for each batch.
         """
-        compiled = self._compile("gradient", reverse.reverse_program, reverse.write, perturbed, platform)
+        compiled = self._compile("gradient", reverse.reverse_program, reverse.write_kernel, perturbed, platform)
         return None if compiled is None else partial(_launch_cotangents, self, *compiled)
 
     def _compile(

@@ -11,7 +11,7 @@ from crazysim.engine.backends.exchange import BLOCK_SIZE, lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
 MIN_BLOCKS_PLACEHOLDER = "1 /* blocks at least */"
-"""Text in a kernel for a GPU, in place of which ``Kernel.with_blocks`` writes a number of blocks."""
+"""Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
 
 BLOCK_THREADS_DEFINITION = "#define BLOCK_THREADS {}\n"
 """Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
@@ -28,7 +28,7 @@ class Kernel:
     outputs: tuple[int, ...]
     """Leaves that it writes. If worlds are checked, a bool per drone follows: True where its world is flagged."""
     in_place: tuple[int, ...] = ()
-    """Leaves of rows that it updates in place: input and output of each must be the same memory."""
+    """Leaves of rows that it updates in place: input and output of such a leaf must be the same memory."""
     threads: int = BLOCK_SIZE
     """Threads of a block on a GPU."""
     lanes: int = BLOCK_SIZE
@@ -78,7 +78,7 @@ def _preamble(target: str) -> str:
 
 
 def _epilogue(target: str) -> str:
-    """Return the code with which a target calls the kernel."""
+    """Return the code that calls the kernel on a target; empty for CUDA."""
     if target == "cuda":
         return ""
     return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()

@@ -62,7 +62,7 @@ class Kernels:
         return self._launches[platform]
 
     def _compile(self, location: Location) -> Launch:
-        return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
+        return compile_kernel(kernel.write_kernel(self.program, TARGETS[location.platform]), location)
 
     def result_shapes(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return the shapes and types of the kernel's outputs: leaves, and flags of drones if there is a check."""
@@ -150,7 +150,7 @@ DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weak
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
     """Return a line for each kernel of a program, as ``describe_kernel`` describes it."""
-    sources = [kernel.write(part, TARGETS[platform]) for part in _parts(program) if part.fused]
+    sources = [kernel.write_kernel(part, TARGETS[platform]) for part in _parts(program) if part.fused]
     return [f"kernel: {describe_kernel(source, platform, devices)}" for source in sources]
 
 

@@ -20,7 +20,7 @@ MAX_REGISTERS = 255
 """Maximum number of registers of a GPU thread."""
 
 
-def write(program: Program, target: str) -> Kernel:
+def write_kernel(program: Program, target: str) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
 
     A kernel takes the number of steps as an array of one number.

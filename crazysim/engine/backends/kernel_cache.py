@@ -58,7 +58,7 @@ def folder() -> Path:
             if reason := untrusted_reason(kernel_folder):
                 _warn_once(kernel_folder, reason)
             elif os.access(kernel_folder, os.W_OK | os.R_OK):
-                _sweep_once(kernel_folder)
+                _remove_abandoned_files_once(kernel_folder)
                 return kernel_folder
     return temporary_folder()
 
@@ -73,9 +73,9 @@ def _warn_once(kernel_folder: Path, reason: str) -> None:
 
 
 @functools.cache
-def _sweep_once(kernel_folder: Path) -> None:
-    """Remove the remains in a folder, once."""
-    sweep(kernel_folder, "*.tmp")
+def _remove_abandoned_files_once(kernel_folder: Path) -> None:
+    """Remove unfinished files of processes that have ended from a folder, once."""
+    remove_abandoned_files(kernel_folder, "*.tmp")
 
 
 def temporary_folder() -> Path:
@@ -88,7 +88,7 @@ def temporary_folder() -> Path:
 @functools.cache
 def _make_temporary_folder(pid: int) -> Path:
     parent = Path(tempfile.gettempdir())
-    sweep(parent, "crazysim-*")
+    remove_abandoned_files(parent, "crazysim-*")
     folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{process_name()}-", dir=parent))
 
     def remove() -> None:
@@ -114,7 +114,7 @@ def _machine() -> str:
     return digest(platform.node(), pid_namespace)[:8]
 
 
-def sweep(cache_folder: Path, pattern: str) -> None:
+def remove_abandoned_files(cache_folder: Path, pattern: str) -> None:
     """Remove files and folders of processes that have ended without removing them.
 
     Args:
@@ -152,7 +152,7 @@ def _is_abandoned(name: str, age: float) -> bool:
     return False
 
 
-def find(cache_folder: Path, key: str) -> Iterator[Path]:
+def find_files(cache_folder: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
     for path in sorted(cache_folder.glob(f"{key}-*")):
         if path.suffix == ".tmp" or untrusted_reason(path):
@@ -168,7 +168,7 @@ def find(cache_folder: Path, key: str) -> Iterator[Path]:
                 path.unlink()
 
 
-def store(cache_folder: Path, key: str, content: bytes, suffix: str) -> Path:
+def store_file(cache_folder: Path, key: str, content: bytes, suffix: str) -> Path:
     """Write a file into a folder, under the name of its key and contents, and return it.
 
     Args:

@@ -77,7 +77,7 @@ class LeafValues:
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:
-        """Return a leaf as an array, in the form in which the program takes and returns it."""
+        """Return a leaf as an array, as the program takes and returns it."""
         if leaf not in self.arrays:
             description = self.program.leaves[leaf]
             vectors = [self.vectors[leaf, k] for k in range(description.size)]

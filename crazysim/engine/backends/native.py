@@ -215,7 +215,7 @@ def toolchain(words: tuple[str, ...]) -> str:
 def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     """Return a kernel's library: from the cache, or compiled."""
     cache_folder = kernel_cache.folder()
-    for path in kernel_cache.find(cache_folder, key):
+    for path in kernel_cache.find_files(cache_folder, key):
         library = _load_library(path)
         if library is not None:
             return library
@@ -223,7 +223,7 @@ def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     # The cache may be on a file system without permission to execute code.
     for folder in dict.fromkeys((cache_folder, kernel_cache.temporary_folder())):
         try:
-            library = _load_library(kernel_cache.store(folder, key, content, ".so"))
+            library = _load_library(kernel_cache.store_file(folder, key, content, ".so"))
         except OSError as error:
             problem = f"the kernel that {words[0]} compiled cannot be written: {error}; make room, or set TMPDIR"
             continue

@@ -211,7 +211,7 @@ def needed_leaves(reverse: ReverseProgram) -> tuple[int, ...]:
     return kernel.needed_leaves(reverse.program)
 
 
-def write(reverse: ReverseProgram, target: str) -> Kernel:
+def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
     """Return the source of the reverse-mode kernel.
 
     Its inputs are the leaves that the program needs, then the cotangents of the floats that it writes. Its outputs are

@@ -1,4 +1,4 @@
-"""NumPy forms of operations for which NumPy has no function that agrees with XLA; ``ops`` has the table of operations.
+"""Operations in NumPy, where NumPy has no function that agrees with XLA; ``ops`` has the table of operations.
 
 Operands are NumPy arrays or scalars.
 """

@@ -20,8 +20,7 @@ from crazysim.engine.ir.blocks import Block
 from crazysim.jaxcompat import is_key
 
 Slot = tuple[int, int]
-"""Place of a number: the index of its leaf, and the index of the element in the part of the leaf that belongs to one
-drone (or world)."""
+"""Place of a number: the index of its leaf, and the index of the element among the elements of one drone (or world)."""
 
 TABLE_INDEX = -1
 """Element index in the slot of a whole leaf that is read as a table. Only shared leaves are tables."""
@@ -50,7 +49,7 @@ class Leaf:
 
     @functools.cached_property
     def size(self) -> int:
-        """Number of scalars per drone (or world); a key is two 32-bit integers."""
+        """Number of scalars per drone (or world); a random key is two 32-bit integers."""
         if self.row_leaves:
             return self.shape[0]
         shape = self.shape[2:] if self.scope in ("drone", "world") else self.shape

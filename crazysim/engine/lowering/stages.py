@@ -218,7 +218,7 @@ def _lower_guarded(
 
 
 def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> ElementArray:
-    """Return scalars as an array with the shape of the template; two scalars become a key where it has one."""
+    """Return scalars as an array of the template's shape; where the template has a random key, it takes two scalars."""
     scalar = iter(items)
     elements = [(next(scalar), next(scalar)) if isinstance(x, tuple) else next(scalar) for x in template.reshape(-1)]
     return as_elements(elements, template.shape)

@@ -79,7 +79,7 @@ class Tracer:
 _TRACED_STAGES: dict[Any, TracedStage] = {}
 """Traced stages with ``trace_once``, for all simulations of this process."""
 MAX_TRACED_STAGES = 256
-"""Maximum number of traced stages that are kept."""
+"""Maximum number of traced stages in ``_TRACED_STAGES``."""
 
 
 def _get_shared_trace(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:

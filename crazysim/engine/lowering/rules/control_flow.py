@@ -126,8 +126,8 @@ def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> l
 
 @rule("scan")
 def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    p, length = eqn.params, eqn.params["length"]
-    body = close_jaxpr(p["jaxpr"])
+    params, length = eqn.params, eqn.params["length"]
+    body = close_jaxpr(params["jaxpr"])
     # The parameters with the numbers of constants, carried and stacked operands have different names in different
     # versions of JAX, so these are counted by axes: a stacked operand has one axis more than in the body.
     n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
@@ -144,11 +144,11 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
             f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
         )
     outs_by_iteration: list[list[ElementArray]] = []
-    for i in range(length)[::-1] if p["reverse"] else range(length):
+    for i in range(length)[::-1] if params["reverse"] else range(length):
         outs = ctx.lower(body, [*consts, *carry, *(x[i, ...] for x in xs)])
         carry = outs[:n_carry]
         outs_by_iteration.append(outs[n_carry:])
-    if p["reverse"]:
+    if params["reverse"]:
         outs_by_iteration.reverse()
     if not length:
         return [*carry, *(np.empty(v.aval.shape, object) for v in eqn.outvars[n_carry:])]
@@ -158,14 +158,14 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 @rule("while")
 def _while(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    p = eqn.params
-    n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
+    params = eqn.params
+    n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
     cond_consts, body_consts, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
     cond, body = ctx.make_inner(), ctx.make_inner()
     cond_args = [*cond_consts, *(_add_inputs(cond, x) for x in carry)]
-    cond_block = cond.finish(cond.lower(close_jaxpr(p["cond_jaxpr"]), cond_args))
+    cond_block = cond.finish(cond.lower(close_jaxpr(params["cond_jaxpr"]), cond_args))
     body_args = [*body_consts, *(_add_inputs(body, x) for x in carry)]
-    body_block = body.finish(body.lower(close_jaxpr(p["body_jaxpr"]), body_args))
+    body_block = body.finish(body.lower(close_jaxpr(params["body_jaxpr"]), body_args))
     return _add_operation(ctx, "while", eqn, scalars(*carry), (cond_block, body_block))
 
 

@@ -31,7 +31,7 @@ def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Element
 
 @rule("digamma")
 def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the digamma function, whose value at zero depends on the version of JAX."""
+    """Return the digamma function. Its value at zero depends on the version of JAX."""
     dtype = eqn.outvars[0].aval.dtype
     is_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
     regular = ctx.elementwise("digamma", args, dtype)
@@ -147,7 +147,7 @@ class _Bits:
 
     def count(self, x: ElementArray) -> ElementArray:
         """Count the bits that are set: add them up in pairs, fours and bytes, and sum the bytes by a product."""
-        pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
+        pairs, fours, eights, ones = (self.repeat_byte(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
         x = self.apply("sub", x, self.apply("and", self.apply("shift_right_logical", x, 1), pairs))
         x = self.apply(
             "add", self.apply("and", x, fours), self.apply("and", self.apply("shift_right_logical", x, 2), fours)
@@ -155,7 +155,7 @@ class _Bits:
         x = self.apply("and", self.apply("add", x, self.apply("shift_right_logical", x, 4)), eights)
         return self.apply("shift_right_logical", self.apply("mul", x, ones), self.n_bits - 8)
 
-    def mask(self, byte: int) -> int:
+    def repeat_byte(self, byte: int) -> int:
         return int.from_bytes(bytes([byte] * self.dtype.itemsize), "little")
 
 

@@ -139,8 +139,11 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
         is_inside = [_is_inside(ctx, row, limits) for row in rows]
         fill = eqn.params["fill_value"]
         fill = _fill_value(out.dtype) if fill is None else fill
-        result = [_select(ctx, is_inside[row_by_element[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
-                  for o, item in enumerate(result)]  # fmt: skip
+        fill_element = constants(fill, out.dtype)
+        result = [
+            _select(ctx, is_inside[row_by_element[position]], as_elements([item], ()), fill_element)[()]
+            for position, item in enumerate(result)
+        ]
     return [as_elements(result, out.shape)]
 
 
@@ -166,10 +169,12 @@ def _select_windows(
             _conjunction(ctx, (_is_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0))
             for row in rows
         ]
-        for o, item in enumerate(window):
-            condition = is_window[row_by_element[o]]
-            if condition is not None and item is not result[o]:
-                result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
+        for position, item in enumerate(window):
+            condition = is_window[row_by_element[position]]
+            if condition is not None and item is not result[position]:
+                result[position] = _select(
+                    ctx, condition, as_elements([item], ()), as_elements([result[position]], ())
+                )[()]
     return result
 
 

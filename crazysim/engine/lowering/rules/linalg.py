@@ -52,16 +52,16 @@ def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
 
 @rule("triangular_solve")
 def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    p = eqn.params
+    params = eqn.params
     _check_size(eqn, args[0].shape[-1])
     out = []
     for a, b in zip(_matrices(args[0]), _matrices(args[1]), strict=True):
-        a = a.T if p["transpose_a"] else a
-        is_lower = p["lower"] != p["transpose_a"]
-        if not p["left_side"]:  # x a = b is a' x' = b'
+        a = a.T if params["transpose_a"] else a
+        is_lower = params["lower"] != params["transpose_a"]
+        if not params["left_side"]:  # x a = b is a' x' = b'
             a, b, is_lower = a.T, b.T, not is_lower
-        x = _substitute(ctx, a, b, is_lower, p["unit_diagonal"])
-        out.append(x if p["left_side"] else x.T)
+        x = _substitute(ctx, a, b, is_lower, params["unit_diagonal"])
+        out.append(x if params["left_side"] else x.T)
     return [as_elements([e for x in out for e in x.reshape(-1)], args[1].shape)]
 
 

@@ -36,15 +36,15 @@ def _check_generator(impl: Any) -> None:
 
 @rule("random_fold_in", "random_split", "random_bits", "random_seed")
 def _random(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Lower the functions of JAX's generator, which are integer arithmetic and a cipher on the two halves of a key."""
-    name, p, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
+    """Lower a function of JAX's generator: integer arithmetic, and a cipher on the two halves of a key."""
+    name, params, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
     takes_keys = name != "random_seed"
     if takes_keys:
         _check_generator(eqn.invars[0].aval.dtype._impl)
     random_function = {
         "random_fold_in": lambda key, data: impl.fold_in(key, data),
-        "random_split": lambda key: impl.split(key, p["shape"]),
-        "random_bits": lambda key: impl.random_bits(key, p["bit_width"], p["shape"]),
+        "random_split": lambda key: impl.split(key, params["shape"]),
+        "random_bits": lambda key: impl.random_bits(key, params["bit_width"], params["shape"]),
         "random_seed": lambda seed: impl.seed(seed),
     }[name]
     shape = np.broadcast_shapes(*(x.shape for x in args))

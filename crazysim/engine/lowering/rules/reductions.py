@@ -103,7 +103,7 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Eleme
     positions = constants(np.broadcast_to(numbers, x.shape), np.int32)
     key = x
     if dtype.kind == "f":  # bits as integers are in the order of the floats, negative floats in reverse
-        ctx.builder.barrier()  # without it, XLA may recompute a NaN for another exchange, with the other sign
+        ctx.builder.barrier()  # without it, XLA may recompute a NaN for each exchange, with different signs
         integer = np.dtype(f"i{dtype.itemsize}")
         key = ctx.elementwise("bitcast_convert_type", [x], integer)
         flipped = ctx.elementwise("xor", [key, constants(np.iinfo(integer).max, integer)], integer)
