@@ -70,7 +70,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         UnsupportedError: If a part of the program has no derivative in a kernel.
     """
     program, perturbed = prepare_derivative(program, perturbed)
-    n = len(program.leaves)
+    n_leaves = len(program.leaves)
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
@@ -78,13 +78,17 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         for s in step_segments
     ]
     extended_program = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
-    changed, constants = changed_slots(program, perturbed)
+    changed, hoisted_indices = changed_slots(program, perturbed)
     backward_segments = {}
     for s in program.fused_segments:
-        hoisted_leaf = 2 * n + step_segments.index(s) if s in step_segments else -1
-        backward_segments[s] = _reverse_segment(extended_program, n, s, changed, constants.get(s, ()), hoisted_leaf)
+        hoisted_leaf = 2 * n_leaves + step_segments.index(s) if s in step_segments else -1
+        backward_segments[s] = _reverse_segment(
+            extended_program, n_leaves, s, changed, hoisted_indices.get(s, ()), hoisted_leaf
+        )
     backward_hoisted_segments = {
-        s: _reverse_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
+        s: _reverse_hoisted(n_leaves, s, changed, hoisted_indices[s], 2 * n_leaves + k)
+        for k, s in enumerate(step_segments)
+        if hoisted_indices[s]
     }
     used_by_steps = {slot for s in step_segments for slot in program.drone_slots(s, [*s.reads, *s.writes])}
     changing = program.changing_slots()
@@ -98,7 +102,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     }
     return ReverseProgram(
         extended_program,
-        n,
+        n_leaves,
         perturbed,
         backward_segments,
         backward_hoisted_segments,
@@ -119,20 +123,28 @@ def _float_type(block: Block) -> np.dtype:
 
 
 def _reverse_segment(
-    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], hoisted_leaf: int
+    program: Program, n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int], hoisted_leaf: int
 ) -> Segment:
     """Return the segment that replaces the cotangents after a segment by the cotangents before the segment.
 
     In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
     cotangents of the written numbers over the drones, and adds its results to the cotangents of the first drone.
+
+    Args:
+        program: The program with the leaves of cotangents.
+        n_leaves: Number of leaves of the program before the leaves of cotangents.
+        s: The segment.
+        changed: Slots whose numbers depend differentiably on the perturbed leaves.
+        hoisted_indices: Indices of the hoisted numbers that depend differentiably on the perturbed leaves.
+        hoisted_leaf: Leaf of the cotangents of hoisted numbers; -1 for a segment before or after the steps.
     """
     n_drones, is_world_segment = program.n_drones, s.scope == "world"
     reads = program.drone_slots(s, s.reads)
     input_indices = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
-    constant_indices = [len(reads) + k for k in constants]
+    hoisted_input_indices = [len(reads) + k for k in hoisted_indices]
     float_outputs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
-    pullback = transpose_block(s.block, [s.block.inputs[k] for k in (*input_indices, *constant_indices)])
+    pullback = transpose_block(s.block, [s.block.inputs[k] for k in (*input_indices, *hoisted_input_indices)])
     n_inputs = len(s.block.inputs)
 
     def cotangent_slots(slot: Slot) -> list[Slot]:
@@ -142,8 +154,8 @@ def _reverse_segment(
         """
         i, k = slot
         if not is_world_segment or program.leaves[i].scope == "drone":
-            return [(n + i, k)]
-        return [(n + i, d * program.leaves[i].size + k) for d in range(n_drones)]
+            return [(n_leaves + i, k)]
+        return [(n_leaves + i, d * program.leaves[i].size + k) for d in range(n_drones)]
 
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
     ct_inputs: dict[Slot, Value] = {}
@@ -155,9 +167,9 @@ def _reverse_segment(
         return ct_inputs[slot]
 
     def sum_copies(slot: Slot, dtype: np.dtype) -> object:
-        sums = [read_cotangent(c, dtype) for c in cotangent_slots(slot)]
-        result: object = sums[0]
-        for x in sums[1:]:
+        copies = [read_cotangent(c, dtype) for c in cotangent_slots(slot)]
+        result: object = copies[0]
+        for x in copies[1:]:
             result = builder.add("add", (result, x), dtype)
         return result
 
@@ -172,17 +184,19 @@ def _reverse_segment(
         ct_slot, dtype = cotangent_slots(s.reads[k])[0], s.block.inputs[k].dtype
         old_ct = ct_outputs[ct_slot] if ct_slot in ct_outputs else read_cotangent(ct_slot, dtype)
         ct_outputs[ct_slot] = builder.add("add", (old_ct, part), dtype)
-    for k, part in zip(constants, parts[len(input_indices) :], strict=True):
+    for k, part in zip(hoisted_indices, parts[len(input_indices) :], strict=True):
         ct_slot, dtype = (hoisted_leaf, k), s.block.inputs[len(reads) + k].dtype
         ct_outputs[ct_slot] = builder.add("add", (read_cotangent(ct_slot, dtype), part), dtype)
-    first_inputs, constant_inputs = primal[: len(reads)], primal[len(reads) : n_inputs]
+    read_inputs, hoisted_inputs = primal[: len(reads)], primal[len(reads) : n_inputs]
     block = Block(
-        (*first_inputs, *ct_inputs.values(), *constant_inputs), tuple(builder.operations), tuple(ct_outputs.values())
+        (*read_inputs, *ct_inputs.values(), *hoisted_inputs), tuple(builder.operations), tuple(ct_outputs.values())
     )
     return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *ct_inputs), tuple(ct_outputs))
 
 
-def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], hoisted_leaf: int) -> Segment:
+def _reverse_hoisted(
+    n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int], hoisted_leaf: int
+) -> Segment:
     """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
     input_indices = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
@@ -192,7 +206,7 @@ def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence
     primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
     seeds, ct_slots = [], []
     for k, x in enumerate(s.hoisted.outputs):
-        if x.dtype.kind == "f" and k in constants:
+        if x.dtype.kind == "f" and k in hoisted_indices:
             seeds.append(builder.input(x.dtype))
             ct_slots.append((hoisted_leaf, k))
         elif x.dtype.kind == "f":
@@ -201,7 +215,7 @@ def _reverse_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence
     cts = [x for x in seeds if isinstance(x, Value)]
     parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
     sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old_cts, parts, strict=True)]
-    targets = tuple((n + reads[k][0], reads[k][1]) for k in input_indices)
+    targets = tuple((n_leaves + reads[k][0], reads[k][1]) for k in input_indices)
     block = Block((*primal, *cts, *old_cts), tuple(builder.operations), tuple(sums))
     return Segment("drone", s.stages, "each", block, (*reads, *ct_slots, *targets), targets)
 

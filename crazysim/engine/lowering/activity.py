@@ -41,25 +41,25 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
         that depend on the perturbed leaves.
     """
     changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
-    constants: dict[Segment, tuple[int, ...]] = {}
+    hoisted_indices: dict[Segment, tuple[int, ...]] = {}
 
-    def find_active_outputs(block: Block, slots: Sequence[Slot], active_constants: Sequence[int] = ()) -> list[int]:
+    def find_active_outputs(block: Block, slots: Sequence[Slot], active_hoisted: Sequence[int] = ()) -> list[int]:
         active_inputs = [
             x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"
         ]
-        active_inputs += [block.inputs[len(slots) + k] for k in active_constants]
+        active_inputs += [block.inputs[len(slots) + k] for k in active_hoisted]
         active = active_values(block, active_inputs)
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in active]
 
     def propagate(s: Segment) -> None:
         written_slots = program.drone_slots(s, s.writes)
         reads = program.drone_slots(s, s.reads)
-        changed.update(written_slots[k] for k in find_active_outputs(s.block, reads, constants.get(s, ())))
+        changed.update(written_slots[k] for k in find_active_outputs(s.block, reads, hoisted_indices.get(s, ())))
 
     for s in program.phase_segments("before"):
         propagate(s)
     for s in program.phase_segments("each"):
-        constants[s] = tuple(find_active_outputs(s.hoisted, s.hoisted_reads))
+        hoisted_indices[s] = tuple(find_active_outputs(s.hoisted, s.hoisted_reads))
     while True:  # numbers that become dependent in one step may affect other numbers in the next step
         n_changed_before = len(changed)
         for s in program.phase_segments("each"):
@@ -68,7 +68,7 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
             break
     for s in program.phase_segments("after"):
         propagate(s)
-    return changed, constants
+    return changed, hoisted_indices
 
 
 def active_values(block: Block, perturbed: Collection[Value]) -> set[Value]:

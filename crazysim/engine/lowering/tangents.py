@@ -44,9 +44,9 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     """
     program, perturbed = prepare_derivative(program, perturbed)
     n_leaves = len(program.leaves)
-    changed, constants = changed_slots(program, perturbed)
+    changed, hoisted_indices = changed_slots(program, perturbed)
     segments = [
-        _add_segment_tangents(program, n_leaves, s, changed, constants.get(s, ())) for s in program.fused_segments
+        _add_segment_tangents(program, n_leaves, s, changed, hoisted_indices.get(s, ())) for s in program.fused_segments
     ]
     written_tangents = [
         i for s in segments for i in s.written_leaves if i >= n_leaves and i - n_leaves not in perturbed
@@ -69,14 +69,14 @@ def _tangent_leaf(leaf: Leaf) -> Leaf:
 
 
 def _add_segment_tangents(
-    program: Program, n_leaves: int, s: Segment, changed: set[Slot], constants: Sequence[int]
+    program: Program, n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int]
 ) -> Segment:
     """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.drone_slots(s, s.reads), len(s.reads)
     input_indices = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
     input_indices = [k for k in input_indices if not s.block.inputs[k].size]
     block = add_block_tangents(
-        s.block, [s.block.inputs[k] for k in (*input_indices, *(n_reads + k for k in constants))]
+        s.block, [s.block.inputs[k] for k in (*input_indices, *(n_reads + k for k in hoisted_indices))]
     )
     primal, input_tangents = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
     inputs = (
@@ -91,13 +91,13 @@ def _add_segment_tangents(
     hoisted_slots = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
-    if constants:
+    if hoisted_indices:
         pairs = zip(s.hoisted.inputs, s.hoisted_reads, strict=True)
         perturbed_inputs = [x for x, slot in pairs if slot in hoisted_slots]
         hoisted = add_block_tangents(s.hoisted, perturbed_inputs)
         indices = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
-        tangents_of_constants = [hoisted.outputs[n_hoisted + indices.index(k)] for k in constants]
-        hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *tangents_of_constants))
+        hoisted_tangents = [hoisted.outputs[n_hoisted + indices.index(k)] for k in hoisted_indices]
+        hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *hoisted_tangents))
     return dataclasses.replace(
         s,
         block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in output_tangents))),
@@ -105,7 +105,7 @@ def _add_segment_tangents(
         writes=(*s.writes, *((n_leaves + s.writes[k][0], s.writes[k][1]) for k, _ in output_tangents)),
         hoisted=hoisted,
         hoisted_reads=(*s.hoisted_reads, *((n_leaves + i, k) for i, k in hoisted_slots))
-        if constants
+        if hoisted_indices
         else s.hoisted_reads,
     )
 
