@@ -15,8 +15,8 @@ from crazysim.sim.sim import Sim
 BACKGROUND_COLOR, OBSTACLE_COLOR, OUTLINE_COLOR = (238, 238, 230), (40, 65, 40), (20, 20, 20)
 """Colours of a map, of obstacles, and of the outlines of drones, RGB."""
 MIN_OBSTACLE_TOP = 0.1
-"""Smallest height of the top of an obstacle, m. Lower geoms are not drawn: markers on the floor, and obstacles that a
-layout has moved below it."""
+"""Smallest height of the top of an obstacle, m. Lower geoms are not drawn, such as markers on the floor, and obstacles
+that a layout has moved below the floor."""
 MARGIN = 1.0
 """Width of the margin around obstacles and paths, m."""
 MIN_WIDTH, MAX_WIDTH = 6.0, 24.0
@@ -31,11 +31,11 @@ map is higher than wide."""
 PATH_SECONDS = 1e6
 """Largest duration of a path, s."""
 MAX_COORDINATE = 1e5
-"""Largest coordinate of obstacles and drones that are drawn, m; states that diverge are left out."""
+"""Largest coordinate of obstacles and drones that are drawn, m. This leaves out drones whose states diverge."""
 
 
 class Grid(NamedTuple):
-    """Samples of a part of the horizontal plane, in columns along x and rows against y."""
+    """Samples of a part of the horizontal plane. Columns are in the direction of x, rows in the direction of -y."""
 
     start: NDArray
     """Indices of the first column and the first row. Column 0 and row 0 are at the origin of the world. (2,)"""

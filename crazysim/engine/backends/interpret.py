@@ -289,9 +289,9 @@ def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu:
 
 def _run_steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
     values = lanes.LeafValues(program, leaves, run_block, np)
-    constants = lanes.prepare_steps(program, values)
+    hoisted_results = lanes.prepare_steps(program, values)
     for _ in range(n_steps):
-        lanes.run_phase(program, values, "each", constants)
+        lanes.run_phase(program, values, "each", hoisted_results)
     flagged = lanes.nonfinite_worlds(program, values)
     lanes.run_phase(program, values, "after", {})
     return [np.ascontiguousarray(values.array(i)) for i in program.written_leaves], flagged

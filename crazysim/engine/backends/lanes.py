@@ -26,7 +26,7 @@ from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot, Unfu
 from crazysim.engine.passes.schedule import add_barriers
 from crazysim.jaxcompat import is_key
 
-Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
+BlockRunner = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 """Function that runs a block: it takes the block, its inputs and the shape of the lanes, and returns the outputs."""
 
 
@@ -36,7 +36,7 @@ class LeafValues:
     If a leaf has only one of these forms, the other form is made when it is read. Writing one form removes the other.
     """
 
-    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run_block, library: Any = jnp):
+    def __init__(self, program: Program, leaves: list[Any], execute: BlockRunner = xla.run_block, library: Any = jnp):
         """Store leaves as arrays.
 
         Args:
@@ -66,13 +66,13 @@ class LeafValues:
         if slot[1] == TABLE_INDEX:
             return self.arrays[slot[0]].reshape(-1)
         if slot not in self.vectors:
-            self._split(slot[0])
+            self._split_leaf(slot[0])
         return self.vectors[slot]
 
     def set(self, slot: Slot, value: Any) -> None:
         """Write the value of a slot for every drone; a scalar is broadcast to all lanes."""
         if slot not in self.vectors:
-            self._split(slot[0])
+            self._split_leaf(slot[0])
         self.vectors[slot] = value if np.shape(value) == self.shape else self.library.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
@@ -81,10 +81,12 @@ class LeafValues:
         if leaf not in self.arrays:
             description = self.program.leaves[leaf]
             vectors = [self.vectors[leaf, k] for k in range(description.size)]
-            self.arrays[leaf] = self.library.stack(vectors) if description.row_leaves else self._stack(leaf, vectors)
+            self.arrays[leaf] = (
+                self.library.stack(vectors) if description.row_leaves else self._stack_vectors(leaf, vectors)
+            )
         return self.arrays[leaf]
 
-    def _stack(self, leaf: int, vectors: list[Any]) -> Any:
+    def _stack_vectors(self, leaf: int, vectors: list[Any]) -> Any:
         description, is_random_key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
         shape = (*description.shape[2:], 2) if is_random_key else description.shape[2:]
         array = self.library.stack(vectors, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
@@ -97,10 +99,10 @@ class LeafValues:
         for k in range(self.program.leaves[leaf].size):
             self.vectors.pop((leaf, k), None)
 
-    def _split(self, leaf: int) -> None:
+    def _split_leaf(self, leaf: int) -> None:
         x, description = self.arrays[leaf], self.program.leaves[leaf]
         size = description.size
-        if description.row_leaves or x is None:  # a leaf of None is written before it is read
+        if description.row_leaves or x is None:  # a leaf that is None is written before it is read
             self.vectors.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
             return
         if is_key(x):
@@ -134,11 +136,11 @@ def leaf_shape(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStru
 MIN_CHECKPOINTED_STEPS = 256
 """Number of steps from which the backward pass stores the carries of only some steps; see ``repeat``."""
 
-Constants = dict[int, Sequence[Any]]
+HoistedResults = dict[int, Sequence[Any]]
 """Results of hoisted blocks, by the index of their segment among the segments of the phase ``each``."""
 
 
-def prepare_steps(program: Program, values: LeafValues) -> Constants:
+def prepare_steps(program: Program, values: LeafValues) -> HoistedResults:
     """Run the segments before the first step, then the hoisted blocks, and return the results of these blocks."""
     run_phase(program, values, "before", {})
     return {
@@ -148,7 +150,7 @@ def prepare_steps(program: Program, values: LeafValues) -> Constants:
     }
 
 
-def run_phase(program: Program, values: LeafValues, phase: Phase, constants: Constants) -> None:
+def run_phase(program: Program, values: LeafValues, phase: Phase, hoisted_results: HoistedResults) -> None:
     """Run the segments of a phase."""
     for k, segment in enumerate(program.phase_segments(phase)):
         if isinstance(segment, UnfusedStage):
@@ -156,11 +158,13 @@ def run_phase(program: Program, values: LeafValues, phase: Phase, constants: Con
         elif segment.scope == "world":
             _run_worlds(segment, values)
         else:
-            _run_drones(segment, values, constants.get(k, []))
+            _run_drones(segment, values, hoisted_results.get(k, []))
 
 
-def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) -> None:
-    outs = values.execute(segment.block, [*(values.get(slot) for slot in segment.reads), *constants], values.shape)
+def _run_drones(segment: Segment, values: LeafValues, hoisted_results: Sequence[Any]) -> None:
+    outs = values.execute(
+        segment.block, [*(values.get(slot) for slot in segment.reads), *hoisted_results], values.shape
+    )
     for slot, value in zip(segment.writes, outs, strict=True):
         values.set(slot, value)
 
@@ -207,7 +211,7 @@ def build(program: Program, location: Location) -> Run:
 
 
 def run_steps(
-    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run_block
+    program: Program, leaves: list[Any], n_steps: int | Array, execute: BlockRunner = xla.run_block
 ) -> tuple[list[Any], Array]:
     """Return the written leaves after some steps, and True for worlds that are flagged as not finite. (n_worlds, 1)
 
@@ -220,7 +224,7 @@ def run_steps(
         execute: Function that runs blocks.
     """
     initial_values = LeafValues(program, leaves, execute)
-    constants = prepare_steps(program, initial_values)
+    hoisted_results = prepare_steps(program, initial_values)
     segments = program.phase_segments("each")
     carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written_leaves})
     fused_segments = [s for s in segments if isinstance(s, Segment)]
@@ -229,7 +233,7 @@ def run_steps(
 
     def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
         values = unpack_carry(carry)
-        run_phase(program, values, "each", constants)
+        run_phase(program, values, "each", hoisted_results)
         return [values.get(slot) for slot in carried_slots], [values.array(leaf) for leaf in carried_leaves]
 
     def unpack_carry(carry: tuple[list[Any], list[Any]]) -> LeafValues:
