@@ -228,8 +228,8 @@ def _batching_rule(
         broadcast_args = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
         return jax.lax.map(lambda xs: list(primitive.bind(*xs, spec=spec, **params)), broadcast_args)
 
-    def join_batches(x: Any, b: bool) -> Any:
-        x = x if b else jnp.broadcast_to(x, (n, *x.shape))
+    def join_batches(x: Any, is_batched: bool) -> Any:
+        x = x if is_batched else jnp.broadcast_to(x, (n, *x.shape))
         return x.reshape(-1, *x.shape[2:])
 
     operands = [

@@ -109,7 +109,7 @@ def _announce_missing_compiler() -> None:
 
 
 class FusedRun:
-    """A ``Run`` with the kernels that it calls; None if unfused stages split the step."""
+    """A ``Run`` with its kernels. ``kernels`` is None if unfused stages split the step."""
 
     def __init__(self, run: Run, kernels: Kernels | None):
         self._run, self.kernels = run, kernels
@@ -172,14 +172,14 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
             or not program.fused
             or any(b and not has_axis for b, has_axis in zip(leaves_batched, have_world_axis, strict=True))
         ):
-            # Batches cannot be joined, for example because their shared parameters differ: they run one by one.
+            # Batches run one by one if they cannot be joined, for example because their shared parameters differ.
             broadcast_leaves = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
                     for x, b in zip(leaves, leaves_batched, strict=True)]  # fmt: skip
             counts = count if count_batched else jnp.broadcast_to(count, (size,))
             return jax.lax.map(lambda xs: run(*xs), (broadcast_leaves, counts)), out_batched
 
-        def join_batches(x: Any, b: bool, in_rows: bool) -> Any:
-            x = x if b else jnp.broadcast_to(x, (size, *x.shape))
+        def join_batches(x: Any, is_batched: bool, in_rows: bool) -> Any:
+            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
             return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if in_rows else x.reshape(-1, *x.shape[2:])
 
         def split_batches(x: Any, in_rows: bool) -> Any:

@@ -37,7 +37,7 @@ def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> li
 
 
 def _take(ctx: Lowering, x: ElementArray, start: Element, size: int, axis: int) -> ElementArray:
-    """Return ``size`` elements along an axis, beginning at a start that is clamped to the array."""
+    """Return ``size`` elements along an axis from ``start`` on. The start is clamped so that they are in the array."""
     max_start = x.shape[axis] - size
     if is_constant(start) or max_start == 0:
         k = int(np.clip(start, 0, max_start)) if max_start else 0
@@ -110,8 +110,7 @@ def _check_range(n: int) -> None:
 def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     x, indices = args
     if is_known(indices):
-        p = eqn.params
-        if p["mode"] == GatherScatterMode.FILL_OR_DROP:
+        if eqn.params["mode"] == GatherScatterMode.FILL_OR_DROP:
             return [_gather_filled(eqn, x, known_values(indices))]
         return move_by_indices(eqn, [x], [known_values(indices)])
     dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
