@@ -146,8 +146,8 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
 
     The fit consists of three linear regressions. The first explains changes of the velocity over 0.5 s by thrust and
     drag, rotated by the measured attitude. The second explains fast rotation by the torques of the rotors
-    (``fast_rotation``). The third explains changes of the angular velocity over 0.5 s by the other torques. The mass is
-    not observable from the motion, so it is not fitted.
+    (``fast_rotation``). The third explains the remaining changes of the angular velocity over 0.5 s by the torques in
+    ``TORQUE_TERMS``. The mass is not observable from the motion, so it is not fitted.
 
     Args:
         logs: Logs of the same sample time.

@@ -15,10 +15,10 @@ NORM_TOLERANCE = 1e-3
 """Deviation of a quaternion's norm from 1 that counts as rounding."""
 MAX_INTERPOLATION = 0.03
 """Longest time that is interpolated, s. A straight line over T differs from a sine of frequency f by at most
-``(2 pi f T)^2 / 8`` of its amplitude: by 11% at 5 Hz, about the fastest that a small drone follows."""
+``(2 pi f T)^2 / 8`` of its amplitude: by 11% at 5 Hz, about the fastest motion of a small drone."""
 PERIOD_RANGE = (1e-4, 0.2)
-"""Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
-is left of the rotation."""
+"""Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; less than 5 Hz would not
+show the rotation."""
 TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units in which times may be logged by mistake, s."""
 MIN_SAMPLES = 20

@@ -60,9 +60,9 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     """Return moments of inertia, torque curve and delays that explain the fast rotation of logs.
 
     About x and y, thrust and arms give the torque, and therefore the scale of the moments of inertia. About z, only the
-    ratios of drag torque and rotor inertia to the moment of inertia are observable, so that moment is assumed to be in
-    the same proportion to the other two as in the airframe. Results are weighted medians over blocks, because streams
-    of telemetry drift against each other and lose packets, which spoils single blocks.
+    ratios of drag torque and rotor inertia to the moment of inertia are observable. The moment about z is therefore
+    assumed to be in the same proportion to the moments about x and y as in the airframe. Results are weighted medians
+    over blocks, because streams of telemetry drift against each other and lose packets, which spoils single blocks.
 
     Args:
         logs: Logs of the same sample time.

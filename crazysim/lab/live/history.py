@@ -23,7 +23,7 @@ class Snapshot:
 
 
 class History:
-    """The first snapshot since a reset, and the latest ones."""
+    """The first snapshot since a reset, and the latest snapshots."""
 
     def __init__(self, length: int):
         """Create an empty history.

@@ -40,7 +40,7 @@ class CommandQueue(Closeable):
         self._queue: queue.Queue[Command] = queue.Queue(MAX_QUEUE)
 
     def commands(self) -> list[Command]:
-        """Return the commands that have arrived before this call, in order; later ones wait for the next call."""
+        """Return the commands that have arrived before this call, in order; later commands wait for the next call."""
         commands = []
         with contextlib.suppress(queue.Empty):
             for _ in range(self._queue.qsize()):

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class Viewers(Generic[L]):
-    """Open viewers, which get pictures at one rate; a viewer that fails is closed, and the others continue."""
+    """Open viewers, which all get pictures at the same times. A viewer that fails is closed; other viewers continue."""
 
     period: float
     """Time between two pictures, s."""

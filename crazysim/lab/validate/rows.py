@@ -28,7 +28,7 @@ class Row:
     bound: tuple[float, float] | None = None
     """Least and largest figure that passes; None for a figure without a bound."""
     remark: str = ""
-    """Other figures to compare with, such as published ones."""
+    """Other figures to compare with, such as published figures."""
     problem: str = ""
     """Reason why the comparison failed to run."""
     series: str = ""

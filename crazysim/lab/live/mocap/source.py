@@ -55,7 +55,7 @@ class MocapSource(Closeable):
 
     @property
     def ended(self) -> str | None:
-        """Reason for which the source sends no more frames; None while it may still send some."""
+        """Reason for which the source sends no more frames; None while it may still send frames."""
         return None
 
     def close(self) -> None:

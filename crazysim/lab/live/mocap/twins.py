@@ -36,9 +36,9 @@ HIDDEN_POSITION = (0.0, 0.0, -100.0)
 class Twin:
     """Simulated object that represents a real one.
 
-    The measured attitude is first turned by ``turn``; then the angles in ``fixed`` replace the measured ones, and
+    The measured attitude is first turned by ``turn``. Then the angles in ``fixed`` replace the measured angles, and
     ``offset``, in the resulting axes, is added to the position. With a ``parent``, the object is a part of a skeleton:
-    its position follows from the parent's pose and its own measurement.
+    its position follows from the pose of the parent and its own measured pose.
     """
 
     model: Any = "box"
@@ -50,10 +50,10 @@ class Twin:
     turn: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Roll, pitch and yaw of the body in the tracked frame, rad. (3,)"""
     fixed: Sequence[float | None] = (None, None, None)
-    """Roll, pitch and yaw of the body in the world frame that replace the measured ones, rad;
-    None to keep a measured angle."""
+    """Roll, pitch and yaw of the body in the world frame that replace measured angles, rad; None to keep a measured
+    angle."""
     parent: str | None = None
-    """Name of the body in the stream that carries this one; None if it moves freely."""
+    """Name of the body in the stream that carries this object; None if the object moves freely."""
     at: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Position of the joint in the parent's tracked frame, m. (3,)"""
     length: float = setting(default=0.0, low=0.0)
