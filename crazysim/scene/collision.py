@@ -212,7 +212,7 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int 
         to_body = data.xmat[body].reshape(3, 3).T
         pos, rot = to_body @ (pos - data.xpos[body]), to_body @ rot
     rot = np.where(np.abs(rot) < 1e-12, 0.0, rot)
-    # The compiler stores attitudes as quaternions, whose rounding would turn axis-aligned boxes.
+    # The compiler stores attitudes as quaternions; their rounding would rotate axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
     return CollisionGeom(_read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]

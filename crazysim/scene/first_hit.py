@@ -1,7 +1,7 @@
 """The first geom that a ray meets: a function of one ray, for kernels of all rays and for stages of a step.
 
 Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, geoms of movable bodies and drones are in a
-second hierarchy, whose boxes are computed for each world.
+second hierarchy; its boxes are computed for each world.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 
 IGNORES_NONE, NOT_A_DRONE = -1, -2
-"""Drone index of rays that ignore no drone, and drone index of geoms that belong to no drone."""
+"""Drone index of rays that pass through no drone, and drone index of geoms that are not part of a drone."""
 
 DRONE_OFFSET = 1e4
 """Offset of the drones from the objects while the hierarchy of movable geoms is built, m. Drones then form a separate
@@ -75,7 +75,7 @@ class Hierarchy(NamedTuple):
     """Hierarchy of the geoms that do not move, as tables in memory."""
 
     codes: Array
-    """Index of the surface, and the drone that a geom belongs to. (n, 2)"""
+    """Index of the surface of each geom, and index of its drone or ``NOT_A_DRONE``. (n, 2)"""
     boxes: Array
     """Boxes of the nodes, one order after the other. (8 * n_nodes, 6)"""
     links: Array
@@ -90,7 +90,7 @@ class Tables(NamedTuple):
     counts: Array
     """Numbers of fixed nodes per order, of fixed geoms, of movable geoms, and of movable nodes per order. (1, 4)"""
     codes: Array
-    """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
+    """As in ``Hierarchy``, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
     """As in ``Hierarchy``, of the fixed geoms. (8 * n_nodes, 6)"""
     links: Array
@@ -140,7 +140,7 @@ class Targets:
         owners = [x.row if x.carrier == "drone" else NOT_A_DRONE for x in self.all_geoms]
         codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all_geoms, owners, strict=True)]
         self.codes = np.array(codes, np.int32).reshape(-1, 2)
-        """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
+        """Index of the surface of each geom, and index of its drone or ``NOT_A_DRONE``. (n, 2)"""
 
     def build_fixed_hierarchy(self, dtype: DTypeLike) -> Hierarchy:
         """Return the hierarchy of the fixed geoms; see ``build_hierarchy``."""
@@ -292,7 +292,7 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         n_pixels: Number of rays of a camera.
         n_cameras: Number of cameras of a world.
         index: Index of the ray; pixels of the first camera of the first world come first. ()
-        *tables: ``Tables``.
+        *tables: Fields of ``Tables``.
     """
     t = Tables(*tables)
     n_nodes, n_fixed, n_movable, n_movable_nodes = table_rows(t.counts, jnp.int32(0))
@@ -334,7 +334,7 @@ def normal_at_hit(
         n_pixels: Number of rays of a camera.
         n_cameras: Number of cameras of a world.
         index: Index of the ray, as in ``first_hit``. ()
-        *tables: ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
+        *tables: Fields of ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
     """
     t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
     _, n_fixed, n_movable, _ = table_rows(t.counts, jnp.int32(0))

@@ -11,7 +11,7 @@ from crazysim import rotation
 from crazysim.scene import mjx
 
 N_DUMMY_JOINTS = 1
-"""Number of joints in a scene without joints of its own: MJX requires one, which belongs to a body without geoms."""
+"""Number of joints that ``build_spec`` adds, with a body without geoms, because MJX requires a joint."""
 
 
 def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -97,7 +97,7 @@ def cast_rays(
     require_poses(model, [body.name for body in model.objects], mocap)
     data = with_mocap_bodies(model, data, mocap)
     if origin.ndim == 3:
-        # Each ray is a camera of one pixel, whose first axis is the direction of the ray.
+        # Each ray becomes a camera of one pixel; the camera's first axis is the direction of the ray.
         zero, ignored = (
             jnp.zeros((*direction.shape, 2), direction.dtype),
             IGNORES_NONE if ignored_drones is None else ignored_drones,

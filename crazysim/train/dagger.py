@@ -221,8 +221,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         means = reward.mean(axis=(1, 2)), error.mean(axis=(1, 2))
         return transition.extras, means, (terminated.sum(axis=1), done.sum(axis=1))
 
-    state, _, records = rollout(env, learner.env, policy, k_fly, config.n_steps, record_transition)
-    (raw_obs, labels, difference), (reward, error), (terminated, done) = records
+    state, _, history = rollout(env, learner.env, policy, k_fly, config.n_steps, record_transition)
+    (raw_obs, labels, difference), (reward, error), (terminated, done) = history
     update_agent = functools.partial(_update_agent, config=config)
     agents, finite = for_each_seed(update_agent, agents, raw_obs, labels, swept_values, k_learn, axes=(0, 1, 1, 0, 0))
     metrics = {
@@ -245,8 +245,8 @@ def imitate(
 ) -> Policy:
     """Train a student in an environment, with its wrappers and sensors, and return its policy.
 
-    The policy takes the observations of ``env``, so that ``evaluate(env, policy)``, ``film`` and, with
-    ``describe(env)``, the export work as for other policies.
+    The policy takes the observations of ``env``. It works with ``evaluate(env, policy)`` and ``film``, and can be
+    exported with ``describe(env)``.
 
     Args:
         env: Environment of the student without automatic resets.

@@ -141,7 +141,7 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         ``nonfinite``: fraction of worlds that became non-finite;
         ``length``: mean length of an episode, s;
         ``error``: mean error of the worlds that did not crash, in ``task.unit``, over the last ``task.hold`` seconds,
-        or at the end of the episode if the task defines ``succeeded``; NaN if all worlds crashed;
+        or at the end of the episode if the task defines ``succeeded``; NaN if there is none;
         ``reward``: mean return of an episode;
         ``reward NAME``: contribution of each term to the mean return.
     """

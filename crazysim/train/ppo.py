@@ -142,7 +142,7 @@ class Sample(PyTree):
     """Transitions of a rollout; leading axes (n_steps, n_worlds, n_drones)."""
 
     obs: Array
-    """Normalised observations; the policy's come first."""
+    """Normalised observations; those of the policy come first."""
     action: Array
     """Actions before clipping."""
     log_prob: Array

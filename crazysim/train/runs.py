@@ -69,8 +69,8 @@ def run(
         log: Function that is called with each line of output.
         progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
-        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name, or
-            None. After an evaluation it also gets the metrics of the evaluation, with names that begin with
+        on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
+            name. After an evaluation it also gets the metrics of the evaluation, with names that begin with
             ``"evaluation "``. Each call waits for the device.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options``, ``config``, ``network`` and ``devices`` of
             ``TrainConfig.create``.

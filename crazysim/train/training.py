@@ -125,8 +125,8 @@ def train_many(
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is also written between evaluations, s; None to write none.
-        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name, or
-            None. After an evaluation it also gets the metrics of the evaluation, with names that begin with
+        on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
+            name. After an evaluation it also gets the metrics of the evaluation, with names that begin with
             ``"evaluation "``. A metric is a number, or an array with one number for each training if there are several.
             Each call waits for the device.
 

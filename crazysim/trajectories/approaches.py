@@ -16,7 +16,8 @@ N_SPLITS = 4
 CELLS_PER_BATCH = 500_000
 """Largest number of cells that are examined at once; it bounds the memory."""
 MAX_TABLE_CELLS = 4_000_000
-"""Largest size of a table with the motion of every drone in every cell. Otherwise motion is computed for each pair."""
+"""Largest number of cells of all drones for which the motion of each drone is tabulated; otherwise it is computed for
+each pair."""
 MIN_CELL_DURATION = 1e-6
 """Length below which the search ends, s. Only cells in which a position jumps become so short."""
 
@@ -26,7 +27,7 @@ class Approach:
     """Closest approach of two drones."""
 
     drones: tuple[int, int]
-    """Numbers of the drones, ascending."""
+    """Indices of the drones, ascending."""
     distance: float
     """Distance between their positions, m."""
     time: float
@@ -44,7 +45,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
 
     Args:
         pieces: Trajectories.
-        tolerance: Largest error of a distance, m. It is never too small, since it is evaluated at ``time``.
+        tolerance: Largest error of a distance, m. Distances are never too small: they are evaluated at ``time``.
     """
     n = pieces.n_drones
     first, second = np.triu_indices(n, 1)
@@ -76,7 +77,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
 
 
 class _Motion:
-    """Motion of single drones in cells: positions at both ends, derivatives in the middle, and a bound of the rest."""
+    """Motion of single drones in cells: positions at both ends, derivatives in the middle, and a bound."""
 
     def __init__(self, pieces: PieceTable) -> None:
         self.pieces = pieces
@@ -100,7 +101,7 @@ class _Motion:
     ) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3), and a bound (...), per cell.
 
-        The bound limits the deviation from the chord, less the part due to acceleration and jerk in the middle, m.
+        The bound, m, is for the deviation from the chord without the part due to acceleration and jerk in the middle.
         """
         if motion_table is not None:
             return tuple(x[drone, cell] for x in motion_table)

@@ -198,7 +198,7 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
     h = duration / n
     knots = np.linspace(0.0, duration, n + 1)
     # Derivatives with respect to u = t / h, divided by k!: at the start they are the first four coefficients, at the
-    # end they give four conditions for the others.
+    # end they give four conditions for the other coefficients.
     knot_coefficients = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
     binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
     end_residuals = knot_coefficients[1:] - knot_coefficients[:-1] @ binomials[:, :4].T

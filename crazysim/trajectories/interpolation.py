@@ -83,7 +83,7 @@ def cost_matrices(durations: Floats, order: int) -> Floats:
 def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
 
-    Each axis is solved separately, since its free derivatives may differ from the other axes'. Times are scaled by the
+    Each axis is solved separately, since different derivatives may be free on each axis. Times are scaled by the
     mean duration. A Cholesky factorisation needs no further scaling: its error does not depend on the scaling of rows
     and columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
 

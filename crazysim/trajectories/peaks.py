@@ -15,7 +15,8 @@ from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 N_INTERVALS = 64
 """Number of sampling intervals per piece."""
 REFINED_PART = 0.05
-"""Fraction of the range of a drone's samples: local maxima at most this much below its largest sample are refined."""
+"""Local maxima are refined if they are at most this fraction of the range of a drone's samples below its largest
+sample."""
 N_SECTIONS = 40
 """Number of golden sections. They shorten two sampling intervals to about 1e-10 of a piece."""
 BATCH_SIZES = (64, 4096)
@@ -124,11 +125,11 @@ def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
     low = np.minimum.reduceat(samples.min(axis=1), table.first_pieces)
     piece, sample = _find_candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
 
-    def value(u: Floats) -> Floats:
+    def signed_value(u: Floats) -> Floats:
         return quantity.sign * quantity.compute(*(table.evaluate_pieces(piece, u, k) for k in quantity.orders))
 
     refined_value, best_u = _golden_sections(
-        value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0)
+        signed_value, np.maximum(u[sample] - u[1], 0.0), np.minimum(u[sample] + u[1], 1.0)
     )
     is_better = refined_value > samples[piece, sample]
     best_value = np.where(is_better, refined_value, samples[piece, sample])
@@ -140,14 +141,14 @@ def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
 
 
 def _find_candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
-    """Return piece and sample of each local maximum at or above its piece's threshold. A plateau gives one."""
+    """Return piece and sample of each local maximum at or above its piece's threshold; one for a plateau. (n,) each"""
     padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
 
 
 def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the maximum of a function in each interval, with a single local maximum, and its argument. (n,) each"""
+    """Return the maximum of a function in each interval, and its argument; expects one local maximum. (n,) each"""
     ratio = (np.sqrt(5) - 1) / 2
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     left_value, right_value = function(left), function(right)

@@ -80,10 +80,8 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
     checked_limits = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
-    extremes = find_peaks(table, tuple(checked_limits))
-    excesses = {
-        name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked_limits.items()
-    }
+    peaks = find_peaks(table, tuple(checked_limits))
+    excesses = {name: QUANTITIES[name].sign * (peaks[name].value[0] - limit) for name, limit in checked_limits.items()}
     margins = {
         name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked_limits
     }

@@ -19,8 +19,8 @@ from crazysim.trajectories.splines import require_finite, trajectory_from_unit_p
 from crazysim.trajectories.trajectory import Trajectory
 
 YAW_ORDER = 2
-"""Order of the yaw derivative that is minimised (the integral of its square): the torque depends on the second
-(Mellinger and Kumar 2011)."""
+"""Order of the yaw derivative in the cost of the yaw. The torque depends on the second derivative (Mellinger and Kumar
+2011)."""
 
 
 def minimum_snap(
@@ -52,8 +52,8 @@ def minimum_snap(
             all segments, or one per segment. None for no corridors. () or (n - 1,)
         velocities: Velocities at the waypoints, world frame, m/s, NaN where free. None for rest at both ends and free
             elsewhere. (n, 3)
-        accelerations: Accelerations, likewise, m/s^2. (n, 3)
-        jerks: Jerks, likewise, m/s^3. (n, 3)
+        accelerations: Accelerations, m/s^2; NaN and None as for ``velocities``. (n, 3)
+        jerks: Jerks, m/s^3; NaN and None as for ``velocities``. (n, 3)
 
     Raises:
         ConfigError: If the waypoints cannot be flown within the limits or corridors.
@@ -94,7 +94,7 @@ def minimum_jerk(
 def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Trajectory, Array]:
     """Return the trajectory through waypoints with the smallest integral of a squared derivative, and this integral.
 
-    For order 4 it is the trajectory of ``minimum_snap``, for order 3 that of ``minimum_jerk``: at rest at both ends,
+    Order 4 gives the trajectory of ``minimum_snap``, and order 3 of ``minimum_jerk``: at rest at both ends,
     without limits or corridors, and with zero yaw. It has gradients with respect to waypoints and durations, and works
     in ``jax.jit`` and ``jax.vmap``. Nothing is checked. In float32, up to about ten pieces whose durations vary by less
     than a factor of five are accurate to 1e-3 of the distances; use float64 for more.
