@@ -325,9 +325,7 @@ def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:
 
 
 def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return smoothed accelerations without gravity, angular accelerations, velocities, all in the body frame, and
-    thrusts.
-    """
+    """Return smoothed accelerations without gravity, angular accelerations and velocities, body frame, and thrusts."""
     interior = slice(10, -10)
     acc = np.gradient(_smooth_columns(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
     ang_acc = np.gradient(_smooth_columns(log.ang_vel), log.t, axis=0)
