@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control import Control, Setpoint
-from crazysim.core.data import SimData, SimState
+from crazysim.core.data import SimData, SimState, as_key
 from crazysim.core.functional import stage_command
 from crazysim.core.settings import positive_integer
 from crazysim.core.stage import Stage
@@ -20,9 +20,10 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
+from crazysim.tables import read_floats
 
 CostFn = Callable[[SimState, Setpoint, Array], Array]
 """Function ``(states, setpoint, command)`` of one drone, at one time, that returns the cost of a control step. ()"""
@@ -143,9 +144,12 @@ class MPPI:
         self.substeps, self.knots = positive_integer("substeps", substeps), positive_integer("knots", knots)
         if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
             raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon of at least 2, got {knots} and {horizon}")
-        if not 0 < temperature < np.inf:
+        is_number = isinstance(temperature, (int, float, np.number)) and not isinstance(temperature, bool)
+        if not is_number or not 0 < temperature < np.inf:
             raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
-        self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
+        if not callable(cost):
+            raise ConfigError(f"expected cost as a function, got {short_repr(cost)}. Use tracking_cost.")
+        self.temperature, self.cost, self._key = temperature, cost, as_key(seed)
         freq = c.freq if freq is None else positive_integer("freq", freq)
         self._sim = Sim(
             sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
@@ -156,7 +160,7 @@ class MPPI:
         self.period = self.substeps / freq
         """Time from one command to the next, s."""
         self.hover, self.low, self.high, default = _command_range(sim)
-        self.noise = default if noise is None else np.asarray(noise, float_dtype())
+        self.noise = default if noise is None else read_floats("noise", noise).astype(float_dtype())
         if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
             raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {

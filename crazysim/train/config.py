@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -245,6 +246,9 @@ class TrainConfig:
             if algorithm in (None, resumed.algorithm):
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
+        for name, value in (("options", options), ("config", config)):
+            if not isinstance(value, (Mapping, type(None))):
+                raise ConfigError(f"expected {name} as a dict of values by name, got {short_repr(value)}")
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())

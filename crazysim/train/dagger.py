@@ -261,6 +261,8 @@ def imitate(
         ConfigError: If a hyperparameter is unknown or invalid.
         DivergedError: If weights or losses become non-finite.
     """
+    if not isinstance(config, (Mapping, type(None))):
+        raise ConfigError(f"expected config as a dict of values by name, got {config!r}")
     names = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
     if unknown := [name for name in config or {} if name not in names]:
         raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(unknown)}; use {', '.join(names)}")

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError, RenderError
+from crazysim.errors import ConfigError, RenderError, short_repr
 from crazysim.train.config import TrainConfig
 from crazysim.train.convolution import find_images
 from crazysim.train.hosts import is_first_host
@@ -198,6 +198,13 @@ def make_variants(
         ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
             is not one of ``SWEEPABLE`` or is also in ``config``.
     """
+    _require_iterable("seeds", seeds)
+    if not isinstance(sweep, Mapping):
+        raise ConfigError(
+            f"expected sweep as a dict of values by name, got {short_repr(sweep)}. Use {{'clip': [0.1, 0.2]}}."
+        )
+    for name, values in sweep.items():
+        _require_iterable(name, values)
     values_by_name: dict[str, list[Any]] = {"seeds": list(seeds)} | {
         name: list(values) for name, values in sweep.items()
     }
@@ -289,3 +296,11 @@ def _stored_config(folder: Path) -> TrainConfig:
             f"--seeds and --sweep."
         )
     return configs[""]
+
+
+def _require_iterable(name: str, values: object) -> None:
+    """Check that an argument is a list of values, or another iterable."""
+    if not isinstance(values, Iterable) or isinstance(values, str):
+        raise ConfigError(
+            f"expected {name} as a list of values, got {short_repr(values)}. Use [{values!r}], for example."
+        )

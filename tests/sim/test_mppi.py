@@ -122,6 +122,10 @@ WRONG_SETTINGS = {
     "temperature": (lambda sim: MPPI(sim, temperature=0.0), "temperature"),
     "endless temperature": (lambda sim: MPPI(sim, temperature=np.inf), "temperature"),
     "noise": (lambda sim: MPPI(sim, noise=[1.0, 2.0]), "noise"),
+    "text as temperature": (lambda sim: MPPI(sim, temperature="a"), "temperature"),
+    "text as noise": (lambda sim: MPPI(sim, noise="a"), "noise"),
+    "no cost": (lambda sim: MPPI(sim, cost=None), "cost as a function"),
+    "text as seed": (lambda sim: MPPI(sim, seed="a"), "as seed, got 'a'"),
     "endless noise": (lambda sim: MPPI(sim, noise=[np.inf] * 4), "noise"),
 }
 

@@ -228,3 +228,17 @@ def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):
     with pytest.raises(ConfigError, match="expected at least one value of seeds, and each once, got none"):
         make_variants([], {}, {})
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: make_variants(5, {}, {}), "seeds as a list of values, got 5"),
+        (lambda: make_variants([1], 5, {}), "sweep as a dict"),
+        (lambda: make_variants([1], {"learning_rate": 1e-3}, {}), "learning_rate as a list of values"),
+        (lambda: run_many("hover", config=[1]), "config as a dict"),
+    ],
+)
+def test_seeds_sweeps_and_configs_of_a_wrong_kind_are_refused(call, message):
+    with pytest.raises(ConfigError, match=message):
+        call()
