@@ -529,6 +529,12 @@ FIGURES: dict[str, Figure] = {
         gpu="flight_stack.py --worlds 4194304 --cases rod cable offset",
         table=tables.costs,
     ),
+    "path-errors": Figure(
+        PAGE,
+        ("crazysim/core/integration.py", "crazysim/plugins/vehicles", "crazysim/trajectories"),
+        cpu="vehicles.py --errors",
+        table=tables.path_errors,
+    ),
     "vehicles": Figure(PAGE, (*STEP, "crazysim/plugins/vehicles"), gpu="vehicles.py", table=tables.vehicles),
     "fleets": Figure(
         "docs/guides/fleets.md",

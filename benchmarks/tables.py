@@ -37,7 +37,7 @@ def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def columns(**getters: Callable[[Line], str]) -> Callable[[list[Line]], str]:
     """Return a function that makes a table with a row for each line. Underscores in names become spaces in headings."""
-    head = [name.replace("_", " ") for name in getters]
+    head = [name if name.startswith("`") else name.replace("_", " ") for name in getters]
     return lambda lines: markdown_table(head, [[get(line) for get in getters.values()] for line in lines])
 
 
@@ -209,6 +209,13 @@ fleets = columns(
     Rate_of_the_drones=lambda x: f"{round_digits(x['ratio'], 2):g}",
 )
 vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si_text(x["steps_per_s"]))
+path_errors = columns(
+    Controller=lambda x: f"`{x['controller']}`",
+    **{
+        f"`{vehicle}`": lambda x, v=vehicle: f"{', '.join(f'{100 * e:.1f}' for e in x['errors'][v])} cm"
+        for vehicle in ("f1tenth_ros", "aiml_head")
+    },
+)
 commands = columns(
     Samples=lambda x: f"{x['samples']:,}",
     Commands_per_second=lambda x: si_text(x["commands_per_s"]),

@@ -1,9 +1,13 @@
 """Steps of cars per second: under commands, along paths, with trailers, and beside a drone.
 
     python benchmarks/vehicles.py [--device gpu] [--worlds 1048576] [--cases drive kinematic path] [--steps 20]
+    python benchmarks/vehicles.py --errors
 
 ``alone`` is true if the pipeline of the case has no stages of drones. Cars drive on circles all the time. If they stop
 or leave their circles, the script ends with an error.
+
+With ``--errors`` it prints the largest distances of cars from a figure eight of 6 m by 2 m in one round instead, by
+controller, vehicle and largest speed of the path. Cars start at the speed of the path.
 """
 
 from __future__ import annotations
@@ -15,8 +19,8 @@ import numpy as np
 from measure import engine_name, medians, report, round_digits, seconds
 
 from crazysim import Sim
-from crazysim.plugins.vehicles import Cars, PathLQR, PurePursuit, Stanley
-from crazysim.trajectories import circle
+from crazysim.plugins.vehicles import LPV, Cars, PathController, PathLQR, PurePursuit, Stanley
+from crazysim.trajectories import circle, figure_eight
 
 DEFAULT_WORLDS = {"cpu": 16384, "gpu": 1048576}
 """Default number of worlds on each platform."""
@@ -31,6 +35,10 @@ CASES: dict[str, dict[str, Any]] = {
     "beside_drone": {},
 }
 """Settings of the cars in each case."""
+WIDTH, DEPTH = 6.0, 2.0
+"""Size of the figure eight for errors, m."""
+SPEEDS = (1.2, 1.9, 3.0)
+"""Largest speeds along the figure eight, m/s."""
 
 
 def main() -> None:
@@ -42,7 +50,12 @@ def main() -> None:
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--steps", type=int, default=100, help="physics steps of a call")
     parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--errors", action="store_true", help="measure errors of path controllers instead of rates")
     args = parser.parse_args()
+    if args.errors:
+        for controller in (PurePursuit(), Stanley(), LPV(), PathLQR()):
+            measure_errors(controller, args.device)
+        return
     for case in args.cases:
         measure(case, args)
 
@@ -84,6 +97,35 @@ def measure(case: str, args: argparse.Namespace) -> None:
         compile_s=round(compile_s, 2),
         steps_per_s=round_digits(n_worlds * args.cars * args.steps / step_s),
     )
+
+
+def measure_errors(controller: PathController, device: str) -> None:
+    """Print the errors of one controller."""
+    errors = {
+        vehicle: [round(largest_error(controller, vehicle, speed, device), 4) for speed in SPEEDS]
+        for vehicle in ("f1tenth_ros", "aiml_head")
+    }
+    report(device, benchmark="path_errors", controller=type(controller).__name__, speeds=SPEEDS, errors=errors)
+
+
+def largest_error(controller: PathController, vehicle: str, speed: float, device: str) -> float:
+    """Return the largest distance of a car from the figure eight in one round, m."""
+    path = figure_eight(WIDTH, DEPTH, speed=speed, height=0.0)
+    sim = Sim(control="rotor_vel", device=device)
+    cars = sim.add(Cars(path=path, vehicle=vehicle, controller=controller, in_scene=False))
+    car = cars.read(sim.data)
+    moving = car.replace(
+        body_vel=car.body_vel.at[..., 0].set(speed)
+    )  # the path starts in its middle, the fastest point
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {cars.name: moving})
+    phase = np.linspace(0.0, 2 * np.pi, 20001)
+    points = np.stack([WIDTH / 2 * np.sin(phase), DEPTH / 2 * np.sin(2 * phase)], axis=-1)
+    distances = []
+    for _ in range(round(path.duration * sim.freq / 10)):
+        sim.step(10)
+        pos = np.asarray(cars.read(sim.data).pos)[0, 0, :2]
+        distances.append(np.linalg.norm(points - pos, axis=-1).min())
+    return float(max(distances))
 
 
 if __name__ == "__main__":

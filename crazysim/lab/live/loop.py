@@ -177,7 +177,7 @@ class Live(Interaction, Closeable):
 
         Args:
             process: Function; must not wait. If it has a method ``reset(live)``, this is called after a reset or a jump
-                backwards.
+                backwards. If it has a method ``compile(live)``, ``run`` calls this before the clock starts.
             freq: Rate of the calls in simulated time, Hz, a divisor of the rate of control steps; None for every
                 control step.
             name: Name in messages; None for the name of the function.
@@ -190,8 +190,8 @@ class Live(Interaction, Closeable):
             raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
         label = str(name or getattr(process, "__name__", type(process).__name__))
         period = steps_per_call(freq, self.control_freq, label)
-        reset = getattr(process, "reset", lambda _: None)
-        self._processes.append(Process(label, partial(process, self), partial(reset, self), period, on_error))
+        reset, compile_fn = (partial(getattr(process, x, lambda _: None), self) for x in ("reset", "compile"))
+        self._processes.append(Process(label, partial(process, self), reset, compile_fn, period, on_error))
         return self._processes[-1]
 
     def call_at(self, time: float, callback: Callable[[Live], object], name: str | None = None) -> None:
@@ -378,6 +378,8 @@ class Live(Interaction, Closeable):
         """Compile the functions of a control step before the clock starts."""
         self._commands.stage()
         compile_step(self.sim, self.n_substeps)
+        for process in self._processes:
+            process.compile()
         self._viewers.update(self)
         self._viewers.next_picture_time = perf_counter()
 

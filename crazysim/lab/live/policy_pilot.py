@@ -81,12 +81,16 @@ class PolicyPilot:
             self.goals[:] = self._points[0]
             self._start_data = self._set_goal_fn(self._start_data, self.goals)
         env.sim.data = self._start_data
-        self._command_fn(self._start_data, self._memory)  # compile before the clock starts
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
         live.add(self, name="policy")
         live.on_click, live.goals = self.click, self.goals
+
+    def compile(self, live: Live) -> None:
+        """Compile the policy for the data of the loop and for a memory that the policy has returned."""
+        _, memory = self._command_fn(live.sim.data, self._memory)
+        self._command_fn(live.sim.data, memory)
 
     def __call__(self, live: Live) -> None:
         """Write the command of this control step."""

@@ -49,6 +49,8 @@ class Process:
     """The function; it must return at once, as the loop waits for it."""
     reset: Callable[[], object]
     """Function that is called after a reset or a jump in time."""
+    compile: Callable[[], object]
+    """Function that is called before the clock starts, to compile what ``callback`` uses."""
     period: int
     """Control steps from one call to the next."""
     on_error: OnError = "raise"

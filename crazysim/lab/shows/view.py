@@ -196,6 +196,10 @@ class ShowLights:
         """
         self._lights, self._n_drones = show.lights, show.n_drones
 
+    def compile(self, live: Live) -> None:
+        """Compile the evaluation of the colours."""
+        self._lights.colors([live.time])
+
     def __call__(self, live: Live) -> None:
         """Set the colours at the present time, equal in all worlds."""
         live.lights[:, : self._n_drones] = self._lights.colors([live.time])[0]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from live_loops import no_compilation
 from policies import save_steering, steer
 
 from crazysim.__main__ import main
@@ -51,6 +52,12 @@ def test_a_policy_flies_as_in_its_environment(env, live_and_pilot):
         state = step(state)
     live.run(1.0)
     np.testing.assert_allclose(read_positions(live), state.data.states.pos[:, 0], atol=1e-5)
+
+
+def test_a_policy_is_compiled_before_the_clock_starts(live_and_pilot, caplog):
+    live, _ = live_and_pilot
+    with no_compilation(live, caplog):
+        live.run(0.2)
 
 
 def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(live_and_pilot, caplog):

@@ -150,6 +150,10 @@ class Swarm(Closeable):
         self.update()
         live.lights[0] = self.colors
 
+    def compile(self, live: Live) -> None:
+        """Compile a control step."""
+        self.compile_step()
+
     def run_in(self, live: Live) -> None:
         """Make ``advance`` and ``sleep`` run a live loop, at its speed and with its viewers."""
         self._check_loop(live)
@@ -202,6 +206,7 @@ class Swarm(Closeable):
         """Compile a control step before programs wait for answers, as compilation takes longer than their timeouts."""
         with self.lock:
             compile_step(self.sim, self._n_substeps)
+            self._read_states()
 
     def start(self, speed: float = 1.0) -> Swarm:
         """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm."""
