@@ -1,4 +1,4 @@
-"""A drone simulator in which thousands of worlds advance in one call."""
+"""A drone simulator in which millions of worlds advance in one call."""
 
 from typing import TYPE_CHECKING
 
