@@ -39,7 +39,7 @@ MAX_UNROLLED_GEOMS = 16
 """Largest number of fixed geoms of one shape whose distances are computed one by one."""
 MAX_LISTED_GEOMS = 64
 """Largest number of fixed geoms of one shape in a body whose distances are all computed for one drone; more geoms are
-searched in a hierarchy."""
+searched in a bounding volume hierarchy."""
 DRONES_PER_CHUNK = 64
 """Number of drones whose distances to all other drones of their world are computed at a time."""
 
@@ -66,7 +66,7 @@ class ContactReport(PyTree):
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Index of the nearest other drone; its own for a single drone. None in a stage of one drone. (n_worlds,
+    """Index of the nearest other drone; 0 if there is only one drone. None in a stage of one drone. (n_worlds,
     n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
@@ -107,7 +107,8 @@ def build_contact_fn(
         floor: True to report the floor.
         drones: True to report other drones. With data of one drone this works only in a stage, and ``nearest_drone``
             is None.
-        plugins: Function that returns the plugins of the simulation, whose objects are moved first.
+        plugins: Function that returns the plugins of the simulation. Their objects are moved before distances are
+            computed.
     """
     floor, drones = check_flag("floor", floor), check_flag("drones", drones)
     bodies = select_bodies(model, objects, require_data=False)
@@ -330,7 +331,7 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
     offset, half = bounding_box(geoms.shape)
     halves = np.broadcast_to(half, (n, 3)) if geoms.box_sizes is None else geoms.box_sizes
     middles = geoms.pos + (offset if geoms.rot is None else geoms.rot @ offset)
-    reaches = halves if geoms.rot is None else np.einsum("nij,nj->ni", np.abs(geoms.rot), halves)
+    aligned_halves = halves if geoms.rot is None else np.einsum("nij,nj->ni", np.abs(geoms.rot), halves)
     columns = [geoms.pos, halves, *([] if geoms.rot is None else [geoms.rot.reshape(n, 9)])]
     table = jnp.asarray(np.concatenate(columns, axis=1), dtype)
 
@@ -342,8 +343,8 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
 
     fixed_pos, fixed_rot = jax.lax.stop_gradient((part_pos, drone_rot))
     index = nearest_geom(
-        np.asarray(middles - reaches),
-        np.asarray(middles + reaches),
+        np.asarray(middles - aligned_halves),
+        np.asarray(middles + aligned_halves),
         list(components(part_pos)),
         float(np.linalg.norm(bounding_box(part.shape)[1])) if part.shape.kind != "sphere" else part.shape.size[0],
         lambda k: distance_to_row(table_rows(table, k), fixed_pos, fixed_rot),
@@ -424,11 +425,11 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
         gaps = []
         for part, part_pos, is_present in parts:
             chunk_pos = jnp.take(part_pos, chunk, axis=-2)[..., :, None, :]
-            for geom, other, other_present in parts:
+            for geom, other_pos, other_present in parts:
                 are_present = None
                 if is_present is not None and other_present is not None:
                     are_present = jnp.take(is_present, chunk, axis=-1)[..., :, None] & other_present[..., None, :]
-                offset = chunk_pos - other[..., None, :, :]
+                offset = chunk_pos - other_pos[..., None, :, :]
                 if drone_rot is None:
                     gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, offset, jnp.eye(3))))
                     continue

@@ -38,7 +38,8 @@ Along = Literal["axis", "ray"]
 """Direction of distances: along the axis of the camera, or along the ray."""
 
 BYTES_PER_RAY = 16
-"""Lower bound of the memory of a ray, bytes: distance and index of the geom, and a pixel of each, four bytes each."""
+"""Lower bound of the memory of a ray, bytes: distance and index of the geom, once per ray and once in the image, four
+bytes each."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
     Args:
         model: Compiled scene.
         name: Name or id.
-        objects: Bodies with poses in ``data.objects``, then bodies that are moved through ``mjx_data``.
+        objects: Names of bodies with poses in ``data.objects``, then of bodies that are moved through ``mjx_data``.
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     if isinstance(name, (int, np.integer)) and 0 <= name < model.ncam:
@@ -200,12 +201,12 @@ def build_depth_fn(
     The images have shape (n_worlds, n_cameras, height, width), or without n_worlds in a function of one world.
 
     Args:
-        model: Visual model of the scene.
+        model: Geoms of the scene that cameras see.
         cameras: The cameras.
         rays: Unit directions of the pixels of each camera, as from ``pixel_directions``. (height, width, 3) each
         drones: True for drones to be visible.
         hide_own: True for a drone to be invisible to its own camera.
-        along: ``"axis"`` or ``"ray"``.
+        along: Direction of distances; see ``Along``.
         plugins: Function that returns the plugins of the simulation.
         kernels: Kernels that cast the rays if possible.
     """
@@ -216,6 +217,7 @@ def build_depth_fn(
     tile_height, tile_width = (math.gcd(n, TILE_SIDE) for n in (height, width))
     tile_shape = height // tile_height, tile_height, width // tile_width, tile_width
     tile_order = np.arange(height * width).reshape(tile_shape).swapaxes(1, 2).reshape(-1)
+    # Unit direction of each pixel, tile by tile, and index of the drone that its ray passes through.
     directions = np.zeros((len(cameras), height * width, 4))
     for camera, pixels, pixel_rows in zip(cameras, rays, directions, strict=True):
         pixel_rows[:, :3] = pixels.reshape(-1, 3)[tile_order]

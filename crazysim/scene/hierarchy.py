@@ -65,8 +65,8 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     n = len(geoms)
     if n == 1:
         return node
-    order = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
-    lows, highs = low[geoms][order], high[geoms][order]  # (n, 3, 3): position, axis of the order, component
+    ranking = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
+    lows, highs = low[geoms][ranking], high[geoms][ranking]  # (n, 3, 3): rank, axis of the ranking, component
 
     def half_surface_areas(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(high - low, -1, 0)
@@ -79,9 +79,9 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     min_count = n // 8
     cost = cost[min_count : n - 1 - min_count]
     split, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    halves = np.split(geoms[order[:, axis]], [int(split) + min_count + 1])
+    parts = np.split(geoms[ranking[:, axis]], [int(split) + min_count + 1])
     node.axis, node.geom = int(axis), -1
-    node.children = _build_tree(low, high, halves[0]), _build_tree(low, high, halves[1])
+    node.children = _build_tree(low, high, parts[0]), _build_tree(low, high, parts[1])
     return node
 
 

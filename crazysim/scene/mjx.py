@@ -1,4 +1,4 @@
-"""MJX, imported on first use, since only contact slots, ``mjx_model`` and ``mjx_data`` need it.
+"""MJX, imported on first use, since only its contact slots, ``mjx_model`` and ``mjx_data`` need it.
 
 MJX is imported without NVIDIA Warp: nothing here runs MJX on Warp, and the import of Warp would take two more seconds.
 A program that runs MJX on Warp must import ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls

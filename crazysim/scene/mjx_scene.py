@@ -35,7 +35,7 @@ class MjxScene:
         self._mj_model, self._n_worlds, self._device, self._mesh = mj_model, n_worlds, device, mesh
         self._model: mjx.Model | None = None
         self._data: mjx.Data | None = None
-        self._default_fields: tuple[NDArray, ...] | None = None
+        self._initial_poses: tuple[NDArray, ...] | None = None
         self._is_synced = False
 
     @property
@@ -70,7 +70,7 @@ class MjxScene:
         return self._data is not None
 
     def sync(self, data: SimData) -> SimData:
-        """Bring all worlds up to date, and return the data with ``core.mjx_synced`` set."""
+        """Copy the poses in the data of all worlds into MJX, and return the data with ``core.mjx_synced`` set."""
         is_first, self._is_synced = not self._is_synced, True
         with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if is_first else nullcontext():
             data, self._data = sync_sim2mjx(data, self.data, self.model)
@@ -90,16 +90,19 @@ class MjxScene:
             if worlds is None:
                 return pos, quat, qpos
             return fetch_rows(pos, worlds), fetch_rows(quat, worlds), fetch_rows(qpos, worlds)
-        if self._default_fields is None:
+        if self._initial_poses is None:
             initial_data = mujoco.MjData(self._mj_model)
             defaults = (initial_data.mocap_pos, initial_data.mocap_quat, self._mj_model.qpos0)
-            self._default_fields = tuple(np.array(x) for x in defaults)
+            self._initial_poses = tuple(np.array(x) for x in defaults)
         rows = slice(None) if worlds is None else worlds
-        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._default_fields)
+        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._initial_poses)
         return pos, quat, qpos
 
     def contacts(self, body: str | None) -> Array:
-        """Return True for every contact slot, of one body or of all, that touched at the last sync.
+        """Return True for every contact slot of MJX that touched at the last sync.
+
+        Args:
+            body: Name of the body whose slots are returned; None for all bodies.
 
         Returns:
             (n_worlds, n_slots), bool

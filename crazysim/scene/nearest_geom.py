@@ -18,7 +18,8 @@ def nearest_geom(
 ) -> Array:
     """Return the index of the geom with the smallest distance, int32, without a derivative. ()
 
-    Nodes are visited in one order. If the box of a node is no nearer than the best geom so far, its subtree is skipped.
+    Nodes are visited in depth-first order. If the box of a node is no nearer than the best geom so far, its
+    subtree is skipped.
 
     Args:
         low: Lower corners of boxes around the geoms, m. (n, 3)
@@ -54,6 +55,6 @@ def nearest_geom(
 def _box_distance(low: Sequence[Array], high: Sequence[Array], point: Sequence[Array]) -> Array:
     """Return the signed distance from a point to a box along the axes, m. ()"""
     gaps = [jnp.maximum(a - p, p - b) for a, b, p in zip(low, high, point, strict=True)]
-    face = jnp.maximum(jnp.maximum(gaps[0], gaps[1]), gaps[2])
+    max_gap = jnp.maximum(jnp.maximum(gaps[0], gaps[1]), gaps[2])
     outside = safe_sqrt(sum(jnp.maximum(gap, 0.0) ** 2 for gap in gaps))  # type: ignore[arg-type]
-    return jnp.where(face > 0, outside, face)
+    return jnp.where(max_gap > 0, outside, max_gap)

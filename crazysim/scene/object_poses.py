@@ -14,7 +14,12 @@ ListPlugins = Callable[[], Iterable[Plugin]]
 
 
 def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plugin]:
-    """Return the plugin that moves each object, by the name of the object; only objects that a plugin moves."""
+    """Return a dict from the name of each object that a plugin moves to that plugin.
+
+    Args:
+        plugins: Plugins of the simulation.
+        names: Names of objects, ``KIND:NUMBER``.
+    """
     owners = {}
     for plugin in plugins:
         kinds = plugin.moved_kinds
@@ -35,8 +40,8 @@ def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
     if data.states.pos.ndim == 1:
         name, plugin = next(iter(plugins.items()))
         raise ConfigError(
-            f"expected the data of a world, got those of one drone, from which the pose of {name!r}, an object of "
-            f"plugin {plugin.name!r}, does not follow. Declare the stage @stage('world'), or leave the object out with "
+            f"expected the data of a world, got the data of one drone, which do not determine the pose of {name!r}, an "
+            f"object of plugin {plugin.name!r}. Declare the stage @stage('world'), or leave the object out with "
             f"objects=."
         )
     for plugin in dict.fromkeys(plugins.values()):

@@ -73,8 +73,8 @@ class Handle:
             pos: Positions of the bodies' frames, world frame, m. None keeps them. (3,), (n, 3) or (n_worlds, n, 3)
             quat: Attitudes, body to world, xyzw, which are normalised. None keeps them. (4,), (n, 4) or (n_worlds, n,
                 4)
-            vel: Velocities for contact response, world frame, m/s; they do not move the objects. None sets zero if
-                ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
+            vel: Velocities for contact response, world frame, m/s; they do not move the objects. None sets them to
+                zero if ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         objects = self._objects(data)
@@ -163,7 +163,7 @@ class SceneSnapshot(NamedTuple):
     handles: list[Handle]
     """Handles of all objects."""
     initial_poses: list[tuple[NDArray, NDArray]]
-    """Initial poses of the movable objects."""
+    """Initial positions, m, and attitudes, xyzw, of the objects of each movable handle. (n_worlds, n, ...) each"""
 
 
 class SceneObjects:
@@ -237,7 +237,7 @@ class SceneObjects:
         return bool(added)
 
     def build_record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
-        """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects.
+        """Return the record of the movable objects: poses of an earlier record, then initial poses of newer objects.
 
         Args:
             previous: Earlier record, or None.
@@ -258,7 +258,7 @@ class SceneObjects:
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
-    """Return the elements that attached specs add, in the order of deletion: bodies before what they use."""
+    """Return the elements that attached specs add, in the order of deletion: bodies before the assets that they use."""
     return spec.worldbody.bodies, spec.materials, spec.textures, spec.meshes, spec.hfields
 
 

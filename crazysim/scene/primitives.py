@@ -1,4 +1,4 @@
-"""Primitive objects: a gate, a box, a sphere, a pole, a cylinder, a wall, a landing pad."""
+"""Primitive objects: a gate, a box, a sphere, a pole, a cylinder, a wall, a landing pad. All lengths are in metres."""
 
 from __future__ import annotations
 

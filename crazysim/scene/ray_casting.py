@@ -160,7 +160,7 @@ def _hit_bodies(
         geoms: Geoms of each body, in its frame.
         pos: Positions of all movable bodies, m. (..., n, 3)
         quat: Attitudes of all movable bodies, xyzw. (..., n, 4)
-        group: Row in ``pos`` and ``Hits.body_index`` of each body with these geoms. (k, 2)
+        group: For each body with these geoms, its row in ``pos`` and its index in ``Hits.names``. (k, 2)
         origin: Origins of the rays. (..., n_rays, 3)
         direction: Directions of the rays. (..., n_rays, 3)
         ignored_rows: Row of the body that a ray passes through. (n_rays,)
@@ -303,7 +303,8 @@ def cast_rays_in_worlds(
     Args:
         model: Model, without bodies whose poses are not part of the data.
         data: Simulation, for the poses of objects and drones.
-        camera_poses: Position, m, and axes by rows, of the cameras, world frame. (n_worlds, n_cameras, 12)
+        camera_poses: Position of each camera, m, and the matrix with its axes as columns, row by row; world frame.
+            (n_worlds, n_cameras, 12)
         pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
         drones: True for rays to meet drones.
@@ -388,6 +389,8 @@ class RayKernels:
 
     def node_boxes(self, targets: Targets, leaf_boxes: Array) -> tuple[Array, np.ndarray]:
         """Return the boxes of the nodes of the movable geoms in every world, (n_worlds, n_nodes, 6), and their links.
+
+        The nodes and links are those of ``Targets.movable_nodes``.
 
         Args:
             targets: The geoms.

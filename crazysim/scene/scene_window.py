@@ -40,8 +40,8 @@ class SceneWindow:
         self._model = model
         self._glfw = glfw = _load_glfw()
         # One thread cannot use an EGL context, for images in memory, together with a context of another kind.
-        egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
-        glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
+        uses_egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
+        glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if uses_egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
         glfw.window_hint(glfw.SAMPLES, model.vis.quality.offsamples)
         with warnings.catch_warnings(action="ignore"):  # the error below replaces GLFW's warning
@@ -61,7 +61,8 @@ class SceneWindow:
         self.on_key: Callable[[str, bool], None] | None = None
         """Function that is called with the name of a key, and True when it is pressed, False when it is released."""
         self.on_drawn: Callable[[mujoco.MjrRect, mujoco.MjrContext], None] | None = None
-        """Function that draws over the finished image, with its rectangle, pixels."""
+        """Function that draws over the finished image. It is called with the rectangle of the image, pixels, and the
+        context of the window."""
         self._names = {getattr(glfw, f"KEY_{key}"): name for key, name in KEY_NAMES.items()}
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_cursor_pos_callback(self._window, self._on_move)
@@ -102,12 +103,12 @@ class SceneWindow:
             glfw.set_window_size(self._window, width, height)
         glfw.poll_events()
         glfw.make_context_current(self._window)
-        for k, pixels in enumerate(self._tiles(n)):
+        for k, rectangle in enumerate(self._tile_rectangles(n)):
             data, overlays = tile(k)
             self._update_scene(data)
             overlays.write(self._scene)
-            mujoco.mjr_render(pixels, self._scene, self._context)
-            overlays.write_text(pixels, self._context)
+            mujoco.mjr_render(rectangle, self._scene, self._context)
+            overlays.write_text(rectangle, self._context)
         if self.on_drawn is not None:
             self.on_drawn(mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window)), self._context)
         glfw.swap_buffers(self._window)
@@ -137,7 +138,7 @@ class SceneWindow:
         """
         size = self._glfw.get_framebuffer_size(self._window)
         x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]
-        for k, r in enumerate(self._tiles(n)):
+        for k, r in enumerate(self._tile_rectangles(n)):
             position = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
             if not all(0 <= part < 1 for part in position):
                 continue
@@ -157,7 +158,7 @@ class SceneWindow:
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
 
-    def _tiles(self, n: int) -> list[mujoco.MjrRect]:
+    def _tile_rectangles(self, n: int) -> list[mujoco.MjrRect]:
         """Return the rectangles of n tiles, row by row from the top left, pixels."""
         width, height = self._glfw.get_framebuffer_size(self._window)
         columns = int(np.ceil(np.sqrt(n)))

@@ -106,7 +106,7 @@ def spherical_harmonics(direction: Any, n: int) -> list[Any]:
     """
     x, y, z = (direction[..., k] for k in range(3))
     xx, yy, zz = x * x, y * y, z * z
-    bands = [
+    terms = [  # pi times the square of the factor, and the polynomial, of each harmonic
         (1 / 4, 1 + 0 * x),
         (3 / 4, -y), (3 / 4, z), (3 / 4, -x),
         (15 / 4, x * y), (15 / 4, -y * z), (5 / 16, 2 * zz - xx - yy), (15 / 4, -x * z), (15 / 16, xx - yy),
@@ -114,7 +114,7 @@ def spherical_harmonics(direction: Any, n: int) -> list[Any]:
         (7 / 16, z * (2 * zz - 3 * xx - 3 * yy)), (21 / 32, -x * (4 * zz - xx - yy)), (105 / 16, z * (xx - yy)),
         (35 / 32, -x * (xx - 3 * yy)),
     ]  # fmt: skip
-    return [float(np.sqrt(square / np.pi)) * polynomial for square, polynomial in bands[:n]]
+    return [float(np.sqrt(square / np.pi)) * polynomial for square, polynomial in terms[:n]]
 
 
 def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
@@ -150,8 +150,8 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
     is_invalid |= ~values["quat"].any(axis=1)
     if is_invalid.any():
         raise ConfigError(
-            f"expected finite Gaussians with rotations, got {int(is_invalid.sum())} of {n} without in {str(path)!r}. "
-            f"Drop them."
+            f"expected finite Gaussians with non-zero quaternions, got others in {int(is_invalid.sum())} of {n} in "
+            f"{str(path)!r}. Drop them."
         )
     return values
 

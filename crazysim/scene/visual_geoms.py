@@ -65,9 +65,9 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualG
     pos, quat = np.zeros(3), np.zeros(4)
     geom_quat = np.zeros(4)
     mujoco.mju_mat2Quat(geom_quat, data.geom_xmat[geom])
-    inverse, inverse_pos = np.zeros(4), np.zeros(3)
-    mujoco.mju_negPose(inverse_pos, inverse, data.xpos[body], data.xquat[body])
-    mujoco.mju_mulPose(pos, quat, inverse_pos, inverse, data.geom_xpos[geom], geom_quat)
+    inverse_quat, inverse_pos = np.zeros(4), np.zeros(3)
+    mujoco.mju_negPose(inverse_pos, inverse_quat, data.xpos[body], data.xquat[body])
+    mujoco.mju_mulPose(pos, quat, inverse_pos, inverse_quat, data.geom_xpos[geom], geom_quat)
     vertices, faces = _mesh_arrays(model, geom)
     return VisualGeom(
         kind=_geom_kind(model, geom),
@@ -82,7 +82,10 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualG
 
 
 def _geom_color(model: mujoco.MjModel, geom: int) -> NDArray:
-    """Return the colour of a geom, or of its material multiplied by the mean colour of the texture. (4,)"""
+    """Return the colour of a geom, RGBA. (4,)
+
+    For a geom of the default colour it is the colour of the material times the mean colour of the texture.
+    """
     material = int(model.geom_matid[geom])
     if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
         return model.geom_rgba[geom].astype(float)
@@ -100,8 +103,8 @@ def _mesh_arrays(model: mujoco.MjModel, geom: int) -> tuple[NDArray, NDArray]:
     if _geom_kind(model, geom) != "mesh":
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     mesh = int(model.geom_dataid[geom])
-    vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+    first_vertex, first_face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
     return (
-        model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].astype(float),
-        model.mesh_face[face : face + model.mesh_facenum[mesh]].astype(int),
+        model.mesh_vert[first_vertex : first_vertex + model.mesh_vertnum[mesh]].astype(float),
+        model.mesh_face[first_face : first_face + model.mesh_facenum[mesh]].astype(int),
     )

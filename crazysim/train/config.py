@@ -282,7 +282,7 @@ class TrainConfig:
 
         Args:
             n_worlds: Number of worlds; None for the number of the run.
-            **defaults: Options of ``crazysim.envs.make`` for those that the run does not set.
+            **defaults: Options of ``crazysim.envs.make``; options of the run take precedence.
 
         Raises:
             ConfigError: If the task is in a file that this user has not named before; see ``load_policy``.

@@ -23,6 +23,7 @@ Devices = str | int | Sequence[int]
 ``"2"`` and ``"0,2,3"``."""
 
 
+# Patterns of the text of a compiled program, for ``exchanged_bytes``.
 _COLLECTIVE_PATTERN = re.compile(
     r" = (.*?) (all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast)(-start)?\("
 )
@@ -101,7 +102,7 @@ def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, An
 
 
 def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
-    """Return the sharding of every array of a learner, as a learner.
+    """Return a learner with the sharding of every array in place of the array.
 
     Arrays over worlds are split. Networks, optimisers and statistics are split over the seeds if the number of seeds is
     a multiple of the number of devices: each device then trains its own seeds. Otherwise they are replicated.

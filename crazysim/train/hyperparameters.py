@@ -23,7 +23,7 @@ LIMIT_NAMES = ("max_grad_norm",)
 COUNT_NAMES = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
-"""Allowed words of the hyperparameters that are words, by name."""
+"""Allowed values of the hyperparameters that are a choice of words, by name."""
 
 
 def check_hyperparameters(config: Any) -> None:

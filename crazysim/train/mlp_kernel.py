@@ -8,9 +8,9 @@ Tensor cores compute the products, with operands of 16 bits and sums of 32 bits.
 precision, as in TF32, which XLA uses on the same GPUs, but a smaller range. Weights, normalised observations
 and activations are within this range; gradients of the outputs are scaled such that the largest is between 1 and 2.
 
-Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a sum of 16 x 8 numbers,
-lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two sums, rounded to 16 bits, form a left operand of the
-next product.
+Lanes of a warp hold operands as in the PTX manual, "Matrix Fragments for mma.m16n8k16": of a product of 16 x 8
+numbers, lane 4 g + t has columns 2 t and 2 t + 1 of rows g and g + 8. Two such products, rounded to 16 bits, form a
+left operand of the next product.
 """
 
 from __future__ import annotations
@@ -408,8 +408,8 @@ def _launch(is_gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> A
     """
     (n_seeds, n, _), sizes = x.shape, _layer_sizes(layers)
     source, shared_bytes = cuda_source(sizes, is_gradient)
-    n_warps, n_resident = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
-    n_blocks = min(-(-n_resident * MULTIPROCESSORS // n_seeds), -(-n // (16 * n_warps)))
+    n_warps, blocks_per_multiprocessor = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
+    n_blocks = min(-(-blocks_per_multiprocessor * MULTIPROCESSORS // n_seeds), -(-n // (16 * n_warps)))
     shape = (n_blocks, sum(x.size for x in jax.tree.leaves(layers)) // n_seeds) if is_gradient else (n, sizes[-1])
     result = jax.ShapeDtypeStruct((n_seeds, *shape), np.float32)
     arrays = [np.asarray([n], np.int32), x, *cotangent, *jax.tree.leaves(layers)]

@@ -53,8 +53,8 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
         fn: Function that takes the arguments of one seed.
         args: Arguments of all seeds: pytrees whose arrays are stacked along an axis of seeds.
         axes: Index of this axis: one for all arguments, or one for each.
-        mesh: Devices that compute their own seeds each. XLA distributes the computation if it is None, or if the number
-            of seeds is not a multiple of the number of devices.
+        mesh: Devices, each of which computes its own seeds. XLA distributes the computation if it is None, or if the
+            number of seeds is not a multiple of the number of devices.
     """
     axes = (axes,) * len(args) if isinstance(axes, int) else axes
     n_seeds = jax.tree.leaves(args[0])[0].shape[axes[0]]

@@ -83,14 +83,16 @@ class _Motion:
         self.pieces = pieces
         snap = pieces.derivative_coefficients(4)[:, :3]
         control_points = snap @ bernstein_matrix(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
+        # Sum over each piece and all before it of the largest snap in a piece.
         self.summed_snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
-        summed_jumps = np.zeros((4, len(pieces.drone)))
+        # Jumps of the derivatives of orders 0 to 3 from the previous piece to each piece.
+        jumps = np.zeros((4, len(pieces.drone)))
         piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
         for order in range(4):
             end_values = pieces.evaluate_pieces(piece, np.ones(len(piece)), order)
             start_values = pieces.evaluate_pieces(piece + 1, np.zeros(len(piece)), order)
-            summed_jumps[order, piece + 1] = np.linalg.norm((start_values - end_values)[:, :3], axis=-1)
-        self.summed_jumps = np.cumsum(summed_jumps, axis=1)
+            jumps[order, piece + 1] = np.linalg.norm((start_values - end_values)[:, :3], axis=-1)
+        self.summed_jumps = np.cumsum(jumps, axis=1)
 
     def tabulate(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
         """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
@@ -101,7 +103,7 @@ class _Motion:
     ) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3), and a bound (...), per cell.
 
-        The bound, m, is for the deviation from the chord without the part due to acceleration and jerk in the middle.
+        The bound, m, is for the part of the deviation from the chord that is due to snap and jumps.
         """
         if motion_table is not None:
             return tuple(x[drone, cell] for x in motion_table)

@@ -130,11 +130,12 @@ def helix(
     w = 2 * np.pi / _resolve_period(period, speed, math.hypot(2 * np.pi * radius, climb))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:
-        angle = w * t + order * np.pi / 2
-        progress = (w * t if order == 0 else np.full_like(t, w)) if order < 2 else np.zeros_like(t)
-        z, yaw = climb / (2 * np.pi) * progress + (height if order == 0 else 0.0), progress * along
-        yaw = yaw + np.pi / 2 * (along and order == 0)
-        return np.stack([radius * w**order * np.cos(angle), radius * w**order * np.sin(angle), z, yaw], axis=-1)
+        shifted_angle = w * t + order * np.pi / 2  # each derivative of a sine or cosine adds a quarter turn
+        angle_derivative = (w * t if order == 0 else np.full_like(t, w)) if order < 2 else np.zeros_like(t)
+        z = climb / (2 * np.pi) * angle_derivative + (height if order == 0 else 0.0)
+        yaw = angle_derivative * along + np.pi / 2 * (along and order == 0)
+        x, y = radius * w**order * np.cos(shifted_angle), radius * w**order * np.sin(shifted_angle)
+        return np.stack([x, y, z, yaw], axis=-1)
 
     return fit_curve(curve, 2 * np.pi / w * turns, abs(float(radius)) * w**8)
 

@@ -1,11 +1,11 @@
 """Piecewise polynomials through waypoints that minimise the integral of a squared derivative, in float64 on the host.
 
-A piece of degree 2k - 1 is determined by the values of its first k derivatives, the zeroth included, at both ends
-(Hermite form). The integral of the squared k-th derivative is then a quadratic form of the derivatives at the
-waypoints, its matrix is banded, and its minimum over the free derivatives needs one Cholesky factorisation (Bry,
-Richter, Bachrach and Roy, "Aggressive flight of fixed-wing and quadrotor aircraft in dense indoor environments", IJRR
-2015, section 5). Continuity up to derivative k - 1 holds by construction; at the minimum, derivatives up to 2k - 2 are
-continuous wherever derivative k - 1 and those below are free.
+This integral, of the squared k-th derivative, is called the cost. A piece of degree 2k - 1 is determined by the values
+of its first k derivatives, the zeroth included, at both ends (Hermite form). The cost is then a quadratic form of the
+derivatives at the waypoints, its matrix is banded, and its minimum over the free derivatives needs one Cholesky
+factorisation (Bry, Richter, Bachrach and Roy, "Aggressive flight of fixed-wing and quadrotor aircraft in dense indoor
+environments", IJRR 2015, section 5). Continuity up to derivative k - 1 holds by construction; at the minimum,
+derivatives up to 2k - 2 are continuous wherever derivative k - 1 and those below are free.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _exact_basis(order: int) -> list[list[Fraction]]:
 
 @functools.cache
 def unit_cost(order: int) -> Floats:
-    """Return the matrix of the integral over [0, 1] of the squared k-th derivative, in Hermite form. (2k, 2k)"""
+    """Return the matrix of the cost of a piece on [0, 1], a quadratic form of its end derivatives. (2k, 2k)"""
     k, size = order, 2 * order
     basis = np.array(_exact_basis(order), dtype=object)
     monomials = np.full((size, size), Fraction(0), dtype=object)
@@ -69,7 +69,7 @@ def unit_cost(order: int) -> Floats:
     return (basis.T @ monomials @ basis).astype(float)
 
 
-def _exponents(order: int) -> NDArray[np.int64]:
+def _duration_exponents(order: int) -> NDArray[np.int64]:
     """Return the exponents of the duration in the factors that scale ``unit_cost``. (2k, 2k)"""
     j = np.tile(np.arange(order), 2)
     return 1 - 2 * order + j[:, None] + j
@@ -77,11 +77,11 @@ def _exponents(order: int) -> NDArray[np.int64]:
 
 def cost_matrices(durations: Floats, order: int) -> Floats:
     """Return the matrix of the cost of each piece, for derivatives with respect to time. (n_pieces, 2k, 2k)"""
-    return unit_cost(order) * durations[:, None, None] ** _exponents(order)
+    return unit_cost(order) * durations[:, None, None] ** _duration_exponents(order)
 
 
 def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
-    """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
+    """Return the derivatives at all waypoints that minimise the cost.
 
     Each axis is solved separately, since different derivatives may be free on each axis. Times are scaled by the
     mean duration. A Cholesky factorisation needs no further scaling: its error does not depend on the scaling of rows
@@ -134,7 +134,7 @@ def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:
 
 
 def derivative_cost(nodes: Floats, durations: Floats) -> float:
-    """Return the integral of the squared k-th derivative, summed over the axes."""
+    """Return the cost: the integral of the squared k-th derivative, summed over the axes."""
     ends = end_derivatives(nodes)
     return float(np.einsum("pia,pij,pja->", ends, cost_matrices(durations, nodes.shape[1]), ends))
 
@@ -149,7 +149,7 @@ def cost_gradient(nodes: Floats, durations: Floats) -> Floats:
         durations: Length of each piece, s. (n_pieces,)
     """
     order = nodes.shape[1]
-    slopes = cost_matrices(durations, order) * _exponents(order) / durations[:, None, None]
+    slopes = cost_matrices(durations, order) * _duration_exponents(order) / durations[:, None, None]
     ends = end_derivatives(nodes)
     return np.einsum("pia,pij,pja->p", ends, slopes, ends)
 

@@ -1,4 +1,4 @@
-"""Limits of single trajectories and of several flown together, and a check against these limits."""
+"""Limits of trajectories that one or several drones fly, and a check against these limits."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Violation:
     limit: str
     """Name of the limit, a field of ``Limits``."""
     drones: tuple[int, ...]
-    """Number of the drone, or of both drones of a pair."""
+    """Index of the drone, or indices of both drones of a pair."""
     time: float
     """Time at which the limit is exceeded most, s."""
     value: float
@@ -155,15 +155,15 @@ class Report:
 
 
 def require_limits(limits: Limits) -> None:
-    """Check that an argument is a record of limits."""
+    """Check that an argument is a ``Limits``."""
     if not isinstance(limits, Limits):
         raise ConfigError(
             f"expected limits as Limits, got {short_repr(limits)}. Use Limits(speed=...), or Limits() for none."
         )
 
 
-def limit_size(name: str, limit: float) -> float:
-    """Return the size of a limit for relative tolerances; for a height it is at least 1 m."""
+def tolerance_scale(name: str, limit: float) -> float:
+    """Return the factor of relative tolerances: the absolute value of a limit, at least 1 m for a height."""
     return max(abs(limit), 1.0) if QUANTITIES[name].orders == (0,) else abs(limit)
 
 
@@ -183,8 +183,8 @@ def check(
     flatness).
 
     Args:
-        trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis. One
-            trajectory with several ``starts`` is flown by as many drones.
+        trajectories: One trajectory, or one for each drone: a sequence, or a ``Trajectory`` with one leading axis.
+            One trajectory with several ``starts`` is flown by as many drones.
         limits: Limits.
         airframe: Airframe that provides the thrust limits that ``limits`` leaves None; None for no such limits.
         starts: Start of each drone, s, as in ``Follow``; negative if it began before time zero. () or (n_drones,)
@@ -212,7 +212,7 @@ def check(
         if name not in limit_values:
             continue
         limit, sign = limit_values[name], QUANTITIES[name].sign
-        for k in np.flatnonzero(sign * (peak.value - limit) > LIMIT_TOLERANCE * limit_size(name, limit)):
+        for k in np.flatnonzero(sign * (peak.value - limit) > LIMIT_TOLERANCE * tolerance_scale(name, limit)):
             violations.append(
                 Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
             )

@@ -24,9 +24,9 @@ class PieceTable:
     """Pieces of several trajectories on a common clock, sorted by drone and time."""
 
     duration: float
-    """Duration, s."""
+    """Duration of all trajectories together, from time zero, s."""
     drone: Ints
-    """Drone of each piece. (n_pieces,)"""
+    """Index of the drone of each piece. (n_pieces,)"""
     start: Floats
     """Start of each piece, s. (n_pieces,)"""
     length: Floats
@@ -75,7 +75,7 @@ class PieceTable:
 
     @functools.cached_property
     def first_pieces(self) -> Ints:
-        """First piece of each drone. (n_drones,)"""
+        """Index of the first piece of each drone. (n_drones,)"""
         return np.searchsorted(self.drone, np.arange(self.n_drones))
 
     @functools.cached_property
@@ -98,7 +98,7 @@ class PieceTable:
         return self._derivatives[order]
 
     def find_pieces(self, drone: Ints, t: NDArray) -> Ints:
-        """Return the piece that contains each drone's time; the later piece where two pieces meet. (...)"""
+        """Return the index of the piece that contains each drone's time; where two pieces meet, the later one. (...)"""
         t = np.clip(t, 0.0, self.duration)
         index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
         return np.maximum(index, self.first_pieces[drone])

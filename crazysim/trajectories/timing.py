@@ -1,4 +1,7 @@
-"""Durations of the pieces of a trajectory: the cost determines their ratios, the limits their sum."""
+"""Durations of the pieces of a trajectory: the cost determines their ratios, the limits their sum.
+
+The cost is the integral of a squared derivative, as in ``interpolation``.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.corridors import OutsideError
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits, limit_size
+from crazysim.trajectories.limits import Limits, tolerance_scale
 from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
 
@@ -40,8 +43,8 @@ def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
 def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
     """Return the durations that minimise the cost for the same total duration, s. (n_pieces,)
 
-    A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``),
-    finds a local minimum.
+    A quasi-Newton method over the logarithms of the ratios to the total duration, with the exact gradient
+    (``interpolation.cost_gradient``), finds a local minimum.
 
     Args:
         nodes: Derivatives at each waypoint, NaN where free. (n_pieces + 1, k, 3)
@@ -51,12 +54,12 @@ def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
 
     total = float(np.sum(durations))
 
-    def durations_at_ratios(ratios: Floats) -> Floats:
-        weights = np.exp(ratios - np.max(ratios))
+    def durations_from_logarithms(log_ratios: Floats) -> Floats:
+        weights = np.exp(log_ratios - np.max(log_ratios))
         return total * weights / np.sum(weights)
 
-    def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
-        trial_durations = durations_at_ratios(ratios)
+    def logarithm_of_cost(log_ratios: Floats) -> tuple[float, Floats]:
+        trial_durations = durations_from_logarithms(log_ratios)
         filled_nodes = interpolation.fill_derivatives(nodes, trial_durations)
         cost = interpolation.derivative_cost(filled_nodes, trial_durations)
         slope = interpolation.cost_gradient(filled_nodes, trial_durations) * trial_durations
@@ -65,7 +68,7 @@ def optimal_durations(nodes: Floats, durations: Floats) -> Floats:
     if len(durations) == 1:
         return durations
     result = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
-    return durations_at_ratios(result.x)
+    return durations_from_logarithms(result.x)
 
 
 def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
@@ -79,13 +82,16 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
     """
     checked_limits = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
-    table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
+    drone = np.zeros(len(ends), int)  # all pieces belong to one drone
+    table = PieceTable(float(ends[-1]), drone, ends - durations, durations, coefficients)
     peaks = find_peaks(table, tuple(checked_limits))
     excesses = {name: QUANTITIES[name].sign * (peaks[name].value[0] - limit) for name, limit in checked_limits.items()}
     margins = {
         name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked_limits
     }
-    return [name for name, limit in checked_limits.items() if excesses[name] > margins[name] * limit_size(name, limit)]
+    return [
+        name for name, limit in checked_limits.items() if excesses[name] > margins[name] * tolerance_scale(name, limit)
+    ]
 
 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:

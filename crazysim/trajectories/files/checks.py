@@ -20,7 +20,7 @@ MAX_TIME = 7200.0
 MIN_LENGTH = 1e-3
 """Shortest piece, s: the resolution of Skybrush and of the Crazyflie's compressed trajectories."""
 MAX_COORDINATE = 1e5
-"""Largest coordinate, m, and largest yaw, degrees."""
+"""Largest magnitude of a coordinate, m, and of a yaw in the unit of its file."""
 
 
 def raise_error(expected: str, got: str, location: str) -> NoReturn:
@@ -88,7 +88,7 @@ def require_text(value: object, location: str, n_max: int = 200) -> str:
 
 
 def require_numbers(value: object, lengths: Sequence[int], bound: float, location: str) -> NDArray:
-    """Return a value that must be an array of finite numbers up to ``bound`` in size, of one of the ``lengths``."""
+    """Return a value that must be an array with one of the ``lengths``, of numbers from ``-bound`` to ``bound``."""
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:

@@ -31,7 +31,8 @@ DURATION_UNIT = 1e-3
 MAX_PIECE_DURATION = 65.0
 """Longest compressed piece, s: durations have 16 bits."""
 STORED_DEGREES = (0, 1, 3, 7)
-"""Degree of an axis for each two-bit code, and number of stored control points: all except the first."""
+"""Degree of an axis for each two-bit code. It equals the number of stored control points: a piece does not store its
+first control point, which is the last one of the previous piece."""
 AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
 """Units of compressed x, y, z, m, and yaw, rad. (4,)"""
 
@@ -93,7 +94,7 @@ def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
 
 
 def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return what ``trajectory_pieces`` returns, after a check that the degree is at most 7."""
+    """Return ends and coefficients as ``trajectory_pieces``, after a check that the degree is at most 7."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
@@ -127,8 +128,8 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
     require_no_jumps(ends, c)
     ends, c = split_pieces(ends, c, np.arange(MAX_PIECE_DURATION, ends[-1], MAX_PIECE_DURATION))
     c = c / AXIS_UNITS[:, None]
-    end_ticks = np.round(ends / DURATION_UNIT).astype(int)
-    durations = np.diff(end_ticks, prepend=0)
+    end_units = np.round(ends / DURATION_UNIT).astype(int)
+    durations = np.diff(end_units, prepend=0)
     if not np.all(durations > 0):
         raise ConfigError(f"expected pieces of at least 1 ms, got {int(durations.min())} ms. Merge shorter pieces.")
     content = bytearray(_pack_shorts(c[0, :, 0]))

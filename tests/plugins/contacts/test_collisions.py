@@ -321,7 +321,7 @@ def test_a_report_in_a_stage_needs_a_world():
     sim.data = with_load(load, sim.data, pos=sim.data.states.pos)
     contacts = sim.scene.contact_fn(floor=False, drones=False)
     assert np.asarray(jax.jit(contacts)(sim.data).objects)[0, 0, 0]
-    with pytest.raises(ConfigError, match="expected the data of a world, got those of one drone"):
+    with pytest.raises(ConfigError, match="expected the data of a world, got the data of one drone"):
         contacts(sim.data.replace(states=jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)))
 
 
