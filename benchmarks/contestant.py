@@ -142,7 +142,7 @@ class Gradient:
 class GymSteps:
     """Steps of a Gymnasium vector environment in which drones reach a position.
 
-    Drone, dynamics model, rates and autoreset are the same in both programs.
+    Drone, dynamics model (``so_rpy``), rates and autoreset are the same in both programs.
     """
 
     def __init__(self, package: str, case: dict[str, Any], device: str):
@@ -235,7 +235,7 @@ class SceneQuery:
     """Scene query after a step, timed without the step, or the construction of a swarm."""
 
     def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
-        """Build the scene and query it once."""
+        """Build the scene, and measure its queries for the first time, which compiles them."""
         self._module, self._case, self._device = importlib.import_module(f"{package}.sim"), case, device
         self._task, self._sim = task, None
         if task != "swarm_build":

@@ -2,14 +2,14 @@
 
     python benchmarks/controllers.py [--controllers auto indi ...] [--drones cf21B_500 my_drone.toml ...] [--speed 2]
 
-- hover: from the floor to a height of 1 m, distance from the setpoint after 5 s, m
-- tracking: figure eight of 2 m with ``--speed`` in its middle, from a start on it, RMS distance over 9 s, m
-- pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later and largest distance, m
-- heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
+- hover: distance from the setpoint, at a height of 1 m, 5 s after the take-off from the floor, m
+- tracking: RMS distance over 9 s along a figure eight of 2 m, from a start on it, with ``--speed`` in its middle, m
+- pushed, pushed_largest: distance 5 s after a sideways force of a tenth of the weight sets in, and largest distance, m
+- heavier: distance after 5 s of hovering with 20% more mass, m
 - home: fraction of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
 - lost_178: height lost from rest at a roll of 178 degrees, m
-- overshoot_attitude, overshoot_body_rate: largest overshoot after the steps of ``COMMAND_STEPS``, over their size
-- error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size
+- overshoot_attitude, overshoot_body_rate: largest overshoot after the steps of ``COMMAND_STEPS``, fraction of a step
+- error_attitude, error_body_rate: largest error 2 s after these steps and later, fraction of a step
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; omitted with --worlds 0
 
 Without --drones, the airframes are all built-in airframes with rotors, and three generic airframes
@@ -152,9 +152,9 @@ def fly_airframes(
     device: str = "cpu",
 ) -> dict[str, dict[str, float]]:
     """Return the metrics of a controller by airframe. All fly at once: every world has one drone of each airframe."""
-    worlds, drones = FIRST_TUMBLING_WORLD + n_attitudes, len(airframes)
+    n_worlds, n_drones = FIRST_TUMBLING_WORLD + n_attitudes, len(airframes)
     controller = make_controller(name, speed)
-    sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
+    sim = Sim(n_worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
     path, states, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
     start_setpoint, rng = path.evaluate(jnp.float32(0)), np.random.default_rng(0)
 
@@ -165,13 +165,13 @@ def fly_airframes(
     pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start_setpoint.pos, start_setpoint.vel
     quat[INVERTED_WORLD] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
     quat[FIRST_TUMBLING_WORLD:], ang_vel[FIRST_TUMBLING_WORLD:] = (
-        rng.normal(size=(n_attitudes, drones, 4)),
-        rng.normal(size=(n_attitudes, drones, 3)),
+        rng.normal(size=(n_attitudes, n_drones, 4)),
+        rng.normal(size=(n_attitudes, n_drones, 3)),
     )
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     ang_vel[FIRST_TUMBLING_WORLD:] *= 5 / np.linalg.norm(ang_vel[FIRST_TUMBLING_WORLD:], axis=-1, keepdims=True)
-    mass = np.array(np.broadcast_to(params.mass, (worlds, drones, 1)))
-    force = np.zeros((worlds, drones, 3))
+    mass = np.array(np.broadcast_to(params.mass, (n_worlds, n_drones, 1)))
+    force = np.zeros((n_worlds, n_drones, 3))
     force[PUSHED_WORLD, :, 0] = 0.1 * 9.81 * mass[PUSHED_WORLD, :, 0]
     mass[HEAVY_WORLD] *= 1.2
 

@@ -2,7 +2,10 @@
 
 One JSON line for each number of poles, fixed and movable, with rates by wall time (median) and by processor time
 (least). To compare with another version, run this file alternately with and without the folder of that version in
-PYTHONPATH. With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
+PYTHONPATH.
+
+With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
+``fraction_that_meets`` is the fraction of the first four rays that meet something.
 
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
 """

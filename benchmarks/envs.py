@@ -3,11 +3,11 @@
     python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize] [--depth 16 12]
                               [--actions random policy bfloat16 training]
 
-An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
-contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
-``Randomize.crazyflie()`` are timed alternately. With ``--depth`` the policies also receive a depth image of each
-drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO. This includes
-rollout and updates, but no compilation or evaluation. Batches of training grow with the number of worlds.
+An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training. ``ended`` is
+the fraction of worlds whose episode ends per step; lines of ``training`` lack it. With ``--randomize`` the same
+rollouts with ``Randomize.crazyflie()`` are timed alternately. With ``--depth`` the policies also receive a depth image
+of each drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO. This
+includes rollout and updates, but no compilation or evaluation. Batches of training grow with the number of worlds.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def main() -> None:
     args = parser.parse_args()
     for task in args.tasks:
         for n_worlds in args.worlds or DEFAULT_WORLDS["cpu" if args.device == "cpu" else "gpu"]:
-            sizes = task, n_worlds, args.steps, args.device, args.repeats
-            report_rates(*sizes, args.randomize, args.depth, args.actions)
+            settings = task, n_worlds, args.steps, args.device, args.repeats
+            report_rates(*settings, args.randomize, args.depth, args.actions)
 
 
 def report_rates(
@@ -67,19 +67,23 @@ def report_rates(
     actions: Sequence[str],
 ) -> None:
     """Print the rates of rollouts and of training."""
-    base = envs.make(task, n_worlds, device=device)
-    env_by_drones = {"as the airframe": envs.AutoReset(base)}
+    base_env = envs.make(task, n_worlds, device=device)
+    env_by_drones = {"as the airframe": envs.AutoReset(base_env)}
     if randomize:
         randomized_env = envs.make(task, n_worlds, device=device, effects=[Randomize.crazyflie()])
         env_by_drones["randomized"] = envs.AutoReset(randomized_env)
-    env_device = base.sim.device
+    env_device = base_env.sim.device
     key = jax.device_put(jax.random.key(0), env_device)
-    starts = {drones: jax.jit(env.reset)(key) for drones, env in env_by_drones.items()}
-    n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (image_size[0] * image_size[1] if image_size else 0)
-    policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
+    start_states = {drones: jax.jit(env.reset)(key) for drones, env in env_by_drones.items()}
+    n_obs = flatten(start_states["as the airframe"].obs).shape[-1] + (
+        image_size[0] * image_size[1] if image_size else 0
+    )
+    policy = Policy(
+        RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base_env.actions.size), 0.01)
+    )
     policy = jax.device_put(policy, env_device)
 
-    shape = starts["as the airframe"].action.shape
+    shape = start_states["as the airframe"].action.shape
 
     def act_with_noise(policy: Policy) -> Any:
         return lambda obs, memory, key: (policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ())
@@ -89,7 +93,7 @@ def report_rates(
 
     def rollout_with_images(env: Any, state: Any, act: Any, key: Any) -> Any:
         """Return the results of a rollout of a policy that also receives depth images."""
-        render = base.sim.scene.depth_fn("fpv_cam", *image_size)  # type: ignore[misc]
+        render = base_env.sim.scene.depth_fn("fpv_cam", *image_size)  # type: ignore[misc]
 
         def step(state: Any, key: Any) -> Any:
             depth = jnp.minimum(render(state.data).distance, MAX_DEPTH)
@@ -125,7 +129,7 @@ def report_rates(
                 carry = ppo.init(env, (recipe,), key[None])
                 lowered = ppo.iterate.lower(carry, env, (recipe,))
             else:
-                carry = (starts[drones], jax.device_put(jax.random.key(2), env_device))
+                carry = (start_states[drones], jax.device_put(jax.random.key(2), env_device))
                 lowered = jit_rollout(env, act_functions[name]).lower(carry)
             start_time = time.perf_counter()
             run = lowered.compile()
@@ -155,9 +159,9 @@ def report_rates(
                 n_worlds=n_worlds,
                 n_steps=steps,
                 depth=image_size,
-                engine=engine_name(base.sim),
+                engine=engine_name(base_env.sim),
                 compile_s=round(compile_s[drones], 2),
-                env_steps_per_s=round_digits(n_worlds * base.sim.n_drones * steps / seconds),
+                env_steps_per_s=round_digits(n_worlds * base_env.sim.n_drones * steps / seconds),
                 **ended_entry,
             )
 

@@ -2,9 +2,9 @@
 
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
-The gradient is the gradient of the squared distances from the start after ``--steps`` steps, with respect to the
-commands. ``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode. ``forward_s``
-is the time of the distances alone. Calls alternate; on a GPU the calls of a batch are queued.
+The gradient is the gradient of the sum of squared distances from the start after ``--steps`` steps, with respect to
+the commands. ``jvp_s`` is the time of the sum and its derivative in one direction, in forward mode. ``forward_s`` is
+the time of the sum alone. Calls alternate; on a GPU the calls of a batch are queued.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
     hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
     cmd = jax.device_put(jnp.broadcast_to(1.01 * hover, (n_worlds, 1, hover.size)), sim.device)
 
-    def distance(cmd: jax.Array) -> jax.Array:
+    def squared_distance(cmd: jax.Array) -> jax.Array:
         final_data = step(stage_command(initial_data, cmd), n_steps, zeros)
         return jnp.sum((final_data.states.pos - initial_data.states.pos) ** 2)
 
     functions = {
-        "forward": jax.jit(distance),
-        "gradient": jax.jit(jax.grad(distance)),
-        "jvp": jax.jit(lambda cmd: jax.jvp(distance, (cmd,), (cmd,))),
+        "forward": jax.jit(squared_distance),
+        "gradient": jax.jit(jax.grad(squared_distance)),
+        "jvp": jax.jit(lambda cmd: jax.jvp(squared_distance, (cmd,), (cmd,))),
     }
     first_s = {name: seconds(fn, cmd, 1) for name, fn in functions.items()}
     batch = BATCH_CALLS["cpu" if args.device == "cpu" else "gpu"]

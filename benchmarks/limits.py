@@ -76,11 +76,11 @@ def measure(
     """Print lower bound and measured time of one case."""
     sim = Sim(n_worlds, control=control, integrator=integrator, device=args.device, engine=engine)
     flight = Flight(sim, control, n_steps, args.device)
-    measured = medians({"step": flight.seconds}, args.repeats)["step"]
+    measured_s = medians({"step": flight.seconds}, args.repeats)["step"]
     flight.require_flying()
     step_operations, call_operations, n_bytes = count_work(sim)
-    arithmetic = n_worlds * (step_operations * n_steps + call_operations) / machine.multiply_adds_per_s
-    memory = n_worlds * n_bytes / machine.bytes_per_s
+    arithmetic_s = n_worlds * (step_operations * n_steps + call_operations) / machine.multiply_adds_per_s
+    memory_s = n_worlds * n_bytes / machine.bytes_per_s
     report(
         args.device,
         benchmark="limits",
@@ -91,11 +91,11 @@ def measure(
         n_steps=n_steps,
         operations_a_step=round(step_operations),
         bytes_a_call=n_bytes,
-        arithmetic_s=round_digits(arithmetic),
-        memory_s=round_digits(memory),
-        floor_s=round_digits(max(arithmetic, memory)),
-        measured_s=round_digits(measured),
-        ratio=round(measured / max(arithmetic, memory), 2),
+        arithmetic_s=round_digits(arithmetic_s),
+        memory_s=round_digits(memory_s),
+        floor_s=round_digits(max(arithmetic_s, memory_s)),
+        measured_s=round_digits(measured_s),
+        ratio=round(measured_s / max(arithmetic_s, memory_s), 2),
         crazysim=__version__,
     )
 
@@ -120,10 +120,10 @@ def count_work(sim: Sim) -> tuple[float, float, int]:
         [program.check_segment.block] if program.check_segment else []
     )
     call_operations = sum(count_operations(block, when_rate) for block in blocks)
-    batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
-    sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in batched}
+    world_leaves = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
+    sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in world_leaves}
     read_bytes, written_bytes = (
-        sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read_leaves, program.written_leaves)
+        sum(sizes[i] for i in world_leaves if i in leaves) for leaves in (program.read_leaves, program.written_leaves)
     )
     return step_operations, call_operations, read_bytes + written_bytes
 

@@ -42,7 +42,9 @@ def columns(**getters: Callable[[Line], str]) -> Callable[[list[Line]], str]:
 
 
 LEVELS = {"rotor_vel": "rotor speeds", "attitude": "attitude", "state": "state"}
+"""Text of each command level."""
 INTEGRATORS = {"euler": "Euler", "rk4": "RK4"}
+"""Text of each integrator."""
 
 
 def case_text(line: Line) -> str:
@@ -124,8 +126,8 @@ def env_rates(lines: list[Line]) -> str:
 
     def row_of(line: Line) -> str:
         image = f", a depth image of {line['depth'][0]} x {line['depth'][1]}" if line["depth"] else ""
-        drawn = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
-        return f"`{line['task']}`, {names[line['actions']]}{image}{drawn}"
+        randomized = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
+        return f"`{line['task']}`, {names[line['actions']]}{image}{randomized}"
 
     return pivot(lines, row_of, worlds_text, lambda x: si_text(x["env_steps_per_s"]), "Environment steps/s, worlds")
 
@@ -185,7 +187,7 @@ range_finders = columns(
 
 
 def costs(lines: list[Line]) -> str:
-    """Return the times of cases relative to their references, and the rates of the cases."""
+    """Return the times of cases divided by the times of their references, and the rates of the cases."""
     return columns(
         Case=lambda x: f"`{x['case']}`",
         Time_over_reference=lambda x: f"{x['ratio']:.3g}",
@@ -216,11 +218,13 @@ path_errors = columns(
         for vehicle in ("f1tenth_ros", "aiml_head")
     },
 )
+"""Largest errors of each controller with two models of cars, one for each speed of ``vehicles.py --errors``."""
 commands = columns(
     Samples=lambda x: f"{x['samples']:,}",
     Commands_per_second=lambda x: si_text(x["commands_per_s"]),
     Compilation=lambda x: duration_text(x["compile_s"]),
 )
+"""Table of ``mppi.py``: commands that sampling MPC computes per second, by number of sampled rollouts."""
 live = columns(
     Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
     Times_real_time=lambda x: f"{x['factor']:g}",
@@ -233,6 +237,7 @@ mocap = columns(
     Update_of_the_simulation=lambda x: f"{x['update_ms']:g} ms",
     Lost_frames=lambda x: str(x["lost"]),
 )
+"""Table of ``mocap.py``. The rules of a frame decide which measured poses are used."""
 
 
 def first_results(lines: list[Line]) -> str:
@@ -255,7 +260,12 @@ def first_results(lines: list[Line]) -> str:
 
 
 def control(lines: list[Line]) -> str:
-    """Return the flights of all controllers with all airframes."""
+    """Return the flights of all controllers with all airframes.
+
+    The docstring of ``controllers.py`` defines the entries of a line, such as ``home`` and ``lost_178``, the height
+    that a drone loses from a roll of 178 degrees. A rate of ``levels`` means that the controller levels the drone
+    instead of following a command of body rates.
+    """
 
     def metres(value: float | None) -> str:
         return "" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"
@@ -264,13 +274,13 @@ def control(lines: list[Line]) -> str:
         return "" if value is None else "< 1%" if value < 0.01 else f"{value:.0%}"
 
     def row_of(line: Line) -> list[str]:
-        lost = line.get("lost_178")
+        lost_height = line.get("lost_178")
         rate = "levels" if line.get("error_body_rate", 0) > 0.5 else percent(line.get("overshoot_body_rate"))
         return [
             f"`\"{line['controller']}\"`", f"`{line['drone']}`",
             *(metres(line.get(key)) for key in ("hover", "tracking", "pushed", "heavier")),
             "" if "home" not in line else f"{line['home']:.0%}",
-            "" if lost is None else "all" if lost > 99 else f"{lost:.1f}",
+            "" if lost_height is None else "all" if lost_height > 99 else f"{lost_height:.1f}",
             percent(line.get("overshoot_attitude")), rate,
         ]  # fmt: skip
 
@@ -383,9 +393,10 @@ def readme(records: list[Line]) -> str:
 
 
 def devices(lines: list[Line]) -> str:
-    """Return rates by number of devices, their ratios, and bytes, memory and compile time for the largest number.
+    """Return rates by number of devices, and their ratios to the rate of one device.
 
-    If several hosts were measured, the last column of rates has their rates.
+    Exchanged bytes, memory and compile time are for the largest number of devices of one process. Rates of several
+    processes, such as one on each host, are in the last columns of rates.
     """
     cases: dict[str, dict[tuple[int, int], Line]] = {}
     for line in lines:

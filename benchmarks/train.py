@@ -57,7 +57,7 @@ PAGE = TABLE.with_suffix(".md")
 TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
 N_STARTS = 1000
 """Held-out starts of an evaluation of ``crazysim train``."""
-TABLE_COLUMNS = ("task", "seed", "success", "diverged", "crashed", "error", "seconds")
+PRINTED_ENTRIES = ("task", "seed", "success", "diverged", "crashed", "error", "seconds")
 """Entries of a result that are printed."""
 
 
@@ -191,7 +191,7 @@ def train_all(
                     )
                     with results_file.open("a") as file:
                         file.write(json.dumps(results[key]) + "\n")
-                    print(json.dumps({name: results[key][name] for name in TABLE_COLUMNS}), flush=True)
+                    print(json.dumps({name: results[key][name] for name in PRINTED_ENTRIES}), flush=True)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -218,8 +218,8 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
     seeds = ",".join(str(key[1]) for key in group)
     folder = run_folder(out, task, seeds, device, *arguments)
     sources_file = folder / "sources.txt"
-    is_same = sources_file.exists() and sources_file.read_text() == run_info["sources"]
-    if not is_same:
+    has_same_sources = sources_file.exists() and sources_file.read_text() == run_info["sources"]
+    if not has_same_sources:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         sources_file.write_text(run_info["sources"])
@@ -249,7 +249,7 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
 
 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve. Seconds are those of its process, for all its seeds.
+    """Return the results of one seed from its learning curve. Seconds are the time of its process for all seeds.
 
     Steps and seconds include the steps and seconds of a teacher that was trained first.
 
@@ -279,7 +279,7 @@ def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
 
 
 def make_row(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the row of a task: quantiles of the success over its seeds, and medians of error and time."""
+    """Return the row of a task: least, 10% quantile and median of the success over its seeds, median error and time."""
     success = [run["success"] for run in runs]
     errors = [run["error"] for run in runs if run["error"] is not None]
     row: dict[str, Any] = {name: runs[-1][name] for name in ("task", "algorithm")}

@@ -114,10 +114,10 @@ def largest_error(controller: PathController, vehicle: str, speed: float, device
     sim = Sim(control="rotor_vel", device=device)
     cars = sim.add(Cars(path=path, vehicle=vehicle, controller=controller, in_scene=False))
     car = cars.read(sim.data)
-    moving = car.replace(
+    moving_car = car.replace(
         body_vel=car.body_vel.at[..., 0].set(speed)
     )  # the path starts in its middle, the fastest point
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {cars.name: moving})
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {cars.name: moving_car})
     phase = np.linspace(0.0, 2 * np.pi, 20001)
     points = np.stack([WIDTH / 2 * np.sin(phase), DEPTH / 2 * np.sin(2 * phase)], axis=-1)
     distances = []

@@ -39,6 +39,7 @@ from measure import medians, round_digits
 
 FOLDER = Path(__file__).parent
 PEER_FOLDER = FOLDER.parent / ".cache" / "crazyflow"
+"""Virtual environment with Crazyflow, the peer, on a CPU."""
 CASES = ("first_step", "step", "loop", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 CONTROLLED_LEVELS = ("body_rate", "attitude", "state")

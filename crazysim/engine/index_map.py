@@ -114,7 +114,7 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
 
 
 def write_map(block: Block, target: str) -> Kernel:
-    """Return the kernel of a function of an index and tables for ``cuda`` or ``host``; each lane computes one index.
+    """Return the kernel of a function of an index and tables; each lane computes the results for one index.
 
     Args:
         block: The function: its inputs are the index and the tables, its outputs single numbers.

@@ -297,7 +297,7 @@ class Planner(NamedTuple):
         report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
     def _no_kernel_message(self, error: UnsupportedError) -> str:
-        """Return a message that names what has no kernel, and the stage, or all stages if the stage is not known."""
+        """Return a message that names the stage that has no kernel, or all stages if that stage is not known."""
         if error.stage:
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"

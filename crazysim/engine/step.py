@@ -256,7 +256,7 @@ class Step:
         return sorted({plan.engine for plan in self._plans.values()})
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
+        """Return the number of compiled programs, as for a jitted function, for the tests of law 6: no retrace."""
         count = jaxcompat.n_compilations
         called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans.values()]
         steps = [step for plan in self._plans.values() for step in (plan.traced_count_step, plan.static_count_step)]

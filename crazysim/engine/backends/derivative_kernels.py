@@ -25,7 +25,7 @@ from crazysim.engine.lowering.tangents import add_tangents
 from crazysim.errors import EngineWarning, warn
 
 Leaves = dict[int, Any]
-"""Arrays by leaf."""
+"""Arrays by the index of their leaf."""
 
 
 class DerivativeKernels:
@@ -43,7 +43,7 @@ class DerivativeKernels:
         self.descriptions: dict[str, None] = {}
         """Descriptions of how derivatives were computed so far, for ``explain``, as keys in order."""
         self.floats = tuple(i for i in program.written_leaves if program.leaves[i].number_type.kind == "f")
-        """Leaves that are written and have derivatives."""
+        """Indices of the written leaves that have derivatives."""
         self._programs: dict[Any, Any] = {}
         self._launches: dict[Any, Launch | None] = {}
 

@@ -144,22 +144,23 @@ class SharedMemory(UnsplitLane):
                 f"the {lanes} drones of a world read each other's numbers; on a GPU at most {MAX_THREADS} can"
             )
         self.lanes = lanes
-        self._records: dict[str, int] = {}
+        self._struct_numbers: dict[str, int] = {}
+        """Number of each struct of published numbers, by the source of its fields."""
 
     def publish(self, writer: LineWriter, values: PublishedNumbers, live: LiveValues, depth: int) -> list[ReadFunction]:
         order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
-        text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
-        record = f"Record{self._records.setdefault(text, len(self._records))}"
-        size = sum(math.ceil(_record_bytes(text) / 16) * 16 for text in self._records) * self.lanes
+        fields = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
+        struct = f"Record{self._struct_numbers.setdefault(fields, len(self._struct_numbers))}"
+        size = sum(math.ceil(_struct_bytes(fields) / 16) * 16 for fields in self._struct_numbers) * self.lanes
         if size > SHARED_MEMORY_BYTES:
             raise UnsupportedError(
                 f"the drones of a block publish {size} bytes for each other, and a block's static shared memory has "
                 f"{SHARED_MEMORY_BYTES}"
             )
-        array = f"shared_{record}"
+        array = f"shared_{struct}"
         numbers = ", ".join(values[k][1] for k in order)
         writer.write_line("__syncthreads();", depth)
-        writer.write_line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {record}{{{numbers}}};", depth)
+        writer.write_line(f"if (threadIdx.x < {self.lanes}) {array}[threadIdx.x] = {struct}{{{numbers}}};", depth)
         writer.write_line("__syncthreads();", depth)
         position = {k: n for n, k in enumerate(order)}
         return [lambda j, n=position[k]: f"{array}[world_start + {j}].x{n}" for k in range(len(values))]
@@ -167,8 +168,8 @@ class SharedMemory(UnsplitLane):
     @property
     def declarations(self) -> list[str]:
         lines = []
-        for text, k in self._records.items():
-            lines.append(f"struct __align__(16) Record{k} {{ {text}}};")
+        for fields, k in self._struct_numbers.items():
+            lines.append(f"struct __align__(16) Record{k} {{ {fields}}};")
             lines.append(f"static __shared__ Record{k} shared_Record{k}[{self.lanes}];")
         return lines
 
@@ -240,5 +241,5 @@ def lanes_of_block(group_size: int) -> tuple[int, int]:
     return max(((n, n // group_size * group_size) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
 
 
-def _record_bytes(record: str) -> int:
-    return sum(TYPE_BYTES.get(word, 0) for word in record.split())
+def _struct_bytes(fields: str) -> int:
+    return sum(TYPE_BYTES.get(word, 0) for word in fields.split())

@@ -24,11 +24,12 @@ class Kernel:
     text: str
     """The source."""
     inputs: tuple[int, ...]
-    """Leaves that it reads."""
+    """Indices of the leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes. If worlds are checked, a bool per drone follows: True where its world is flagged."""
+    """Indices of the leaves that it writes. If worlds are checked, another output follows, with a bool per drone: True
+    where its world is flagged as not finite."""
     in_place: tuple[int, ...] = ()
-    """Leaves of rows that it updates in place: input and output of such a leaf must be the same memory."""
+    """Indices of the leaves with rows that it updates in place: input and output of such a leaf are the same memory."""
     threads: int = BLOCK_SIZE
     """Threads of a block on a GPU."""
     lanes: int = BLOCK_SIZE

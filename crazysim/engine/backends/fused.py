@@ -115,7 +115,7 @@ class FusedRun:
         self._run, self.kernels = run, kernels
 
     def __call__(self, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        """Return the written leaves some steps later, and the worlds that are flagged."""
+        """Return the written leaves some steps later, and the worlds that are flagged as not finite."""
         return self._run(leaves, n_steps)
 
 
@@ -187,14 +187,14 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
                 return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0)
             return x.reshape(size, -1, *x.shape[1:])
 
-        rows = [i in program.rows for i in range(len(leaves))]
+        are_rows = [i in program.rows for i in range(len(leaves))]
         merged_leaves = [
             join_batches(x, b, in_rows) if has_axis and x is not None else x
-            for x, b, has_axis, in_rows in zip(leaves, leaves_batched, have_world_axis, rows, strict=True)
+            for x, b, has_axis, in_rows in zip(leaves, leaves_batched, have_world_axis, are_rows, strict=True)
         ]
         written, flagged = run(merged_leaves, count)
         return (
-            [split_batches(x, rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
+            [split_batches(x, are_rows[i]) for i, x in zip(program.written_leaves, written, strict=True)],
             split_batches(flagged, False),
         ), out_batched
 

@@ -185,7 +185,7 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
         return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE_INDEX else value
 
     outs = values.execute(segment.block, [get_world_value(slot) for slot in segment.reads], shape[:1])
-    written: dict[Slot, dict[int, Any]] = {}  # by slot of a drone and index of the drone
+    written: dict[Slot, dict[int, Any]] = {}  # values by slot of a drone, and then by index of the drone
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
         value = library.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":
@@ -280,7 +280,7 @@ def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
 
 
 def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
-    """Return True for worlds that were flagged, hold a watched value that is not finite, or took too many steps.
+    """Return True for worlds that were flagged, hold a checked value that is not finite, or took too many steps.
 
     Returns:
         (n_worlds, 1), False for all worlds if the program has no check

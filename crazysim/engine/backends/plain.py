@@ -122,5 +122,5 @@ class Reset:
         return self._compiled.lower(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
+        """Return the number of compiled programs, as for a jitted function, for the tests of law 6: no retrace."""
         return jaxcompat.n_compilations(self._compiled)

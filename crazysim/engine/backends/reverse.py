@@ -1,9 +1,9 @@
 """Reverse mode of many steps in one kernel, which turns cotangents after the steps into cotangents before the steps.
 
 The kernel recomputes the steps, stores the state before each step, and goes back from the last step to the first. If
-there are more steps than ``interval``, it first stores only the state before each interval. It recomputes the steps of
-an interval before it goes back through them. Every drone has its own cotangent of every number; the caller sums the
-cotangents of leaves that drones share.
+there are more steps than fit in memory, they are split into intervals of ``interval`` steps. It first stores only the
+state before each interval, and recomputes the steps of an interval before it goes back through them. Every drone has
+its own cotangent of every number; the caller sums the cotangents of leaves that drones share.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ReverseProgram:
     n_leaves: int
     """Number of leaves of the program before the leaves of cotangents."""
     perturbed: tuple[int, ...]
-    """Leaves whose cotangents are computed."""
+    """Indices of the leaves whose cotangents are computed."""
     backward_segments: dict[Segment, Segment]
     """Segments of the backward pass, by the forward segment."""
     backward_hoisted_segments: dict[Segment, Segment]
@@ -46,7 +46,7 @@ class ReverseProgram:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Leaves whose cotangents are inputs: the floats that the program writes."""
+        """Indices of the leaves whose cotangents are inputs: the floats that the program writes."""
         return tuple(i for i in self.program.written_leaves if self.program.leaves[i].number_type.kind == "f")
 
     def slots(self) -> list[Slot]:

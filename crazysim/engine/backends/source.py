@@ -253,7 +253,10 @@ class Writer(LineWriter):
     def _assign_carry(
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
-        """Write the assignments of an iteration, after all new values: a new value may be another's old value."""
+        """Write the assignments at the end of an iteration; lanes where ``mask`` is false keep their old values.
+
+        All new values are written first, because a new value may be the old value of another variable.
+        """
         new_names = [self.new_name() for _ in outs]
         for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
             text = result if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {result})"

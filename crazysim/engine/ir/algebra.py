@@ -6,7 +6,7 @@ product is NaN if x is infinite.
 
 Zeros of shared parameters are an exception (``known_zero``): terms that they multiply are removed, such as terms of a
 diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the result is the sum of the other
-terms, where plain XLA would return NaN. The world is flagged either way.
+terms, where plain XLA would return NaN. The world is flagged as not finite in both cases.
 """
 
 from __future__ import annotations

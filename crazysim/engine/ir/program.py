@@ -45,7 +45,8 @@ class Leaf:
     dtype: Any
     """Type."""
     row_leaves: tuple[int, ...] = ()
-    """Leaves whose numbers are the rows of this leaf in order, (n_rows, n_lanes); empty for a leaf without rows."""
+    """Indices of the leaves whose numbers are the rows of this leaf, in order. The shape of a leaf with rows is
+    (n_rows, n_lanes). Empty for a leaf without rows."""
 
     @functools.cached_property
     def size(self) -> int:
@@ -147,7 +148,7 @@ class Program:
     segments: tuple[Segment | UnfusedStage, ...]
     """Segments in order, phase by phase."""
     check_segment: Segment | None = None
-    """Segment that runs after the last step and flags drones whose watched numbers are not finite."""
+    """Segment that runs after the last step and flags drones with an input that is not finite."""
     scratch: frozenset[int] = frozenset()
     """Leaves that only pass numbers from one stage to another; their values are lost after a call."""
     packed: tuple[int, ...] = ()

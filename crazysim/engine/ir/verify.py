@@ -18,8 +18,8 @@ def verify(program: Program) -> Program:
     """Return a program unchanged, or raise an error that says what is wrong with it.
 
     Values are defined once, before they are used. Operands and results have the types of the table of operations, and
-    inputs and outputs the types of their slots. No slot is read or written twice. Hoisted blocks read no number that
-    steps change.
+    inputs and outputs the types of their slots. No slot is read or written twice. Hoisted blocks, which run
+    once before the first step, read no number that steps change.
 
     Raises:
         VerificationError: If the program is not well formed.

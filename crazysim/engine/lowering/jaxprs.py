@@ -198,7 +198,7 @@ def constants(x: Any, dtype: Any) -> ElementArray:
 
 
 def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> ElementArray:
-    """Return an array as new inputs of a block.
+    """Add inputs for an array to a block, and return them as an array of elements.
 
     Args:
         builder: Builder that the inputs are added to.

@@ -203,7 +203,7 @@ def _over_others(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Add the cotangents of numbers that the block uses from outside, and of the numbers that each drone published."""
-    given_cts = [ct for ct in result_cts if ct is not None]
+    known_cts = [ct for ct in result_cts if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
         raise UnsupportedError(f"{', '.join(names)} over other drones has no derivative in a kernel", op.name)
@@ -252,7 +252,7 @@ def _over_others(
 
     other_inputs = body.inputs[:-1]
     add_reverse_loop(other_inputs, {}, [x for x in captured if x in active_set], published)
-    seeds = [ct for ct in given_cts if isinstance(ct, Value)]
+    seeds = [ct for ct in known_cts if isinstance(ct, Value)]
     add_reverse_loop(
         (*captured, *seeds),
         dict(zip(other_inputs, published, strict=True)),

@@ -72,10 +72,10 @@ def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
 @rule("argmax", "argmin")
 def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     """Return the index of the first extreme element, or of the first NaN, as XLA does."""
-    (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
+    (axis,), index_dtype = eqn.params["axes"], eqn.params["index_dtype"]
     comparison = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
-    best, best_index = rows[0], np.broadcast_to(constants(0, index), rows[0].shape)
+    best, best_index = rows[0], np.broadcast_to(constants(0, index_dtype), rows[0].shape)
     for i, row in enumerate(rows[1:], 1):
         best_is_number = ctx.elementwise("eq", [best, best], bool)
         is_better = ctx.elementwise(
@@ -83,7 +83,7 @@ def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
         )
         is_better = ctx.elementwise("and", [is_better, best_is_number], bool)
         best = ctx.elementwise("select_n", [is_better, best, row], eqn.invars[0].aval.dtype)
-        best_index = ctx.elementwise("select_n", [is_better, best_index, constants(i, index)], index)
+        best_index = ctx.elementwise("select_n", [is_better, best_index, constants(i, index_dtype)], index_dtype)
     return [best_index]
 
 
