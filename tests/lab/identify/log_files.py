@@ -1,4 +1,4 @@
-"""Logs of flight controllers and robots, written for the tests of readers: drones that swing about their first axis."""
+"""Writers of log files for the tests of readers: logs of drones that swing about their x axis."""
 
 import struct
 from zlib import crc32
@@ -9,15 +9,20 @@ from crazysim.lab.identify import Columns
 
 N = 400
 T = 5.0 + 0.01 * np.arange(N)
+"""Times of the samples, s."""
 ANGLE = 0.3 * np.sin(T)
 """Roll, rad."""
 RATE = 0.3 * np.cos(T)
+"""Roll rate, rad/s."""
 LATERAL_POS = 9.81 * ANGLE
 """Position along y, m: its second derivative is ``-g roll``, the acceleration of a drone with this roll, m/s^2."""
 
 
 def write_crazyflie(path, version=2, pause=(), damaged=False):
-    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, other variables at 50 Hz, two rare events."""
+    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, other variables at 50 Hz, two events.
+
+    Samples with the numbers in ``pause`` have body rates only. A damaged log lacks its last 7 bytes.
+    """
     kinds = {
         1: ("start", ["x", "y"]),
         3: ("fast", ["gyro.x", "gyro.y", "gyro.z"]),
@@ -63,12 +68,14 @@ COLUMNS = Columns(
     rotor_vel=("m1", "m2", "m3", "m4"),
     rad_per_unit=np.pi / 180,
 )
+"""Columns of the logs of ``write_crazyflie``."""
 
 
 def write_ulog(path, leave_out=(), slow=(), old=False):
-    """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html); slow messages come every 0.25 s.
+    """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html).
 
-    Old logs have the body rates in the message of the attitude.
+    ``leave_out`` names the messages that are missing, and ``slow`` those that come only every 0.25 s. Old logs have the
+    body rates in the message of the attitude.
     """
     formats = {
         "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
@@ -129,7 +136,10 @@ def drift(t):
 
 
 def write_blackbox(path, explorer=False, damaged=0, leave_out=()):
-    """Write a log at 1 kHz as blackbox_decode or the Blackbox Explorer (12 poles, high resolution) does."""
+    """Write a log at 1 kHz as blackbox_decode or the Blackbox Explorer (12 poles, high resolution) does.
+
+    The first ``damaged`` rows have two cells only.
+    """
     names = ["loopIteration", "time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(4))]
     names += [*(f"eRPM[{k}]" for k in range(4)), "vbatLatest", "flightModeFlags"]
     _, rate = swing(BLACKBOX_TIMES)
@@ -159,10 +169,13 @@ def write_blackbox(path, explorer=False, damaged=0, leave_out=()):
     return path
 
 
-def create_mocap(offset=0.0, reverse=False):
-    """Return motion capture of ``swing`` at 100 Hz, on a clock that is behind by an offset, s."""
+def create_mocap(offset=0.0, of_other_flight=False):
+    """Return motion capture of ``swing`` at 100 Hz, on a clock that is behind by an offset, s.
+
+    Motion capture of another flight has a random roll.
+    """
     angle, _ = swing(T)
-    if reverse:
+    if of_other_flight:
         angle = np.cumsum(np.random.default_rng(0).normal(size=N)) * 0.03
     columns = {
         "x": T,

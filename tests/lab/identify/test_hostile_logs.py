@@ -1,4 +1,4 @@
-"""Damaged and hostile logs: each is read, or refused with one error of crazysim, silently and within bounds."""
+"""Damaged and hostile logs: each is read or refused with a ConfigError, without warnings, hangs or much memory."""
 
 import io
 import os
@@ -19,17 +19,18 @@ from crazysim.lab.identify import Columns, read_log
 from crazysim.lab.identify.columns import without_huge_numbers
 
 N_MUTATIONS = 10 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
-"""Mutated files of each kind."""
+"""Number of mutated files of each kind."""
 MAX_MEMORY = 64 * 2**20
 """Largest amount of memory that reading a file of some 200 kB may take, bytes."""
 HANG_TIMEOUT = 60
 """Processor time after which a reader counts as hanging, s: a valid file takes a tenth of a second."""
 INTEGERS = [0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1]
 CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "x", '"', "1" * 400, "\x00", "1,2", "é"]
+"""Integers and table cells that mutations write into files."""
 
 
 class HangError(BaseException):
-    """Error raised by the alarm; it is no ``Exception``, because readers would turn that into their own errors."""
+    """Error raised by the alarm; it is no ``Exception``, which readers would turn into their own errors."""
 
 
 def create_table():
@@ -65,7 +66,7 @@ def bag_writer(storage):
     return write
 
 
-READERS = {
+LOG_KINDS = {
     "sd": ("log00", write_crazyflie, COLUMNS, None),
     "ulog": ("a.ulg", write_ulog, None, None),
     "csv": ("a.csv", write_csv, None, None),
@@ -77,36 +78,36 @@ READERS = {
     "mcap": ("a.mcap", bag_writer("mcap"), None, None),
     "db3": ("a.db3", bag_writer("sqlite3"), None, None),
 }
-"""Name of the file, its writer, its columns and its motion capture by kind."""
+"""Name of the file, function that writes it, its columns and its motion capture, by kind of log."""
 
 
 def draw_offset(rng, n):
     """Return an offset, half of the time near one of the ends, where most formats have their structure."""
-    near = min(n, 1500)
-    return rng.choice([rng.randrange(n), rng.randrange(n), rng.randrange(near), n - 1 - rng.randrange(near)])
+    margin = min(n, 1500)
+    return rng.choice([rng.randrange(n), rng.randrange(n), rng.randrange(margin), n - 1 - rng.randrange(margin)])
 
 
 def damage_bytes(rng, data):
-    """Return the bytes with one random change: a flipped bit, other, missing or repeated bytes, or another number."""
-    at, length = draw_offset(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
+    """Return the bytes with one random change: a flipped bit, a new number, or replaced, missing or repeated bytes."""
+    offset, length = draw_offset(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
     change = rng.randrange(8)
     if change == 0:
-        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+        return data[:offset] + bytes([data[offset] ^ 1 << rng.randrange(8)]) + data[offset + 1 :]
     if change == 1:
-        return data[:at] + rng.randbytes(length) + data[at + length :]
+        return data[:offset] + rng.randbytes(length) + data[offset + length :]
     if change in (2, 3):
         layout = rng.choice(["<B", "<H", "<I", "<Q", ">I", "<d", "<f"])
-        limit = struct.calcsize(layout)
-        value = rng.choice([np.nan, np.inf, 1e30, -1.0]) if layout[1] in "df" else rng.choice(INTEGERS) % 256**limit
-        return data[:at] + struct.pack(layout, value) + data[at + limit :]
+        size = struct.calcsize(layout)
+        value = rng.choice([np.nan, np.inf, 1e30, -1.0]) if layout[1] in "df" else rng.choice(INTEGERS) % 256**size
+        return data[:offset] + struct.pack(layout, value) + data[offset + size :]
     if change == 4:
-        return data[:at]
+        return data[:offset]
     if change == 5:
-        return data[:at] + data[at + length :]
+        return data[:offset] + data[offset + length :]
     if change == 6:
-        return data[:at] + data[at : at + length] + data[at:]
+        return data[:offset] + data[offset : offset + length] + data[offset:]
     other = draw_offset(rng, len(data))
-    return data[:at] + data[other : other + length] + data[at + length :]
+    return data[:offset] + data[other : other + length] + data[offset + length :]
 
 
 def damage_table(rng, text):
@@ -151,11 +152,11 @@ def damage_archive(rng):
 
 
 def mutate_file(rng, kind, k, data):
-    """Return the file of a kind after one to three mutations; its number ``k`` chooses how it is mutated."""
+    """Return the file of a kind after one to three mutations; its number ``k`` selects the kind of mutation."""
     if kind == "npz" and k % 2:
         return damage_archive(rng)
     for _ in range(rng.randint(1, 3)):
-        if READERS[kind][0].endswith(".csv") and k % 4:
+        if LOG_KINDS[kind][0].endswith(".csv") and k % 4:
             data = damage_table(rng, data.decode()).encode()
         else:
             data = damage_bytes(rng, data) or b"\0"
@@ -167,8 +168,9 @@ def valid_files(tmp_path_factory):
     """Return the content of a valid file of each kind."""
     pytest.importorskip("rosbags")
     folder, valid_files = tmp_path_factory.mktemp("seeds"), {}
-    for kind, (name, write, columns, motion) in READERS.items():
+    for kind, (name, write, columns, motion) in LOG_KINDS.items():
         write(folder / name)
+        # The columns of "angles" are wrong for this file: they read a quaternion as angles.
         read_log(folder / name, columns if kind != "angles" else None, motion)
         valid_files[kind] = (folder / name).read_bytes()
     return valid_files
@@ -202,17 +204,17 @@ def read_refusal_message(path, columns, motion):
 
 
 @pytest.fixture
-def traced():
+def trace_allocations():
     """Trace allocations."""
     tracemalloc.start()
     yield
     tracemalloc.stop()
 
 
-@pytest.mark.long("reads mutated files with their allocations traced")
-@pytest.mark.parametrize("kind", READERS)
-def test_a_mutated_log_is_read_or_refused(kind, valid_files, tmp_path, capfd, traced):
-    name, _, columns, motion = READERS[kind]
+@pytest.mark.long("reads mutated files with their allocations trace_allocations")
+@pytest.mark.parametrize("kind", LOG_KINDS)
+def test_a_mutated_log_is_read_or_refused(kind, valid_files, tmp_path, capfd, trace_allocations):
+    name, _, columns, motion = LOG_KINDS[kind]
     seed = int(os.environ.get("CRAZYSIM_FUZZ_SEED", "0"))
     outcomes = {True: 0, False: 0}
     for k in range(N_MUTATIONS):
@@ -257,7 +259,7 @@ def make_npy(header):
     return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode() + bytes(8)
 
 
-HOSTILE = {
+HOSTILE_LOGS = {
     "foreign compression": ("a.npz", pack_archive(method=99), "compression method is not supported"),
     "encryption": ("a.npz", pack_archive(flags=1), "is encrypted"),
     "40 TB": (
@@ -287,13 +289,14 @@ HOSTILE = {
         "over 8 within each other",
     ),
 }  # fmt: skip
+"""Name of the file, its content, and a part of the message that refuses it."""
 
 
-@pytest.mark.parametrize("case", HOSTILE)
-def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, capfd, traced):
+@pytest.mark.parametrize("case", HOSTILE_LOGS)
+def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, capfd, trace_allocations):
     if case == "mcap":
         pytest.importorskip("rosbags")
-    name, data, expected = HOSTILE[case]
+    name, data, expected = HOSTILE_LOGS[case]
     (tmp_path / name).write_bytes(data)
     message = read_refusal_message(tmp_path / name, None, None)
     assert re.search(expected, message), message
@@ -302,7 +305,7 @@ def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, cap
 
 
 @pytest.mark.parametrize("name", ["log00", "a.ulg", "a.csv", "a.npz"])
-def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, traced):
+def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, trace_allocations):
     with (tmp_path / name).open("wb") as file:
         file.truncate(2**40)  # takes no room on the disk
     assert "expected a log of at most 2147483648 bytes, got 1099511627776" in read_refusal_message(
@@ -330,6 +333,8 @@ def test_a_bag_whose_description_is_not_text_is_refused(tmp_path):
 def test_a_ulog_that_counts_more_motors_than_it_has_is_refused(valid_files, tmp_path):
     data = valid_files["ulog"]
     path = tmp_path / "a.ulg"
-    path.write_bytes(data.replace(b"\xa0\x0f\0\0\4", b"\xa0\x0f\0\0\5"))  # the speed of the last motor, and the count
+    path.write_bytes(
+        data.replace(b"\xa0\x0f\0\0\4", b"\xa0\x0f\0\0\5")
+    )  # the end of the speed of the last motor, and the number of motors
     with pytest.raises(ConfigError, match=r"a\.ulg: esc_status: expected a field esc\[4\]\.esc_rpm, got timestamp,"):
         read_log(path)

@@ -1,4 +1,4 @@
-"""Identification finds the airframe that made a log, and refuses or repairs bad logs."""
+"""Identification finds the airframe that flew a log, and refuses or repairs bad logs."""
 
 import re
 from dataclasses import replace
@@ -27,7 +27,9 @@ from crazysim.rotation import to_rpy
 from crazysim.sim import Sim
 
 FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}
+"""Parameters of the airframe that flew the logs, as factors of those of cf21B_500."""
 DRAG = (-0.03, -0.025, -0.02)
+"""Its drag coefficients, N s/m."""
 N_FLIGHTS = 6
 
 
@@ -44,8 +46,8 @@ def flights():
         "drag": {"coefficients": list(DRAG)},
     }
     sim = Sim(n_worlds=N_FLIGHTS, drone=drone, control="attitude", integrator="rk4")
-    high = sim.data.states.pos + np.array([0, 0, 20.0], np.float32)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=high))
+    start_pos = sim.data.states.pos + np.array([0, 0, 20.0], np.float32)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=start_pos))
     rng, rows = np.random.default_rng(0), []
     weight = float(base.value("rigid_body.mass")) * 9.81
     for k in range(600):
@@ -223,7 +225,7 @@ def test_jitter_is_no_gap_and_lost_time_beside_it_is_one(flights):
     assert "as jitter" in read.repairs[0]
 
 
-UNITS = [
+WRONG_FACTORS = [
     ({"t": 1e3}, "in ms: give seconds_per_unit=0.001"),
     ({"t": 1e6}, "in us: give seconds_per_unit=1e-06"),
     (dict.fromkeys("xyz", 1e3), "position seems to be in mm: give metres_per_unit=0.001"),
@@ -242,7 +244,7 @@ UNITS = [
 """Factors of columns, and the remedy that the error names."""
 
 
-@pytest.mark.parametrize(("factors", "remedy"), UNITS, ids=[x[1][-24:] for x in UNITS])
+@pytest.mark.parametrize(("factors", "remedy"), WRONG_FACTORS, ids=[x[1][-24:] for x in WRONG_FACTORS])
 def test_wrong_units_and_signs_are_refused(flights, factors, remedy):
     for flight in flights[:2]:
         with pytest.raises(ConfigError, match=remedy):
@@ -294,16 +296,16 @@ def test_columns_that_cannot_be_are_refused(capsys):
 
 
 def test_wrong_columns_are_refused(flights):
-    """Orders of quaternions, axes, positions alone, and rotors."""
+    """Orders of quaternions and axes, units of a log without velocities, and units of rotor speeds are wrong."""
     quat = dict(zip(("qx", "qy", "qz", "qw"), (flights[0][k] for k in ("qw", "qx", "qy", "qz")), strict=True))
-    slow = {k: x for k, x in flights[0].items() if k[0] not in "vw"}
-    for log in (flights[0], slow):
+    without_velocities = {k: x for k, x in flights[0].items() if k[0] not in "vw"}
+    for log in (flights[0], without_velocities):
         with pytest.raises(ConfigError, match="order w, x, y, z"):
             read_log(log | quat)
     with pytest.raises(ConfigError, match="fits as vel=vy,vx,vz"):
         read_log(flights[0] | {"vx": flights[0]["vy"], "vy": flights[0]["vx"]})
     with pytest.raises(ConfigError, match="position seems to be in mm"):
-        read_log(slow | {k: 1e3 * slow[k] for k in "xyz"})
+        read_log(without_velocities | {k: 1e3 * without_velocities[k] for k in "xyz"})
     with pytest.raises(ConfigError, match="each rotor near"):
         identify([read_log(flights[0] | {"rpm1": 0 * flights[0]["rpm1"]})])
     radians = flights[0] | {f"rpm{k}": flights[0][f"rpm{k}"] * 2 * np.pi / 60 for k in range(1, 5)}
@@ -386,7 +388,7 @@ def test_drift_at_rest_is_no_wrong_unit(flights):
 
 
 def test_a_gyroscope_that_fails_is_left_out(flights):
-    """A rate that grows to 200 rad/s in the last 0.4 s, of pieces of 2 s of three flights in a row."""
+    """Of three flights of 2 s in a row, the last one has a roll rate that is wrong by 50 to 200 rad/s."""
     log = concatenate_flights(flights)
     log["wx"][1000:] += np.linspace(50, 200, 500)
     read = read_log(log)
@@ -399,7 +401,7 @@ def test_factors_that_no_body_explains_are_refused(flights):
         identify([read_log(x) for x in flights[:2]], mass=0.75)
 
 
-FILES = {
+BAD_CSV_FILES = {
     "": "expected names of columns in the first line",
     "t;x;y\n0;1;2": "semicolons between them",
     "0,1,2\n1,2,3": "got numbers: 0,1,2",
@@ -409,10 +411,10 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("text", FILES, ids=lambda x: x[:6].strip())
+@pytest.mark.parametrize("text", BAD_CSV_FILES, ids=lambda x: x[:6].strip())
 def test_bad_csv_files_are_refused_in_a_line(tmp_path, text):
     (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(ConfigError, match=FILES[text]):
+    with pytest.raises(ConfigError, match=BAD_CSV_FILES[text]):
         read_log(tmp_path / "log.csv")
 
 
@@ -458,13 +460,13 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
 
     A second of a flight leaves an error of some 5%, so each flight is logged three times.
     """
-    rng, logs, late = np.random.default_rng(1), [], 3 * [0.004, 0.012, 0.0, 0.008, 0.004]
-    for flight, delay in zip(3 * flights[:-1], late, strict=True):
+    rng, logs, delays_s = np.random.default_rng(1), [], 3 * [0.004, 0.012, 0.0, 0.008, 0.004]
+    for flight, delay in zip(3 * flights[:-1], delays_s, strict=True):
         t, columns = flight["t"], {}
         for k in range(1, 5):
             columns[f"cmd{k}"] = flight[f"rpm{k}"]
-            read = np.interp(t + delay, t, flight[f"rpm{k}"]) + rng.normal(scale=1000, size=len(t))
-            columns[f"rpm{k}"] = 17 * np.round(read / 17)
+            measured = np.interp(t + delay, t, flight[f"rpm{k}"]) + rng.normal(scale=1000, size=len(t))
+            columns[f"rpm{k}"] = 17 * np.round(measured / 17)
         logs.append(read_log(flight | columns, Columns(command=("cmd1", "cmd2", "cmd3", "cmd4"))))
     params = Model.create(load_airframe("cf21B_500")).params
     with_commands = fast_rotation(logs, params, FACTORS["thrust factor"])
@@ -474,7 +476,7 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
     assert np.all(np.abs(with_commands.values[:2] - true) < 3 * deviations), with_commands
     assert np.all(deviations < 0.05 * true), deviations
     delays = np.median(np.reshape(with_commands.delays, (3, 5)), axis=0)
-    np.testing.assert_allclose(delays, late[:5], atol=3e-3)
+    np.testing.assert_allclose(delays, delays_s[:5], atol=3e-3)
     assert np.all(without.values[:2] > 1.07 * true), without.values
 
 
@@ -485,10 +487,10 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
 def test_training_a_residual_lowers_the_errors_of_predictions(flights, result, n_hidden):
     """Rotor speeds that are 5% too high in the log: the residual takes the thrust away."""
     logs = [read_log(x | {f"rpm{k}": 1.05 * x[f"rpm{k}"] for k in range(1, 5)}) for x in flights[:3]]
-    before = prediction_errors(logs, result.model)
+    initial_errors = prediction_errors(logs, result.model)
     steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
     trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
-    assert prediction_errors(logs, trained)["position"][-1] < 0.5 * before["position"][-1]
+    assert prediction_errors(logs, trained)["position"][-1] < 0.5 * initial_errors["position"][-1]
 
 
 def test_results_are_plain_numbers(result):

@@ -22,8 +22,8 @@ def flight():
     airframe, rng = load_airframe("cf2x_L250"), np.random.default_rng(0)
     hover = float(airframe.value("rigid_body.mass")) * 9.81 / float(airframe.value(f"fitted.{MODEL}.cmd_f_coef"))
     states = sim.data.states
-    high = states.pos + np.array([0, 0, 50.0], np.float32)
-    sim.data = sim.data.replace(states=states.replace(pos=high, rotor_vel=np.full_like(states.rotor_vel, hover)))
+    start_pos = states.pos + np.array([0, 0, 50.0], np.float32)
+    sim.data = sim.data.replace(states=states.replace(pos=start_pos, rotor_vel=np.full_like(states.rotor_vel, hover)))
     cmd, rows = np.array([0, 0, 0, hover]), []
     for k in range(SECONDS * RATE):
         states = sim.data.states
@@ -52,12 +52,12 @@ def test_names_of_crazyflow_find_the_parameters(flight):
     true = {key: airframe.value(f"fitted.{MODEL}.{key}") for key in ("cmd_f_coef", "thrust_dyn_coef")}
     drag = airframe.value(f"fitted.{MODEL}.drag_coefficients")
     assert found["cmd_f_coef"] == pytest.approx(true["cmd_f_coef"], rel=0.005)
-    # Products of attitude, thrust and velocity are formed after the filter, which biases lag and drag below a percent.
+    # Products of attitude, thrust and velocity are formed after the filter. This biases lag and drag by less than 1%.
     assert found["thrust_dyn_coef"] == pytest.approx(true["thrust_dyn_coef"], rel=0.01)
     assert found["drag_xy_coef"] == pytest.approx(drag[0], rel=0.01)
     assert found["drag_z_coef"] == pytest.approx(drag[2], rel=0.01)
-    turn = sys_id_rotation(log)
-    for key, x in turn.items():
+    rotation = sys_id_rotation(log)
+    for key, x in rotation.items():
         np.testing.assert_allclose(x, airframe.value(f"fitted.{MODEL}.{key}"), rtol=0.01, err_msg=key)
 
 
@@ -121,7 +121,7 @@ def test_outliers_are_interpolated_and_fast_turns_are_not():
     np.testing.assert_array_equal(preprocessing(data | {"pos": pos})["pos"], pos)
     spoiled = pos.copy()
     spoiled[40:42] += 1.0
-    # Straight lines over three intervals of 10 ms at 40 m/s^2.
+    # The error of a straight line over three intervals of 10 ms at an acceleration of 40 m/s^2.
     np.testing.assert_allclose(preprocessing(data | {"pos": spoiled})["pos"], pos, atol=40 * 0.03**2 / 8)
 
 

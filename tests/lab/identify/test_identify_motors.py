@@ -23,19 +23,19 @@ def create_log(command, voltage=None, rotor_vel=None):
 def test_voltage_and_lag_give_the_speeds():
     """A step of the commands in the middle, at 3.8 V, against a fine integration of the airframe's equation."""
     airframe = load_airframe(AIRFRAME)
-    share = np.where(np.arange(N) < N // 2, 0.6, 0.7)
-    found = with_speeds(create_log(np.tile(share[:, None], 4), np.full(N, 3.8)), airframe)
+    command = np.where(np.arange(N) < N // 2, 0.6, 0.7)
+    found = with_speeds(create_log(np.tile(command[:, None], 4), np.full(N, 3.8)), airframe)
     low, high = (airframe.rotor_vel(np.polyval(airframe.value("battery.thrust_over_voltage")[::-1], 3.8 * x))
                  for x in (0.6, 0.7))  # fmt: skip
     a, b, _, _ = airframe.value("rotors.lag")
-    speed, fine = float(np.ravel(low)[0]), []
+    speed, fine_speeds = float(np.ravel(low)[0]), []
     for k in range(200 * 20):
         speed += DT / 200 * (np.ravel(high)[0] - speed) * (a + b * (np.ravel(high)[0] + speed))
         if k % 200 == 199:
-            fine.append(speed)
+            fine_speeds.append(speed)
     middle = N // 2 - 100
     np.testing.assert_allclose(found.rotor_vel[:middle, 0], np.ravel(low)[0], rtol=1e-4)
-    np.testing.assert_allclose(found.rotor_vel[middle + 1 : middle + 21, 0], fine, rtol=1e-3)
+    np.testing.assert_allclose(found.rotor_vel[middle + 1 : middle + 21, 0], fine_speeds, rtol=1e-3)
     assert "modelled" in found.repairs[0]
 
 

@@ -1,4 +1,4 @@
-"""Fits of simulated flights of random airframes: the deviations that they state contain the truth."""
+"""Fits of simulated flights of random airframes: true parameters are within three stated deviations."""
 
 import tomllib
 
@@ -12,7 +12,7 @@ from crazysim.sim import Sim
 
 COLUMN_NAMES = "x y z qx qy qz qw vx vy vz wx wy wz rpm1 rpm2 rpm3 rpm4".split()
 NOISE_STD = np.repeat([1e-3, 1e-3, 1e-2, 1e-2], [3, 4, 3, 3])
-"""Deviations of a log: position, m, quaternion, velocity, m/s, angular velocity, rad/s."""
+"""Standard deviations of the noise of a log: position, m, quaternion, velocity, m/s, angular velocity, rad/s."""
 
 
 def draw_airframe(rng, folder, k):
@@ -36,12 +36,17 @@ def draw_airframe(rng, folder, k):
         "torque_curve": base.value("rotors.torque_curve") * torque,
         "inertia": base.value("rotors.inertia") * rotor,
     }
-    true = {"base": str(path), "name": f"true{k}", "rigid_body": {"inertia": inertia * moments}, "rotors": rotors}
+    true_airframe = {
+        "base": str(path),
+        "name": f"true{k}",
+        "rigid_body": {"inertia": inertia * moments},
+        "rotors": rotors,
+    }
     factors = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
     truth = dict(zip(factors, [thrust, *moments, torque, rotor], strict=True))
     truth |= {f"drag {axis}": x for axis, x in zip("xyz", drag, strict=True)}
     truth |= {"centre of mass x": offset[0], "centre of mass y": offset[1]}
-    return path, true | {"drag": {"coefficients": drag}}, truth
+    return path, true_airframe | {"drag": {"coefficients": drag}}, truth
 
 
 def fly_airframes(airframes, seconds, rng, *, at_samples):
@@ -58,21 +63,21 @@ def fly_airframes(airframes, seconds, rng, *, at_samples):
     sim.data = sim.data.replace(
         states=states.replace(pos=jnp.asarray(pos, states.pos.dtype), rotor_vel=states.rotor_vel + hover)
     )
-    cmd, until, rows = np.zeros((1, n, 4), np.float32), np.zeros(n), []
+    cmd, change_samples, rows = np.zeros((1, n, 4), np.float32), np.zeros(n), []
     for k in range(round(100 * seconds) + 50):
         s = sim.data.states
-        if np.any(due := until <= k):
+        if np.any(is_due := change_samples <= k):
             vel, climbed = np.asarray(s.vel)[0], np.asarray(s.pos)[0, :, 2] - 100
             tilt = rng.uniform(-0.5, 0.5, (n, 3))
             tilt[:, :2] += np.clip(0.05 * vel[:, [1, 0]], -0.3, 0.3) * [1, -1]  # against drifting away
             lift = rng.uniform(0.9, 1.15, n) * np.clip(1 - 0.02 * climbed - 0.05 * vel[:, 2], 0.8, 1.2)
-            cmd[0, due] = np.c_[tilt, lift * weight][due]
-            until[due] = k + rng.integers(15, 50, np.sum(due))
-        wait = 0 if at_samples else int(rng.integers(1, 5))
-        if wait:
-            sim.step(wait)
+            cmd[0, is_due] = np.c_[tilt, lift * weight][is_due]
+            change_samples[is_due] = k + rng.integers(15, 50, np.sum(is_due))
+        n_late_steps = 0 if at_samples else int(rng.integers(1, 5))
+        if n_late_steps:
+            sim.step(n_late_steps)
         sim.attitude_control(cmd)
-        sim.step(5 - wait)
+        sim.step(5 - n_late_steps)
         s = sim.data.states
         rows.append(np.concatenate([np.asarray(x)[0] for x in (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)], -1))
     return np.stack(rows[50:], axis=1).astype(np.float64)
@@ -82,7 +87,7 @@ def find_missed_parameters(folder, n, seconds, seed, *, at_samples):
     """Return the fitted numbers that are off by more than three deviations, and the number of all fitted numbers."""
     rng = np.random.default_rng(seed)
     paths, airframes, truths = zip(*(draw_airframe(rng, folder, k) for k in range(n)), strict=True)
-    wrong, total = [], 0
+    missed, total = [], 0
     for path, flight, truth in zip(
         paths, fly_airframes(airframes, seconds, rng, at_samples=at_samples), truths, strict=True
     ):
@@ -95,11 +100,11 @@ def find_missed_parameters(folder, n, seconds, seed, *, at_samples):
             for name, value in result.values.items():
                 error, total = value - truth.get(name, 0.0), total + 1
                 if not abs(error) <= 3 * result.deviations[name]:
-                    wrong.append((path.stem, noise, name, value, truth.get(name, 0.0), result.deviations[name]))
-            # A deviation that is as large as the number says nothing.
+                    missed.append((path.stem, noise, name, value, truth.get(name, 0.0), result.deviations[name]))
+            # A deviation as large as the parameter would contain any truth.
             for name in ("thrust factor", "inertia x", "inertia y", "inertia z", "rotor inertia"):
                 assert result.deviations[name] < 0.03 * truth[name], (path.stem, noise, name)
-    return wrong, total
+    return missed, total
 
 
 @pytest.mark.long("flies four airframes for 40 s and fits each twice")
@@ -107,12 +112,12 @@ def find_missed_parameters(folder, n, seconds, seed, *, at_samples):
     "at_samples", [False, pytest.param(True, marks=pytest.mark.slow("commands between samples are harder to fit"))]
 )
 def test_three_deviations_contain_the_truth(tmp_path, at_samples):
-    wrong, total = find_missed_parameters(tmp_path, 4, 40.0, 0, at_samples=at_samples)
-    assert len(wrong) <= 0.02 * total, wrong
+    missed, total = find_missed_parameters(tmp_path, 4, 40.0, 0, at_samples=at_samples)
+    assert len(missed) <= 0.02 * total, missed
 
 
-@pytest.mark.slow("50 airframes; four do the same")
+@pytest.mark.slow("50 airframes; the test above does the same with four")
 @pytest.mark.parametrize("at_samples", [False, True])
 def test_three_deviations_contain_the_truth_in_99_percent(tmp_path, at_samples):
-    wrong, total = find_missed_parameters(tmp_path, 50, 60.0, 1, at_samples=at_samples)
-    assert len(wrong) <= 0.01 * total, wrong
+    missed, total = find_missed_parameters(tmp_path, 50, 60.0, 1, at_samples=at_samples)
+    assert len(missed) <= 0.01 * total, missed

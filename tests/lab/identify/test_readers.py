@@ -1,4 +1,4 @@
-"""Files of flight controllers and robots, written here, are read; damaged ones are repaired or refused."""
+"""Readers of logs: the files that ``log_files`` writes are read, and damaged files are repaired or refused."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from crazysim.lab.identify.readers import Stream, decompress_quat, resample
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_micro_sd_logs_are_read_at_the_rate_of_the_fastest(tmp_path, version):
+def test_micro_sd_logs_are_read_at_the_rate_of_the_fastest_block(tmp_path, version):
     log = read_log(write_crazyflie(tmp_path / "log00", version), COLUMNS)
     assert log.dt == pytest.approx(0.01)
     np.testing.assert_allclose(log.pos[:, 0], T[: len(log.t)], atol=2e-3)  # interpolated, from milliseconds
@@ -54,17 +54,15 @@ def test_angles_after_a_sample_that_is_missing_are_kept():
     table = {"x": angle, "y": angle, "z": angle, "roll": 0 * angle, "pitch": 0 * angle, "yaw": logged}
     columns = Columns(rpy=("roll", "pitch", "yaw"), rad_per_angle=np.pi / 180)
     found = resample("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
-    bad = np.isnan(found)
-    assert 0 < np.sum(bad) < 3
-    np.testing.assert_allclose(found[~bad], angle[: len(found)][~bad], atol=1e-6)
+    is_missing = np.isnan(found)
+    assert 0 < np.sum(is_missing) < 3
+    np.testing.assert_allclose(found[~is_missing], angle[: len(found)][~is_missing], atol=1e-6)
 
 
 def test_compressed_attitudes_are_unpacked():
-    """The quaternions are packed as in quatcompress.h: the index of the largest component, then 10 bits for others."""
-    bits = {1: [(2, 0), (0, 255), (1, 511), (0, 511)], 2: [(3, 0), (0, 0), (1, 100), (0, 1)]}
-    packed = [
-        (b[0][0] << 30) | sum(((s << 9) | m) << (20 - 10 * k) for k, (s, m) in enumerate(b[1:])) for b in bits.values()
-    ]
+    """Quaternions are packed as in quatcompress.h: index of the largest component, then sign and 9 bits of others."""
+    bits = [[(2, 0), (0, 255), (1, 511), (0, 511)], [(3, 0), (0, 0), (1, 100), (0, 1)]]
+    packed = [(b[0][0] << 30) | sum(((s << 9) | m) << (20 - 10 * k) for k, (s, m) in enumerate(b[1:])) for b in bits]
     unit = np.sqrt(0.5) / 511
     expected = np.array([[255, -511, 0, 511], [0, -100, 1, 0]]) * unit
     expected[0, 2], expected[1, 3] = 0.0, np.sqrt(1 - (100**2 + 1) * unit**2)
@@ -122,9 +120,9 @@ def test_blackbox_logs_are_joined_with_motion_capture(tmp_path, explorer):
     assert log.dt == pytest.approx(0.004)
     angle, rate = swing(log.t - log.t[0] + 5.0015)  # times are means of four samples
     np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=2e-3)
-    # The clocks agree to a fraction of the 0.005 s of the search.
+    # The clocks agree to a fraction of 0.005 s, the step of their search.
     np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]), angle, atol=3e-3)
-    # Differentiated: lines through 0.06 s at jerks of up to 7 m/s^3, with clocks that agree to 2 ms.
+    # Velocities are slopes of lines through 0.06 s of positions. Jerks reach 7 m/s^3, and the clocks agree to 2 ms.
     np.testing.assert_allclose(log.vel[20:-20, 1], drift(log.t - log.t[0] + 5.0015)[1][20:-20], atol=0.02)
     np.testing.assert_allclose(log.vel[20:-20, 2], log.pos[20:-20, 0], atol=5e-3)
     poles = 12 if explorer else 14
@@ -142,7 +140,7 @@ def test_bad_blackbox_logs_are_repaired_or_refused(tmp_path):
     with pytest.raises(ConfigError, match="--motion"):
         read_log(write_blackbox(path))
     with pytest.raises(ConfigError, match="one flight"):
-        read_log(write_blackbox(path), motion=create_mocap(reverse=True))
+        read_log(write_blackbox(path), motion=create_mocap(of_other_flight=True))
     with pytest.raises(ConfigError, match=r"gyroADC\[1\]"):
         read_log(write_blackbox(path, leave_out=["gyroADC[1]"]), motion=create_mocap())
     with pytest.raises(ConfigError, match="degrees per second"):
@@ -157,7 +155,7 @@ def test_ros_bags_are_read_by_the_types_of_their_topics(tmp_path, odometry):
     angle, rate = swing(log.t + 5.0)
     np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]) * np.sign(log.quat[0, 3]), angle, atol=1e-3)
     np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=1e-6)
-    # Linear interpolation of the twist; the velocity that is differentiated lacks up to 0.06 s at both ends.
+    # A logged twist is interpolated linearly; a differentiated velocity lacks up to 0.06 s at both ends.
     np.testing.assert_allclose(log.vel[12:-12, 1], drift(log.t + 5.0)[1][12:-12], atol=1e-2)
     np.testing.assert_allclose(log.vel[:, ::2], 0, atol=2e-3)
     np.testing.assert_allclose(log.rotor_vel[7], np.arange(100, 500, 100) * 60 / (2 * np.pi))
@@ -173,9 +171,9 @@ def test_ros_bags_are_read_by_a_map_of_topics(tmp_path):
         rpm_per_unit=60 / (2 * np.pi),
     )
     path = write_bag(tmp_path / "flight", odometry=False)
-    log, same = read_log(path, columns), read_log(path)
+    log, log_by_types = read_log(path, columns), read_log(path)
     for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
-        np.testing.assert_allclose(getattr(log, key), getattr(same, key), err_msg=key)
+        np.testing.assert_allclose(getattr(log, key), getattr(log_by_types, key), err_msg=key)
 
 
 def test_ros_bags_without_a_topic_or_a_field_are_refused(tmp_path):

@@ -47,7 +47,7 @@ def live(sim):
     return live
 
 
-class Running:
+class LoopThread:
     """A loop that runs in a thread while a test uses the page."""
 
     def __init__(self, live):
@@ -64,7 +64,7 @@ class Running:
 
 
 def project_point(chromium, point, size):
-    """Return column and row of a point in the first view of the page's camera."""
+    """Return column and row of a point as the page's camera shows it at first, for worlds of a size, m."""
     position, target = np.array([0.0, -0.9 * size, 0.6 * size + 0.5]), np.array([0, 0, 0.5])
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
@@ -104,7 +104,7 @@ def test_a_page_shows_the_simulation_and_commands_it(chromium, live, caplog):
     live.slider(f"slider {MARKUP}", 0.0, 10.0, 5.0, lambda live, value: values.append(value))
     live.quantities[f"quantity {MARKUP}"] = lambda live: 1.0
     page = live.show(Browser(port=0, trail=0.5, plot=f"quantity {MARKUP}"))
-    with Running(live):
+    with LoopThread(live):
         chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
@@ -124,9 +124,9 @@ def test_a_page_shows_the_simulation_and_commands_it(chromium, live, caplog):
         np.testing.assert_allclose(clicked[0][1], [-0.5, -1.0, 0.0], atol=0.05)
 
         # Buttons: single steps, events, pause, reset.
-        step = live.step
+        initial_step = live.step
         press(chromium, "step")
-        wait_for(lambda: live.step == step + 1)
+        wait_for(lambda: live.step == initial_step + 1)
         press(chromium, "Shoot")
         wait_for(lambda: values == ["shot"])
         press(chromium, "pause")
@@ -169,8 +169,8 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
     live = Live(sim, fps=10)
     live.paused = True
     page = live.show(Browser(port=0, spacing=3.0, trail=0.5))
-    size = 3.0 + 2.0  # of the grid: the distance of the worlds, and 1 m of margin on both sides
-    with Running(live):
+    size = 3.0 + 2.0  # extent of the grid, m: the distance of the worlds, and a margin of 1 m on both sides
+    with LoopThread(live):
         chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
@@ -213,19 +213,19 @@ def test_a_port_in_use_is_named(viser, live, caplog):
 
 
 def test_closing_does_not_wait_for_unused_connections(viser, live, monkeypatch):
-    """Browsers open connections in advance, for which viser waits."""
+    """Browsers open connections in advance, and viser's ``stop`` waits until they are closed."""
     page = live.show(Browser(port=0))
-    unused, ended = threading.Event(), []
+    connections_closed, finished_waits = threading.Event(), []
 
     def stop(real=page._server.stop):
-        ended.append(unused.wait(300))
+        finished_waits.append(connections_closed.wait(300))
         real()
 
     monkeypatch.setattr(page._server, "stop", stop)
     live.close()
-    assert not ended
+    assert not finished_waits
     assert not page.is_open
-    unused.set()
+    connections_closed.set()
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from crazysim.lab.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.lab.live.swarm import Swarm
 from crazysim.plugins.effects import Battery
 
-OFFSET = 0.02
-"""Distance that a drone may still be from its setpoint shortly after a move, m."""
+MAX_DISTANCE = 0.02
+"""Largest distance of a drone from its setpoint shortly after a move, m."""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_hover_and_land(script):
     cf.arm(True)
     cf.takeoff(targetHeight=1.0, duration=2.5)
     timeHelper.sleep(2.5 + 1.0)
-    assert cf.position()[2] == pytest.approx(1.0, abs=OFFSET)
+    assert cf.position()[2] == pytest.approx(1.0, abs=MAX_DISTANCE)
     assert cf.get_status()["supervisor"] & 16
     cf.goTo(cf.initialPosition + [0, 0.5, 1.0], yaw=0.0, duration=2.0)
     timeHelper.sleep(3.0)
@@ -112,7 +112,7 @@ def test_streamed_hover_setpoints(script):
     for _ in range(40):
         cf.cmdHover(0.0, 0.0, 0.0, 0.6)
         timeHelper.sleep(0.1)
-    assert cf.position()[2] == pytest.approx(0.6, abs=OFFSET)
+    assert cf.position()[2] == pytest.approx(0.6, abs=MAX_DISTANCE)
     for _ in range(20):
         cf.cmdHover(0.3, 0.0, 0.0, 0.6)
         timeHelper.sleep(0.1)
@@ -163,7 +163,7 @@ def test_groups_parameters_and_lights(script):
     allcfs.takeoff(targetHeight=0.5, duration=1.0, groupMask=2)
     timeHelper.sleep(1.5)
     assert first.position()[2] < 0.02
-    assert second.position()[2] == pytest.approx(0.5, abs=OFFSET)
+    assert second.position()[2] == pytest.approx(0.5, abs=MAX_DISTANCE)
     first.setLEDColor(1, 0.5, 2)
     allcfs.setParam("ring.solidBlue", 51)
     np.testing.assert_allclose(script.swarm.colors[0], [1, 127 / 255, 0.2])
@@ -252,7 +252,7 @@ def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
         cfs[0].setParam("ring.solidGreen", 255)
         clock.sleep(0.5)
         clock.sleep(0.0)
-        np.testing.assert_allclose(cfs[1].position()[2], 1.0, atol=OFFSET + 0.05)
+        np.testing.assert_allclose(cfs[1].position()[2], 1.0, atol=MAX_DISTANCE + 0.05)
         assert clock.time() == pytest.approx(3.5)
         assert live.time == pytest.approx(3.5)
     assert len(recorder.lights) > 5

@@ -24,8 +24,8 @@ from crazysim.plugins.sensors.range_finder import RangeFinder
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
-OFFSET = 0.02
-"""Distance that a drone may still be from its setpoint a second after a move, m."""
+MAX_DISTANCE = 0.02
+"""Largest distance of a drone from its setpoint a second after a move, m."""
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def swarm():
 
 
 @pytest.fixture
-def running(swarm, request):
+def running_swarm(swarm, request):
     """Return the swarm on the floor, advanced by a thread at a multiple of real time."""
     swarm.sim.reset()
     swarm.advance(0.02)
@@ -44,34 +44,36 @@ def running(swarm, request):
 
 
 @pytest.fixture
-def uri(running):
-    yield add_cflib_driver(running)[0]
-    remove_cflib_driver(running)
+def uri(running_swarm):
+    yield add_cflib_driver(running_swarm)[0]
+    remove_cflib_driver(running_swarm)
 
 
-def test_the_high_level_commander(running, uri):
+def test_the_high_level_commander(running_swarm, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
         commander = scf.cf.high_level_commander
         commander.takeoff(0.8, 1.5)
-        running.sleep(2.5)
-        assert running.state(0).pos[2] == pytest.approx(0.8, abs=OFFSET)
+        running_swarm.sleep(2.5)
+        assert running_swarm.state(0).pos[2] == pytest.approx(0.8, abs=MAX_DISTANCE)
         commander.go_to(0.4, 0.0, 0.0, np.pi / 2, 1.5, relative=True)
-        running.sleep(2.5)
-        np.testing.assert_allclose(running.state(0).pos[:2], [-0.1, -0.5], atol=0.05)
-        assert running.state(0).rpy[2] == pytest.approx(np.pi / 2, abs=0.05)
+        running_swarm.sleep(2.5)
+        np.testing.assert_allclose(running_swarm.state(0).pos[:2], [-0.1, -0.5], atol=0.05)
+        assert running_swarm.state(0).rpy[2] == pytest.approx(np.pi / 2, abs=0.05)
         assert scf.cf.supervisor.hl_traj_finished
         commander.land(0.0, 1.5)
-        running.sleep(2.5)
-        assert running.state(0).pos[2] < 0.02
+        running_swarm.sleep(2.5)
+        assert running_swarm.state(0).pos[2] < 0.02
         assert not scf.cf.supervisor.is_flying
 
 
 def test_accelerations_are_logged_in_the_frames_of_the_firmware():
     """A drone that pitches by 90 degrees, with its thrust along x of the world, falls: -1 g along z."""
-    half = math.sqrt(0.5)
-    state = DroneState(0.0, np.zeros(3), np.array([0, half, 0, half]), np.zeros(3), np.zeros(3), np.array([0, 0, 9.81]))
+    sqrt_half = math.sqrt(0.5)
+    state = DroneState(
+        0.0, np.zeros(3), np.array([0, sqrt_half, 0, sqrt_half]), np.zeros(3), np.zeros(3), np.array([0, 0, 9.81])
+    )
     logged = {
         name: LOG_VARIABLES[name][1](state, None)
         for name in LOG_VARIABLES
@@ -81,7 +83,7 @@ def test_accelerations_are_logged_in_the_frames_of_the_firmware():
     assert list(logged) == [f"stateEstimate.a{axis}" for axis in "xyz"] + [f"acc.{axis}" for axis in "xyz"]
 
 
-def test_log_configurations_and_the_synchronous_logger(running, uri):
+def test_log_configurations_and_the_synchronous_logger(running_swarm, uri):
     from cflib.crazyflie.log import LogConfig
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
     from cflib.crazyflie.syncLogger import SyncLogger
@@ -112,7 +114,7 @@ def test_log_configurations_and_the_synchronous_logger(running, uri):
     assert received[0][2] == "other"
 
 
-def test_parameters_are_set_and_read(running, uri):
+def test_parameters_are_set_and_read(running_swarm, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
@@ -128,10 +130,10 @@ def test_parameters_are_set_and_read(running, uri):
             param.set_value("deck.bcFlow2", 0)
         wait_for(lambda: called)
     assert called == [("ring.solidRed", "51")]
-    np.testing.assert_allclose(running.colors[0], [0.2, 1.0, 0.0])
+    np.testing.assert_allclose(running_swarm.colors[0], [0.2, 1.0, 0.0])
 
 
-def test_a_parameter_that_is_not_simulated_keeps_its_value_and_is_reported(running, uri):
+def test_a_parameter_that_is_not_simulated_keeps_its_value_and_is_reported(running_swarm, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
@@ -147,7 +149,7 @@ def test_a_parameter_that_is_not_simulated_keeps_its_value_and_is_reported(runni
     assert "pid_attitude.pitch_kd = 0.1234; it stays 0. The guide" in "".join(lines)
 
 
-def test_a_reset_of_the_estimator_sets_the_initial_pose(running, uri):
+def test_a_reset_of_the_estimator_sets_the_initial_pose(running_swarm, uri):
     """A drone at (-0.5, -0.5), yaw 0, whose estimate is reset to (1, 1), yaw 90 degrees: its x is the world's -y."""
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
     from cflib.utils.reset_estimator import reset_estimator
@@ -158,17 +160,17 @@ def test_a_reset_of_the_estimator_sets_the_initial_pose(running, uri):
         reset_estimator(scf)
         commander = scf.cf.high_level_commander
         commander.takeoff(0.6, 1.5, yaw=None)
-        running.sleep(2.0)
+        running_swarm.sleep(2.0)
         commander.go_to(0.6, 1.0, 0.6, np.pi / 2, 1.5)
-        running.sleep(2.5)
-        np.testing.assert_allclose(running.state(0).pos[:2], [-0.5, -0.1], atol=0.05)
-        assert running.state(0).rpy[2] == pytest.approx(0.0, abs=0.05)
-        estimate = running["cf1"].estimate(running.state(0))
+        running_swarm.sleep(2.5)
+        np.testing.assert_allclose(running_swarm.state(0).pos[:2], [-0.5, -0.1], atol=0.05)
+        assert running_swarm.state(0).rpy[2] == pytest.approx(0.0, abs=0.05)
+        estimate = running_swarm["cf1"].estimate(running_swarm.state(0))
         np.testing.assert_allclose(estimate.pos[:2], [0.6, 1.0], atol=0.05)
         commander.stop()
 
 
-def test_clients_read_decks_and_memories(running, uri):
+def test_clients_read_decks_and_memories(running_swarm, uri):
     from cflib.crazyflie.mem import MemoryElement
     from cflib.crazyflie.mem.deck_memory import SyncDeckMemoryManager
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
@@ -184,12 +186,12 @@ def test_clients_read_decks_and_memories(running, uri):
         for led in leds.leds:
             led.set(255, 0, 255)
         leds.write_data(None)
-        wait_for(lambda: running.colors[0, 0] == 1)
-    np.testing.assert_allclose(running.colors[0], [1, 0, 1])
+        wait_for(lambda: running_swarm.colors[0, 0] == 1)
+    np.testing.assert_allclose(running_swarm.colors[0], [1, 0, 1])
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_uploaded_trajectories(running, uri, compressed):
+def test_uploaded_trajectories(running_swarm, uri, compressed):
     from cflib.crazyflie.mem import CompressedSegment, CompressedStart, MemoryElement, Poly4D
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
@@ -206,43 +208,43 @@ def test_uploaded_trajectories(running, uri, compressed):
         commander = scf.cf.high_level_commander
         commander.define_trajectory(1, 0x40, len(pieces), type=int(compressed))
         commander.takeoff(0.6, 1.5)
-        running.sleep(2.0)
+        running_swarm.sleep(2.0)
         commander.start_trajectory(1, 1.0, relative_position=True)
-        running.sleep(2.5)
-        np.testing.assert_allclose(running.state(0).pos[:2], [0.1, -0.5], atol=0.05)
-        assert not running.reports.latest
+        running_swarm.sleep(2.5)
+        np.testing.assert_allclose(running_swarm.state(0).pos[:2], [0.1, -0.5], atol=0.05)
+        assert not running_swarm.reports.latest
         commander.start_trajectory(1, 2.0, relative_position=True)
-        running.sleep(1.0)
+        running_swarm.sleep(1.0)
         commander.stop()
     # As in the firmware, which does not stretch compressed trajectories.
-    assert ["timescale 2" in report.text for report in running.reports.latest] == [True] * compressed
+    assert ["timescale 2" in report.text for report in running_swarm.reports.latest] == [True] * compressed
 
 
-@pytest.mark.parametrize("running", [4.0], indirect=True)  # a stream must not be late
-def test_motion_commander_and_streamed_setpoints(running, uri):
+@pytest.mark.parametrize("running_swarm", [4.0], indirect=True)  # a stream must not be late
+def test_motion_commander_and_streamed_setpoints(running_swarm, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
         commander = scf.cf.commander
         for _ in range(20):
             commander.send_position_setpoint(-0.5, -0.5, 0.7, 0.0)
-            running.sleep(0.1)
-        assert running.state(0).pos[2] == pytest.approx(0.7, abs=OFFSET)
+            running_swarm.sleep(0.1)
+        assert running_swarm.state(0).pos[2] == pytest.approx(0.7, abs=MAX_DISTANCE)
         for _ in range(10):
             commander.send_hover_setpoint(0.3, 0.0, 0.0, 0.7)
-            running.sleep(0.1)
-        assert running.state(0).pos[0] > -0.45
-        yaw = running.state(0).rpy[2]
+            running_swarm.sleep(0.1)
+        assert running_swarm.state(0).pos[0] > -0.45
+        yaw = running_swarm.state(0).rpy[2]
         for _ in range(10):
             commander.send_velocity_world_setpoint(0.0, 0.0, 0.0, 45.0)
-            running.sleep(0.1)
-        assert running.state(0).rpy[2] > yaw + 0.2  # positive turns to the left
+            running_swarm.sleep(0.1)
+        assert running_swarm.state(0).rpy[2] > yaw + 0.2  # positive turns to the left
         commander.send_stop_setpoint()
-        running.sleep(0.5)
-        assert not running["cf1"].motors_on
+        running_swarm.sleep(0.5)
+        assert not running_swarm["cf1"].motors_on
 
 
-def test_scripts_use_udp_with_a_changed_uri(running):
+def test_scripts_use_udp_with_a_changed_uri(running_swarm):
     import cflib.crtp
     from cflib.crazyflie.swarm import CachedCfFactory
     from cflib.crazyflie.swarm import Swarm as CfSwarm
@@ -250,22 +252,22 @@ def test_scripts_use_udp_with_a_changed_uri(running):
     cflib.crtp.CLASSES.clear()
     cflib.crtp.init_drivers()
     try:
-        with CrtpServer(running, port=0) as server:
+        with CrtpServer(running_swarm, port=0) as server:
             assert all(address.startswith("udp://127.0.0.1:") for address in server.uris)
             with CfSwarm(set(server.uris), factory=CachedCfFactory(rw_cache=None)) as drones:
                 drones.parallel_safe(lambda scf: scf.cf.high_level_commander.takeoff(0.6, 1.5))
-                running.sleep(2.5)
+                running_swarm.sleep(2.5)
                 positions = drones.get_estimated_positions()
                 for k, address in enumerate(server.uris):
-                    np.testing.assert_allclose(positions[address], running.state(k).pos, atol=0.1)
-                    assert running.state(k).pos[2] > 0.4
-            running.sleep(2.0)
-            assert running.state(0).pos[2] < 0.1  # cflib stops the motors when it disconnects
+                    np.testing.assert_allclose(positions[address], running_swarm.state(k).pos, atol=0.1)
+                    assert running_swarm.state(k).pos[2] > 0.4
+            running_swarm.sleep(2.0)
+            assert running_swarm.state(0).pos[2] < 0.1  # cflib stops the motors when it disconnects
     finally:
         cflib.crtp.CLASSES.clear()
 
 
-def test_scanning_lists_the_drones(running, uri):
+def test_scanning_lists_the_drones(running_swarm, uri):
     import cflib.crtp
 
     assert cflib.crtp.CLASSES[0]().scan_interface() == [["sim://cf1", ""], ["sim://cf2", ""]]
@@ -337,19 +339,19 @@ def test_a_server_answers_scans_and_warns_if_a_network_can_reach_it(swarm, caplo
         assert "every machine of that network can fly the drones" in caplog.text
 
 
-@pytest.mark.parametrize("wait", ["server", "start"])
-def test_a_step_is_compiled_before_clients_wait(wait):
+@pytest.mark.parametrize("starter", ["server", "thread"])
+def test_a_step_is_compiled_before_clients_wait(starter):
     """``aiocflib`` gives up after 0.6 s without an answer; compilation of a step takes longer."""
-    sim, traced = Sim(control="state", engine="interpret"), []
-    append_fn(sim.step_pipeline, lambda data: (traced.append(1), data)[1], "traced")
+    sim, traces = Sim(control="state", engine="interpret"), []
+    append_fn(sim.step_pipeline, lambda data: (traces.append(1), data)[1], "traced")
     swarm = Swarm(sim)
-    waiting = CrtpServer(swarm, port=0) if wait == "server" else swarm.start(speed=1e-6)
-    n = len(traced)
-    waiting.close()
+    service = CrtpServer(swarm, port=0) if starter == "server" else swarm.start(speed=1e-6)
+    n = len(traces)
+    service.close()
     assert n > 0
-    assert float(sim.time[0, 0]) <= (0.0 if wait == "server" else 0.011)  # the thread may have taken one step
+    assert float(sim.time[0, 0]) <= (0.0 if starter == "server" else 0.011)  # the thread may have taken one step
     swarm.advance(0.02)
-    assert len(traced) == n
+    assert len(traces) == n
 
 
 # Packets ------------------------------------------------------------------------------------------------------------
@@ -364,6 +366,7 @@ def device(swarm):
 
 
 def send(device, port, channel, data):
+    """Return the answers of a device to a packet."""
     return [bytes(answer) for answer in device.handle(bytes([port << 4 | 0x0C | channel]) + bytes(data))]
 
 
@@ -420,8 +423,8 @@ def test_numbers_are_clipped_to_the_range_of_their_type():
 
 def test_log_variables_of_a_user(swarm):
     device = CrtpDevice(swarm, 1, log={"range.front": ("uint16_t", lambda state, commander: 1234.0)})
-    k = device.log.ids["range.front"]
-    send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 2, k))
+    variable = device.log.ids["range.front"]
+    send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 2, variable))
     send(device, 5, 1, b"\x03\x01\x01")
     swarm.advance(0.05)
     (packet,) = device.due_packets()
@@ -479,8 +482,8 @@ def test_any_packet_is_answered_or_reported_and_the_setpoint_stays_finite(swarm,
             assert 1 <= len(answer) <= 31
         command = device.commander.tick(device.commander.now + 0.01, np.zeros(3), np.zeros(3), 0.0)
         assert command is None or np.isfinite(command.astype(np.float32)).all()
-        for due in device.due_packets():
-            assert len(due) <= 31
+        for packet in device.due_packets():
+            assert len(packet) <= 31
 
 
 @settings(max_examples=50, deadline=None)

@@ -23,9 +23,9 @@ from crazysim.lab.show_files import Lights, Show
 from crazysim.trajectories import Trajectory, hover, line
 
 RED, BLUE, OFF = (1, 0, 0), (0, 0, 1), (0, 0, 0)
-SETTLED = 0.12
-"""Distance from the setpoint 2 s after a move, m: the integral of the default controller, wound up on the floor, decays
-slowly."""
+MAX_DISTANCE = 0.12
+"""Largest distance from the setpoint 2 s after a move, m: the integral of the default controller grows on the floor and
+decays slowly."""
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +56,13 @@ def test_flight_by_commands(sim):
     step, plan = sim.step_fn, sim.step_fn.plan(sim.data)
     assert fleet.apply([TakeOff(None, 0.8)]) == 1
     sim.step(1500)
-    np.testing.assert_allclose(read_positions(sim)[:, 2], 0.8, atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[:, 2], 0.8, atol=MAX_DISTANCE)
 
     start = read_positions(sim)[2]
     fleet.apply([Upload(7, line((5, 5, 5), (5, 6, 5), 2.0)), Start(7, relative=True)])
     sim.step(1500)
-    np.testing.assert_allclose(read_positions(sim)[2] - start, [0, 1, 0], atol=SETTLED)
-    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[2] - start, [0, 1, 0], atol=MAX_DISTANCE)
+    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=MAX_DISTANCE)
 
     fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8), 2.0)), Start(7)])
     sim.step(500)
@@ -72,11 +72,11 @@ def test_flight_by_commands(sim):
     np.testing.assert_allclose(staged_pos, setpoint[:3], atol=0.03)  # at most a control step apart
     assert 0.2 < setpoint[1] < 0.8
     sim.step(1000)
-    np.testing.assert_allclose(read_positions(sim)[2], setpoint[:3], atol=SETTLED)
+    np.testing.assert_allclose(read_positions(sim)[2], setpoint[:3], atol=MAX_DISTANCE)
     fleet.apply([Land(None), SetParameter(7, "stabilizer.controller", 2.0)])
     assert fleet.parameters == [{}, {}, {"stabilizer.controller": 2.0}]
     sim.step(1500)
-    assert np.all(read_positions(sim)[:, 2] < SETTLED)
+    assert np.all(read_positions(sim)[:, 2] < MAX_DISTANCE)
     assert sim.step_fn is step
     assert sim.step_fn.plan(sim.data) is plan
 
@@ -87,7 +87,9 @@ def test_show_by_commands(sim):
     fleet = Fleet(sim, max_pieces=8)
     assert fleet.apply([StartShow()]) == 0  # nothing to start
     fleet.apply([LoadShow(show)])
-    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 0, 0.5], [1, 0, 0.5]])  # as the lab's simulator does
+    np.testing.assert_allclose(
+        read_positions(sim)[:2], [[0, 0, 0.5], [1, 0, 0.5]]
+    )  # loading a show moves its drones, as in the lab's simulator
     sim.step(250)
     np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))  # the show has not started
     assert fleet.apply([StartShow()]) == 1
@@ -96,8 +98,8 @@ def test_show_by_commands(sim):
     sim.step(600)
     np.testing.assert_array_equal(fleet.colors(), [BLUE, BLUE, OFF])  # 1.2 s later
     sim.step(900)
-    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=SETTLED)
-    assert read_positions(sim)[2, 2] < SETTLED
+    np.testing.assert_allclose(read_positions(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=MAX_DISTANCE)
+    assert read_positions(sim)[2, 2] < MAX_DISTANCE
     fleet.reset()
     np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))
 
@@ -105,13 +107,12 @@ def test_show_by_commands(sim):
 def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     fleet = Fleet(sim, ids={1: 0, 2: 1, 3: 2}, max_pieces=2, teleport=False)
     last_data = sim.data
-    c = np.zeros((3, 4, 1))
-    long = Trajectory.of_pieces([1.0] * 3, c)
-    high = Trajectory.of_pieces([1.0], np.zeros((1, 4, 9)))
-    many = Show(tuple("abcd"), Trajectory.stack([hover()] * 4), Lights.stack([Lights.constant()] * 4))
-    big = Show(("a",), Trajectory.stack([long]), Lights.stack([Lights.constant()]))
-    uploads = [Upload(1, long), Upload(1, high), Upload(None, Trajectory.stack([hover()]))]
-    wrong = [*uploads, Start(1), Start(None), Land(4), LoadShow(many), LoadShow(big)]
+    long_trajectory = Trajectory.of_pieces([1.0] * 3, np.zeros((3, 4, 1)))
+    high_degree = Trajectory.of_pieces([1.0], np.zeros((1, 4, 9)))
+    large_show = Show(tuple("abcd"), Trajectory.stack([hover()] * 4), Lights.stack([Lights.constant()] * 4))
+    long_show = Show(("a",), Trajectory.stack([long_trajectory]), Lights.stack([Lights.constant()]))
+    uploads = [Upload(1, long_trajectory), Upload(1, high_degree), Upload(None, Trajectory.stack([hover()]))]
+    wrong = [*uploads, Start(1), Start(None), Land(4), LoadShow(large_show), LoadShow(long_show)]
     assert fleet.apply(wrong) == 0
     assert caplog.text.count("refused: expected") == len(wrong)
     assert sim.data is last_data
@@ -150,5 +151,5 @@ def test_commands_over_the_network_while_the_simulation_runs(sim):
                 fleet.apply(server.commands())
                 sim.step(50)
                 heights.append(read_positions(sim)[:, 2])
-    np.testing.assert_allclose(heights[-1][:2], [0.6, 0.4], atol=SETTLED)
-    assert heights[-1][2] < SETTLED
+    np.testing.assert_allclose(heights[-1][:2], [0.6, 0.4], atol=MAX_DISTANCE)
+    assert heights[-1][2] < MAX_DISTANCE

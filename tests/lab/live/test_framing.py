@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from crazysim.lab.live import framing
 from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 
-TRICKY = {"name": '_EOF "quoted\\" {', "odd": '" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
-JSON = json.dumps(TRICKY).encode()
+TRICKY_VALUE = {"name": '_EOF "quoted\\" {', "odd": '" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
+"""JSON value that contains the delimiters of messages."""
+JSON = json.dumps(TRICKY_VALUE).encode()
 ARCHIVE = (
     b"PK\x03\x04 data with SKYC and PK\x05\x06 inside" + bytes(30) + b"PK\x05\x06" + bytes(16) + b"\x04\x00" + b"note"
 )
@@ -29,7 +30,7 @@ STREAM = [
     (b"CMDSTART_4_traj_relative_" + JSON + b"_EOF", Message(4, "traj", "relative", JSON)),
     (b"CMDSTART_hover_EOF", Message(None, "hover", "")),
 ]
-"""Messages of the lab's programs, and their meaning."""
+"""Bytes that the lab's programs send, and the message that they encode."""
 BYTES = b"".join(message for message, _ in STREAM)
 EXPECTED = [expected for _, expected in STREAM]
 
@@ -130,13 +131,13 @@ parts = st.sampled_from(
 
 @given(st.lists(parts, max_size=40), st.integers(0, 10**6))
 def test_any_bytes_are_messages_or_refused_however_they_are_split(pieces, seed):
-    stream, pick = b"".join(pieces), random.Random(seed)
+    stream, rng = b"".join(pieces), random.Random(seed)
 
-    def read(size):
+    def read(choose_size):
         buffer, messages, start = MessageBuffer(), [], 0
         try:
             while start < len(stream):
-                n = size()
+                n = choose_size()
                 for message in buffer.feed(stream[start : start + n]):
                     messages.append(message)
                 start += n
@@ -144,4 +145,4 @@ def test_any_bytes_are_messages_or_refused_however_they_are_split(pieces, seed):
             messages.append(FramingError)
         return messages
 
-    assert read(lambda: len(stream)) == read(lambda: pick.randint(1, 5))
+    assert read(lambda: len(stream)) == read(lambda: rng.randint(1, 5))

@@ -10,7 +10,7 @@ from crazysim.lab.live.circles import CIRCLE_DURATION, CLIMB_DURATION, HEIGHT, R
 from crazysim.media import Flight
 
 
-def test_a_headless_flight_prints_the_factor(tmp_path, capsys):
+def test_a_headless_flight_prints_the_real_time_factor(tmp_path, capsys):
     path = tmp_path / "f.journal"
     arguments = ["--drones", "3", "--seconds", "4", "--headless", "--speed", "max", "--record", str(path)]
     assert main(["live", *arguments]) == 0

@@ -188,11 +188,11 @@ def test_wrong_requests_are_reported_and_the_run_continues(live, caplog):
     assert "time of 0 s or more, got -1.0" in caplog.text
 
 
-class Counter(Viewer):
-    """A viewer that counts its pictures, is closed after some, and may be slow or broken."""
+class CountingViewer(Viewer):
+    """A viewer that counts its pictures, closes after ``max_pictures``, and takes ``work`` seconds or fails."""
 
-    def __init__(self, until=10**9, work=0.0, broken=False):
-        self.n, self._until, self._work, self._broken, self.closed = 0, until, work, broken, False
+    def __init__(self, max_pictures=10**9, work=0.0, broken=False):
+        self.n, self._max_pictures, self._work, self._broken, self.closed = 0, max_pictures, work, broken, False
 
     def open(self, live):
         self.n = 0
@@ -205,7 +205,7 @@ class Counter(Viewer):
 
     @property
     def is_open(self):
-        return self.n < self._until
+        return self.n < self._max_pictures
 
     def close(self):
         self.closed = True
@@ -213,7 +213,7 @@ class Counter(Viewer):
 
 def test_pictures_come_at_their_own_rate(live):
     live.speed = 0.5  # control steps every 20 ms
-    viewer = live.show(Counter())
+    viewer = live.show(CountingViewer())
     report = live.run(0.5)
     assert 2 < viewer.n < 50 * report.wall_s + 4  # 50 a second and one before, fewer on a busy machine
     assert report.n_pictures == pytest.approx(viewer.n, abs=1)
@@ -221,7 +221,7 @@ def test_pictures_come_at_their_own_rate(live):
 
 def test_the_run_ends_when_the_last_viewer_is_closed(live):
     live.speed = 1.0
-    first, second = live.show(Counter(until=3)), live.show(Counter(until=8))
+    first, second = live.show(CountingViewer(max_pictures=3)), live.show(CountingViewer(max_pictures=8))
     live.run()
     assert first.closed
     assert second.closed
@@ -230,16 +230,16 @@ def test_the_run_ends_when_the_last_viewer_is_closed(live):
 
 def test_a_broken_viewer_is_closed_and_named(live, caplog):
     live.speed = 1.0
-    broken, other = live.show(Counter(broken=True)), live.show(Counter())
+    broken, other = live.show(CountingViewer(broken=True)), live.show(CountingViewer())
     report = live.run(0.3)
     assert report.simulated_s == pytest.approx(0.3)
     assert broken.closed
     assert not other.closed
-    assert "Counter failed" in caplog.text
+    assert "CountingViewer failed" in caplog.text
     assert "no light" in caplog.text
 
 
-class Equal(Counter):
+class EqualViewer(CountingViewer):
     """A viewer that equals every other viewer, as two windows with the same settings do."""
 
     def __eq__(self, other):
@@ -250,7 +250,7 @@ class Equal(Counter):
 
 def test_only_the_closed_one_of_two_equal_viewers_is_removed(live):
     live.speed = 1.0
-    open_viewer, closed_viewer = live.show(Equal()), live.show(Equal(until=2))
+    open_viewer, closed_viewer = live.show(EqualViewer()), live.show(EqualViewer(max_pictures=2))
     live.run(0.3)
     assert closed_viewer.closed
     assert not open_viewer.closed

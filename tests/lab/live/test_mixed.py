@@ -7,7 +7,7 @@ from crazysim import Sim
 from crazysim.lab.live import FunctionSource, Live, MocapSource, RealTimeSource, Swarm, ThreadSource, Twin, Twins
 from crazysim.lab.live.mocap import Frame, Poll
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
 class SilentSource(ThreadSource):
@@ -29,7 +29,7 @@ class FailingSource(ThreadSource):
 def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
     sim = Sim(n_drones=2, control="state")
     swarm = Swarm(sim)
-    moving = RealTimeSource(FunctionSource(lambda t: {"cf1": ((1.0 + 0.1 * t, 0, 1), LEVEL)}, 200.0)).start()
+    moving = RealTimeSource(FunctionSource(lambda t: {"cf1": ((1.0 + 0.1 * t, 0, 1), LEVEL_QUAT)}, 200.0)).start()
     silent, failing = SilentSource("silent").start(), FailingSource("failing").start()
     twins = [
         Twins(sim, source, {"": Twin("box")}, [name])
@@ -70,12 +70,12 @@ class HostileSource(MocapSource):
             case 90:
                 stamp = np.nan
             case 100:
-                names = ("a", "ghost")  # nobody knows
+                names = ("a", "ghost")  # a body without a twin
             case 110:
                 names = ("b", "b")
             case k if k >= 120:
                 return Poll(now, [])  # stops
-        return Poll(now, [Frame(stamp, names, pos, np.tile(LEVEL, (2, 1)), now)])
+        return Poll(now, [Frame(stamp, names, pos, np.tile(LEVEL_QUAT, (2, 1)), now)])
 
 
 def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog):
@@ -101,5 +101,5 @@ def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog
         assert f"{name} {kind} at {time:.3f} s" in caplog.text
     np.testing.assert_allclose(xs[119], 0.119, atol=1e-6)
     assert np.abs(np.diff(xs)).max() < 0.01, "no jump and no NaN reaches the scene"
-    np.testing.assert_allclose(xs[-1], 0.119, atol=1e-6)  # it stays where it was seen last
-    np.testing.assert_allclose(sim.data.states.pos[0, 0, 2], 1.0, atol=0.2)  # it has just risen there
+    np.testing.assert_allclose(xs[-1], 0.119, atol=1e-6)  # the twin stays where the body was seen last
+    np.testing.assert_allclose(sim.data.states.pos[0, 0, 2], 1.0, atol=0.2)  # the drone has risen to its setpoint

@@ -1,4 +1,4 @@
-"""Sticks move setpoints in the drone's axes; keys and gamepads are sticks, and clicks set setpoints."""
+"""Piloting: sticks (keys or a gamepad) move the setpoint in the drone's axes, and clicks set it."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ from crazysim.sim import Sim
 
 
 def test_sticks_move_in_the_axes_of_the_drone():
-    """A second forwards, left, up and turning, from a yaw of 90 degrees: forwards is y, left is -x."""
+    """At a yaw of 90 degrees, forwards is y and left is -x; the third stick moves down, and the fourth turns."""
     start = [1.0, 2.0, 3.0, np.pi / 2]
     np.testing.assert_allclose(move_setpoint(start, [1, 0, 0, 0], 1.0, 2.0, 0.5), [1, 4, 3, np.pi / 2], atol=1e-12)
     np.testing.assert_allclose(move_setpoint(start, [0, 1, 0, 0], 1.0, 2.0, 0.5), [-1, 2, 3, np.pi / 2], atol=1e-12)
@@ -124,22 +124,22 @@ class FakeGlfw:
 
 def test_a_gamepad_is_sticks_and_buttons():
     fake, posted = FakeGlfw(), []
-    pad = Gamepad(glfw=fake)
-    assert pad.name == "Stand-in"
+    gamepad = Gamepad(glfw=fake)
+    assert gamepad.name == "Stand-in"
     live = SimpleNamespace(post=posted.append)
     fake.axes = [0.0, -1.0, 1.0, 0.05, -1.0, -1.0]  # left stick up, right stick to the right, a little drift
-    np.testing.assert_allclose(pad(live), [0, -1, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(gamepad(live), [0, -1, 1, 0], atol=1e-12)
     fake.axes = [-1.0, 0.0, 0.0, -0.5, -1.0, -1.0]
-    np.testing.assert_allclose(pad(live), [(0.5 - DEADBAND) / (1 - DEADBAND), 0, 0, 1])
-    pad.bind("start", len)
+    np.testing.assert_allclose(gamepad(live), [(0.5 - DEADBAND) / (1 - DEADBAND), 0, 0, 1])
+    gamepad.bind("start", len)
     fake.buttons[glfw.GAMEPAD_BUTTON_START] = 1
-    pad(live)
-    pad(live)
+    gamepad(live)
+    gamepad(live)
     assert posted == [len], "once per press"
     fake.is_connected = False
-    np.testing.assert_array_equal(pad(live), 0)
+    np.testing.assert_array_equal(gamepad(live), 0)
     fake.is_connected = True
-    pad(live)
+    gamepad(live)
     assert posted == [len, len], "pressed again after it was connected again"
 
 

@@ -89,7 +89,7 @@ class Node:
         self.callbacks[topic] = lambda fill: callback(fill(kind()))
 
 
-def make_converter(fill):
+def make_message_filler(fill):
     def call(message):
         fill(message)
         return message
@@ -134,14 +134,14 @@ def test_poses_speeds_and_clock(swarm, bridge):
     np.testing.assert_allclose(last.pose.orientation.w, state.quat[3])
     odometry = sent["/cf2/odom"][-1]
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("world", "cf2")
-    speed = odometry.twist.twist.linear
+    linear_vel = odometry.twist.twist.linear
     assert state.rpy[2] > 0.05
     body_vel = np.asarray(rotation.matrix(state.quat)).T @ state.vel
-    np.testing.assert_allclose([speed.x, speed.y, speed.z], body_vel, atol=1e-4)
-    assert abs(speed.y - state.vel[1]) > 0.01
+    np.testing.assert_allclose([linear_vel.x, linear_vel.y, linear_vel.z], body_vel, atol=1e-4)
+    assert abs(linear_vel.y - state.vel[1]) > 0.01
     assert odometry.twist.twist.angular.z == state.ang_vel[2]
-    force = sent["/cf1/imu"][-1].linear_acceleration
-    np.testing.assert_allclose([force.x, force.y, force.z], [0, 0, 9.81], atol=0.1)
+    accel = sent["/cf1/imu"][-1].linear_acceleration
+    np.testing.assert_allclose([accel.x, accel.y, accel.z], [0, 0, 9.81], atol=0.1)
     assert sent["/cf1/imu"][-1].header.frame_id == "cf1"
     car = sent["/car_0/pose"][-1].pose.position
     np.testing.assert_allclose([car.x, car.y, car.z], [1, 2, 0.1], atol=1e-6)
@@ -159,8 +159,8 @@ def test_messages_command_the_drones(swarm, bridge):
         message.pose.orientation.z, message.pose.orientation.w = 2 * math.sin(0.4), 2 * math.cos(0.4)
 
     for _ in range(100):
-        bridge.node.callbacks["/cf2/cmd_vel"](make_converter(climb))
-        bridge.node.callbacks["/cf1/cmd_pose"](make_converter(hold_position))
+        bridge.node.callbacks["/cf2/cmd_vel"](make_message_filler(climb))
+        bridge.node.callbacks["/cf1/cmd_pose"](make_message_filler(hold_position))
         swarm.advance(0.02)
     assert swarm.state("cf2").pos[2] > 0.7
     assert swarm.state("cf2").rpy[2] == pytest.approx(0.6, abs=0.1)
@@ -179,7 +179,7 @@ def test_messages_command_the_drones(swarm, bridge):
     ],
 )
 def test_wrong_commands_are_reported(swarm, bridge, topic, fill, reason):
-    bridge.node.callbacks[f"/cf1/{topic}"](make_converter(fill))
+    bridge.node.callbacks[f"/cf1/{topic}"](make_message_filler(fill))
     (report,) = swarm.reports.latest
     assert (report.kind, report.name) == ("refused", "cf1")
     assert reason in report.text
@@ -193,8 +193,8 @@ def test_attitudes_and_thrust():
         for name, value in zip("xyzw", from_rpy([0.1, -0.2, 0.3]), strict=True):
             setattr(message.quaternion, name, float(value))
 
-    bridge.node.callbacks["/cf1/cmd_thrust"](make_converter(lambda m: setattr(m, "data", 0.4)))
-    bridge.node.callbacks["/cf1/cmd_attitude"](make_converter(tilt))
+    bridge.node.callbacks["/cf1/cmd_thrust"](make_message_filler(lambda m: setattr(m, "data", 0.4)))
+    bridge.node.callbacks["/cf1/cmd_attitude"](make_message_filler(tilt))
     command = swarm["cf1"].tick(0.0, np.zeros(3), np.zeros(3), 0.0)
     np.testing.assert_allclose(command, [0.1, -0.2, 0.3, 0.4], atol=1e-9)
 

@@ -43,14 +43,14 @@ def wait_for_commands(source, n):
     return commands
 
 
-def exchange_bytes(port, *messages, more=False):
-    """Send bytes and return all answers until the server disconnects; if ``more``, the client does not end its side."""
+def exchange_bytes(port, *messages, stay=False):
+    """Send bytes and return all answers until the server disconnects; with ``stay``, the client ends no stream."""
     with socket.create_connection(("127.0.0.1", port), 300.0) as peer:
         answers = b""
         with contextlib.suppress(ConnectionError):
             for message in messages:
                 peer.sendall(message)
-            if not more:
+            if not stay:
                 peer.shutdown(socket.SHUT_WR)
             while received := peer.recv(100):
                 answers += received
@@ -117,7 +117,7 @@ def test_answers_follow_the_protocol(server):
     assert wait_for_commands(server, 3) == [TakeOff(7, 0.5), Land(7), Land(7)]
 
 
-WRONG = [
+WRONG_MESSAGES = [
     b"07_CMDSTART_takeoff_nan_EOF", b"07_CMDSTART_takeoff_-1_EOF", b"07_CMDSTART_takeoff_1e9_EOF",
     b"07_CMDSTART_takeoff_EOF", b"07_CMDSTART_start_sideways_EOF", b"07_CMDSTART_param_x_EOF",
     b"07_CMDSTART_param_x=nan_EOF", b"07_CMDSTART_dance_EOF", b"07_CMDSTART_upload_EOF", b"07_CMDSTART_upload_{}_EOF",
@@ -128,17 +128,17 @@ WRONG = [
 
 def test_invalid_commands_are_refused_and_the_connection_stays(server, caplog):
     with caplog.at_level(logging.WARNING, "crazysim.lab.live"), StreamClient(port=server.stream_port) as stream:
-        for message in WRONG:
+        for message in WRONG_MESSAGES:
             with pytest.raises(ConfigError, match="ERR"):
                 stream.send(message)
         stream.command(7, "hover")
     assert wait_for_commands(server, 1) == [Hover(7)]
-    assert caplog.text.count("command refused: expected") == len(WRONG)
+    assert caplog.text.count("command refused: expected") == len(WRONG_MESSAGES)
 
 
 def test_a_message_that_is_not_completed_is_refused(caplog):
     with CommandServer(drone_port=0, stream_port=0, timeout=0.2) as server:
-        assert exchange_bytes(server.stream_port, b"07_CMDSTART_upload_{", more=True) == b""
+        assert exchange_bytes(server.stream_port, b"07_CMDSTART_upload_{", stay=True) == b""
     assert "complete message within" in caplog.text
 
 
@@ -147,8 +147,8 @@ def test_peers_that_misbehave_are_refused(server, caplog):
     assert exchange_bytes(server.stream_port, b"07_CMDSTART_takeoff_" + b"0" * 10_000) == b""
     assert exchange_bytes(server.drone_port, bytes(10**6)) == b""
     socket.create_connection(("127.0.0.1", server.stream_port)).close()
-    with socket.create_connection(("127.0.0.1", server.stream_port)) as half:
-        half.sendall(b"07_CMDSTART_la")
+    with socket.create_connection(("127.0.0.1", server.stream_port)) as peer:
+        peer.sendall(b"07_CMDSTART_la")
     with StreamClient(port=server.stream_port) as stream:  # other clients are still served
         stream.command(1, "land")
     assert wait_for_commands(server, 1) == [Land(1)]
@@ -184,7 +184,7 @@ def test_waiting_commands_are_bounded(monkeypatch):
 
 
 def test_commands_that_arrive_during_a_call_wait_for_the_next_call():
-    """Queue with a producer as fast as the consumer: it adds a command when one of the first nine is removed."""
+    """A producer is as fast as the consumer: it adds a command whenever one of the first nine is removed."""
     queue = CommandQueue()
     queue._enqueue(Land(1))
     take = queue._queue.get_nowait
@@ -216,7 +216,7 @@ def test_many_clients_at_once(server):
 
 
 @contextlib.contextmanager
-def lab_server(*messages, leaves=False):
+def lab_server(*messages, end_stream=False):
     """Run a server like the lab's stream server, which sends messages to its first client and collects the answers."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         answers = bytearray()
@@ -227,7 +227,7 @@ def lab_server(*messages, leaves=False):
                 for message in messages:
                     peer.sendall(message)
                     time.sleep(0.02)  # in separate packets
-                if leaves:
+                if end_stream:
                     peer.shutdown(socket.SHUT_WR)
                 with contextlib.suppress(OSError):
                     while received := peer.recv(100):
@@ -250,7 +250,7 @@ def test_listener_at_the_servers_stream(caplog):
 
 def test_listener_stops_at_garbage_and_at_the_end(caplog):
     for message, reason in ((b"garbage", "refused"), (b"07_CMDSTART_la", "end of the connection")):
-        with lab_server(message, leaves=True) as (port, _), StreamListener(port=port) as listener:
+        with lab_server(message, end_stream=True) as (port, _), StreamListener(port=port) as listener:
             wait_for(lambda: not listener.is_connected)
             assert listener.commands() == []
         assert reason in caplog.text

@@ -1,4 +1,4 @@
-"""Firmware in the loop: stand-ins that speak each protocol and fly a drone by what they receive."""
+"""Firmware in the loop: stand-ins for firmware speak its protocols and fly a drone with the data that they receive."""
 
 import json
 import socket
@@ -24,7 +24,7 @@ TO_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 TO_FRD = np.diag([1.0, -1, -1])
 """Axes forward, left, up to forward, right, down, and back."""
 HOVER_COMMAND = 0.733
-"""Part of the largest rotor speed at which a cf21B_500 hovers (15,864 of 21,661 rpm)."""
+"""Fraction of the largest rotor speed at which a cf21B_500 hovers (15,864 of 21,661 rpm)."""
 
 
 def rotation_matrix(quat):
@@ -40,22 +40,22 @@ def rotation_matrix(quat):
 def autopilot_commands(link, pos, vel, rotation, gyro):
     """Return the motor commands of a simple autopilot that holds 1 m above the origin and heads east.
 
-    All in the axes east, north, up and forward, left, up; motors by the position and the torque that the firmware gives
-    each of its numbers.
+    World axes are east, north, up; body axes are forward, left, up. The link has the position and yaw torque of each
+    motor of its firmware.
     """
-    wanted = -1.0 * pos - 1.0 * vel
-    thrust = HOVER_COMMAND + 0.15 * (wanted[2] + 1.0)
+    target_acc = -1.0 * pos - 1.0 * vel
+    thrust = HOVER_COMMAND + 0.15 * (target_acc[2] + 1.0)
     tilt = np.cross([0, 0, 1.0], rotation[2])  # from the body's z to the world's z, in the body
-    lean = rotation.T @ np.array([-wanted[1], wanted[0], 0.0]) * 0.1
+    target_tilt = rotation.T @ np.array([-target_acc[1], target_acc[0], 0.0]) * 0.1
     heading = np.arctan2(rotation[1, 0], rotation[0, 0])
-    roll, pitch = (0.3 * (tilt + lean) - 0.03 * gyro)[:2]
+    roll, pitch = (0.3 * (tilt + target_tilt) - 0.03 * gyro)[:2]
     yaw = -0.1 * heading - 0.05 * gyro[2]
     x, y = np.array(link.positions).T
     return np.clip(thrust + y * roll - x * pitch + np.array(link.yaw_torque_signs) * yaw, 0, 1)
 
 
 class StandInThread(threading.Thread):
-    """Thread of a stand-in, which ends when its socket is closed or silent; an error is raised by ``end``."""
+    """Thread of a stand-in. It ends when its socket is closed or silent; ``end`` raises an error of the thread."""
 
     def __init__(self, serve):
         super().__init__(daemon=True)
@@ -102,7 +102,7 @@ def assert_at_goal(sim):
 
 
 class LockstepBetaflight(Betaflight):
-    """The stand-in waits for each answer, so that the flight does not depend on the speed of the machine."""
+    """Link that waits for each answer, so that the flight does not depend on the speed of the machine."""
 
     lockstep = True
 
@@ -122,7 +122,7 @@ def test_betaflight_receives_the_state_and_flies():
             received.append(packet)
             gyro, quat, vel, place = packet[1:4], packet[7:11], packet[11:14], packet[14:17]
             w, x, y, z = quat * [1, 1, -1, -1]
-            degrees = 2 * received[0][14:16] - place[:2]  # the bridge mirrors places at the first one
+            degrees = 2 * received[0][14:16] - place[:2]  # the bridge mirrors positions at the first one
             east, north = (degrees - [20.0, 10.0]) * 111194.93 * np.array([np.cos(np.radians(10.0)), 1])
             pos = np.array([east, north, place[2] - 100.0])
             motors = autopilot_commands(Betaflight, pos, vel, rotation_matrix([x, y, z, w]), TO_FRD @ gyro)
@@ -180,8 +180,8 @@ def test_ardupilot_steps_with_the_simulation_and_flies():
 
 
 def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own():
-    """It ignores fields whose bits are not set, and answers to measurements of the gyroscope alone, once it runs."""
-    n_steps, n_boot, sensors, places, truths = 2000, 20, [], [], []
+    """The stand-in ignores fields whose bits are not set. It answers gyroscope messages, after ``n_boot`` messages."""
+    n_steps, n_boot, sensors, gps_messages, truths = 2000, 20, [], [], []
     link = Px4(port=0, origin=Origin(10.0, 20.0, 100.0))
 
     def serve():
@@ -191,10 +191,10 @@ def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own(
         while len(truths) < n_steps:
             for message in mav.parse_buffer(client.recv(4096)) or []:
                 kind = message.get_type()
-                {"HIL_SENSOR": sensors, "HIL_GPS": places, "HIL_STATE_QUATERNION": truths}[kind].append(message)
+                {"HIL_SENSOR": sensors, "HIL_GPS": gps_messages, "HIL_STATE_QUATERNION": truths}[kind].append(message)
                 if kind != "HIL_SENSOR" or message.fields_updated & 0x38 != 0x38 or len(sensors) < n_boot:
                     continue
-                # A real one estimates its state; the stand-in takes the simulation's.
+                # PX4 estimates the state; the stand-in reads it from the simulation.
                 m = loop.measure()[0]
                 gyro = np.array([message.xgyro, -message.ygyro, -message.zgyro])
                 motors = autopilot_commands(Px4, m.pos, m.vel, rotation_matrix(m.quat), gyro)
@@ -221,18 +221,18 @@ def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own(
     # About the field of central Europe, in the body's axes of a drone that heads east: right is south.
     np.testing.assert_allclose([last.xmag, last.ymag, last.zmag], [0, -0.2, 0.45], atol=0.02)
     assert last.abs_pressure == pytest.approx(1013.25 * (1 - 0.0065 / 288.15 * 101.0) ** 5.2559, rel=1e-4)
-    # The gyroscope has a bias, which the autopilot holds against; the truth does not turn.
+    # The measured rates have the bias of the gyroscope; the true rates are zero.
     assert np.linalg.norm([last.xgyro, last.ygyro, last.zgyro]) > 0.03
     np.testing.assert_allclose([truth.rollspeed, truth.pitchspeed, truth.yawspeed], 0, atol=0.01)
-    # Accelerometer and gyroscope, magnetometer, barometer as PX4 tests for them: all at first, then at their rates.
+    # Bits of accelerometer and gyroscope, magnetometer, barometer: all in the first message, then at their own rates.
     masks = np.array([message.fields_updated for message in sensors])
     for mask, freq in ((0x003F, 125), (0x01C0, 25), (0x1A00, 50)):
         has = masks & mask == mask
         assert has.sum() == 1 + n_steps * freq // 250
         assert not np.any(masks[~has] & mask)
     assert not np.any(masks & ~0x1BFF)  # nothing else: bit 10 would be an airspeed
-    assert len(places) == 1 + n_steps * 10 // 250
-    assert (places[-1].lat, places[-1].lon) == (pytest.approx(10e7, abs=20), pytest.approx(20e7, abs=20))
+    assert len(gps_messages) == 1 + n_steps * 10 // 250
+    assert (gps_messages[-1].lat, gps_messages[-1].lon) == (pytest.approx(10e7, abs=20), pytest.approx(20e7, abs=20))
 
 
 def test_px4_turns_no_motor_while_it_is_disarmed_and_is_given_time_to_start():
@@ -269,13 +269,13 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer():
                 sent.append(np.float32([0.5, 0.6, 0.7, 0.8]) + np.float32(1e-4) * len(sent))
                 peer.sendto(sent[-1].astype("<f4").tobytes(), ("127.0.0.1", ports[0]))
 
-        thread, began = StandInThread(serve), time.monotonic()
+        thread, start_time = StandInThread(serve), time.monotonic()
         loop.run(0.5)
-        assert time.monotonic() - began > 0.49  # the last step begins 4 ms before the end
+        assert time.monotonic() - start_time > 0.49  # the last step begins 4 ms before the end
     thread.end()
     command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._max_rotor_vel[0])[loop._orders[0]]
     assert len(sent) > 1
-    assert min(np.abs(command - each).max() for each in sent) < 1e-6
+    assert min(np.abs(command - motors).max() for motors in sent) < 1e-6
 
 
 def test_attitudes_in_the_axes_of_aviation():
@@ -370,13 +370,13 @@ def test_law_09_channels_times_and_links_are_checked():
 
 
 INVALID_PACKETS = [b"", b"\x01", b"\xff" * 15, b"\x00" * 17, np.float32([np.nan, 0, 0, 0]).tobytes(), bytes(range(200))]
-"""Packets that no firmware sends."""
+"""Packets of a format that no firmware sends."""
 
 
 @pytest.mark.parametrize("kind", [ArduPilot, Betaflight])
 def test_packets_of_another_format_are_skipped_and_extend_no_deadline(kind):
     """The sender stops long after the deadline, and not before ``receive`` has returned."""
-    wait = threading.Event()
+    has_returned = threading.Event()
     settings = {"port": 0} if kind is ArduPilot else {"ports": (0, 9003, 9004)}
     with kind(**settings) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         address = link._link._socket.getsockname()
@@ -384,13 +384,13 @@ def test_packets_of_another_format_are_skipped_and_extend_no_deadline(kind):
         def serve():
             for k in range(6000):
                 peer.sendto(INVALID_PACKETS[k % len(INVALID_PACKETS)], address)
-                if wait.wait(0.005):
+                if has_returned.wait(0.005):
                     return
             raise AssertionError("receive did not return while garbage arrived")
 
         thread = StandInThread(serve)
         assert link.receive(0.1) is None
-        wait.set()
+        has_returned.set()
         thread.end()
         good = (
             struct.pack("<HHI16H", 18458, 400, 0, *[1250] * 16)
@@ -408,7 +408,7 @@ def test_px4_skips_bytes_that_are_no_message():
         controls = [0.5, 0.25, np.nan, 1.0, *[0.0] * 12]
         message = common.MAVLink_hil_actuator_controls_message(0, controls, mode, 1).pack(mav)
         damaged = message[:20] + bytes([message[20] ^ 0xFF]) + message[21:]
-        # the false start of a message takes some of the messages with it
+        # after the false start of a message, the parser skips some of the messages
         client.sendall(b"".join(INVALID_PACKETS) + damaged + b"\xfd\xfe" + 20 * message)
         wait_for(lambda: np.array_equal(link.receive(0.1), [0.5, 0.25, 0.0, 1.0]))
 

@@ -16,12 +16,12 @@ from crazysim.lab.live.swarm import Commander, DroneState, Swarm
 from crazysim.lab.live.swarm.motion import PlannedMotion, nearest_yaw, plan_move
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
-OFFSET = 0.02
-"""Distance that a drone may still be from its setpoint shortly after a move, m."""
+MAX_DISTANCE = 0.02
+"""Largest distance of a drone from its setpoint shortly after a move, m."""
 
 
 def create_flying_commander(control="state", **commands):
-    """Return a commander in flight at (1, 2, 1)."""
+    """Return a commander in flight at (1, 2, 1), after commands that are given by name with their arguments."""
     commander = Commander(Control(control))
     tick(commander, 10.0)
     for name, arguments in commands.items():
@@ -53,8 +53,8 @@ def test_a_reversed_slow_plan():
     plan = PlannedMotion(path, 1.0, timescale=2.0, reversed=True)
     np.testing.assert_allclose(plan.evaluate(1.0)[0, :3], [2, 0, 1], atol=1e-6)
     np.testing.assert_allclose(plan.evaluate(5.0)[0, :3], [1, 0, 1], atol=1e-6)
-    ahead = (plan.evaluate(5.01)[0] - plan.evaluate(4.99)[0]) / 0.02
-    np.testing.assert_allclose(plan.evaluate(5.0)[1], ahead, atol=1e-5)
+    slope = (plan.evaluate(5.01)[0] - plan.evaluate(4.99)[0]) / 0.02
+    np.testing.assert_allclose(plan.evaluate(5.0)[1], slope, atol=1e-5)
     np.testing.assert_allclose(
         plan.evaluate(5.0)[2], (plan.evaluate(5.01)[1] - plan.evaluate(4.99)[1]) / 0.02, atol=1e-5
     )
@@ -92,15 +92,15 @@ def test_motors_are_off_before_take_off_and_after_landing():
 
 
 def test_a_landing_continues_if_the_drone_is_still_too_high():
-    """So it does with a controller that has an offset, with a load, or on a pad above the target."""
+    """It is too high if the controller has an offset, if it carries a load, or on a pad above the target."""
     commander = create_flying_commander(land=(0.04, 1.0))
     above = np.array([1.0, 2.0, 0.13])
     heights = [commander.tick(now, above, np.array([0, 0, -0.2]), 0.5)[2] for now in (11.0, 11.1, 11.3, 20.0)]
     np.testing.assert_allclose(heights, [0.04, 0.01, -0.05, -0.96], atol=1e-9)
     assert commander.tick(20.1, above * [1, 1, 0.05 / 0.13], np.array([0, 0, -0.2]), 0.5) is None
-    standing = create_flying_commander(land=(0.04, 1.0))
-    assert standing.tick(11.4, above, np.zeros(3), 0.5) is not None
-    assert standing.tick(11.6, above, np.zeros(3), 0.5) is None
+    standing_commander = create_flying_commander(land=(0.04, 1.0))
+    assert standing_commander.tick(11.4, above, np.zeros(3), 0.5) is not None
+    assert standing_commander.tick(11.6, above, np.zeros(3), 0.5) is None
 
 
 def test_commands_are_in_the_frame_of_the_estimate():
@@ -339,7 +339,7 @@ def test_a_swarm_flies(swarm):
     home = swarm.home("a")
     swarm["a"].take_off(1.0, 2.0)
     swarm.advance(3.0)
-    np.testing.assert_allclose(swarm.state("a").pos, [*home[:2], 1.0], atol=OFFSET)
+    np.testing.assert_allclose(swarm.state("a").pos, [*home[:2], 1.0], atol=MAX_DISTANCE)
     np.testing.assert_allclose(swarm.state("b").pos, swarm.home("b"), atol=0.01)
     np.testing.assert_allclose(swarm.state("a").acc, [0, 0, 9.81], atol=0.3)
     swarm["a"].go_to([0.5, 0.0, 0.0], np.pi / 2, 2.0, relative=True)

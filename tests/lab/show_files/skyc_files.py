@@ -139,12 +139,13 @@ def create_studio_show():
     }
 
 
-ALL = {
+SHOW_CREATORS = {
     "lab": create_lab_show,
     "lab_poly4d": create_lab_poly4d_show,
     "lab_older": create_older_lab_show,
     "studio": create_studio_show,
 }
+"""Functions that return the files of a show, by kind."""
 
 
 def replace_value(files, name, path, value):

@@ -13,12 +13,13 @@ from crazysim.lab.show_files import Lights, decode_lights, encode_lights, led
 RED, GREEN, WHITE, BLACK = (1, 0, 0), (0, 1, 0), (1, 1, 1), (0, 0, 0)
 
 
-LONG = Lights.of_pieces(np.arange(64.0), np.zeros((64, 3)))
+LONG_LIGHTS = Lights.of_pieces(np.arange(64.0), np.zeros((64, 3)))
 """Lights with as many pieces as any test needs; lights stacked with it are all evaluated by one compiled function."""
 
 
 def colors(program, *times, **options):
-    lights = Lights.stack([decode_lights(bytes(program), **options), LONG])
+    """Return the colours of a light program at times, s."""
+    lights = Lights.stack([decode_lights(bytes(program), **options), LONG_LIGHTS])
     return np.round(lights.colors(np.resize(times, 10))[: len(times), 0], 4)
 
 
@@ -68,13 +69,13 @@ PUBLIC = "DAMHBQYFDQwACAAA/zIKMgj/AAAyCjIIAP8AMgoyCP//ADIKMggA//8yCjII/wD/MgoyCz
 
 def test_a_public_light_program_gives_its_colours():
     lights = Lights.stack([decode_lights(PUBLIC, 20.0)])
-    got = lights.colors([0.05, 0.15, 0.25, 0.6, 1.1, 1.6, 3.1, 3.6, 13.6, 14.6])[:, 0]
+    found = lights.colors([0.05, 0.15, 0.25, 0.6, 1.1, 1.6, 3.1, 3.6, 13.6, 14.6])[:, 0]
     blue, red = (0, 0, 1), (1, 0, 0)
     expected = [WHITE, BLACK, WHITE, BLACK, (0, 0, 0.5), blue, (0.5, 0, 0), red, WHITE, BLACK]
-    np.testing.assert_allclose(got, expected, atol=1e-4)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-WRONG = {
+WRONG_PROGRAMS = {
     "unknown command": ([7, 1, 0x16], "0x16"),
     "unused command": ([0x0F], "0x0f"),
     "missing argument": ([4, 1, 2], "argument"),
@@ -89,7 +90,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("program", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("program", "message"), WRONG_PROGRAMS.values(), ids=WRONG_PROGRAMS)
 def test_wrong_programs(program, message):
     with pytest.raises(ConfigError, match=message):
         decode_lights(bytes(program))
@@ -128,9 +129,9 @@ def test_lights_survive_the_code(pieces):
     begins = np.array([first for _, first, _, _ in pieces] + [pieces[-1][2]]) / 255
     ends = np.array([last if fades else first for _, first, last, fades in pieces] + [pieces[-1][2]]) / 255
     lights = Lights.of_pieces(times, begins, ends)
-    again = decode_lights(encode_lights(lights), until=1e4)
-    seen = Lights.stack([again, lights, LONG]).colors(np.linspace(0.0, times[-1] + 1.0, 500))
-    np.testing.assert_allclose(seen[:, 0], seen[:, 1], atol=1e-4)
+    decoded = decode_lights(encode_lights(lights), until=1e4)
+    sampled = Lights.stack([decoded, lights, LONG_LIGHTS]).colors(np.linspace(0.0, times[-1] + 1.0, 500))
+    np.testing.assert_allclose(sampled[:, 0], sampled[:, 1], atol=1e-4)
 
 
 def test_encoded_lights_use_the_shortest_commands():

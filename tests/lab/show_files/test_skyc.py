@@ -43,10 +43,10 @@ def evaluate_control_points(points, t):
 
 
 @pytest.mark.parametrize(
-    "make", [skyc_files.create_lab_show, skyc_files.create_lab_poly4d_show, skyc_files.create_older_lab_show]
+    "create_files", [skyc_files.create_lab_show, skyc_files.create_lab_poly4d_show, skyc_files.create_older_lab_show]
 )
-def test_trajectories_are_the_curves_of_the_file(make):
-    files = make()
+def test_trajectories_are_the_curves_of_the_file(create_files):
+    files = create_files()
     show = parse_show(skyc_files.pack_archive(files))
     points = files["drones/drone_1/trajectory.json"]["points"]
     t = np.linspace(0.0, points[-1][0], 91)
@@ -85,15 +85,15 @@ def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
     assert show.names == ("drone_0",)
     assert show.environment == "outdoor"  # as in Skybrush
     assert show.duration == pytest.approx(11.66 + 2.5)
-    at = evaluate_positions(show.trajectory(0), np.array([0.0, 6.0, 11.66, 11.91, 12.0, 12.16, 13.5, 14.16]))
-    np.testing.assert_allclose(at[:3, :3], [[17.5, 10, 1]] * 3, atol=1e-5)
-    np.testing.assert_allclose(at[3, :3], [17.5, 10, 1.36], atol=1e-4)
-    np.testing.assert_allclose(np.rad2deg(at[:, 3]), [0, 45, 87.45, 89.325, 90, 70.8, -90, -90], atol=1e-3)
+    values = evaluate_positions(show.trajectory(0), np.array([0.0, 6.0, 11.66, 11.91, 12.0, 12.16, 13.5, 14.16]))
+    np.testing.assert_allclose(values[:3, :3], [[17.5, 10, 1]] * 3, atol=1e-5)
+    np.testing.assert_allclose(values[3, :3], [17.5, 10, 1.36], atol=1e-4)
+    np.testing.assert_allclose(np.rad2deg(values[:, 3]), [0, 45, 87.45, 89.325, 90, 70.8, -90, -90], atol=1e-3)
 
 
-@pytest.mark.parametrize("make", skyc_files.ALL.values(), ids=skyc_files.ALL)
-def test_saved_show_is_the_same(make, tmp_path):
-    show = parse_show(skyc_files.pack_archive(make()))
+@pytest.mark.parametrize("create_files", skyc_files.SHOW_CREATORS.values(), ids=skyc_files.SHOW_CREATORS)
+def test_saved_show_is_the_same(create_files, tmp_path):
+    show = parse_show(skyc_files.pack_archive(create_files()))
     save_show(show, tmp_path / "again.skyc")
     again = load_show(tmp_path / "again.skyc")
     assert again.names == show.names
@@ -146,7 +146,7 @@ def test_curves_without_yaw_are_written_without(tmp_path):
 
 
 TRAJECTORY = "drones/drone_0/trajectory.json"
-WRONG = {
+WRONG_VALUES = {
     "unknown version of the show": ("show.json", ["version"], 2, "version 1"),
     "no drones": ("show.json", ["swarm", "drones"], [], "at least one drone"),
     "drone without trajectory": ("show.json", ["swarm", "drones", 0, "settings", "trajectory"], None, "object"),
@@ -176,7 +176,7 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "path", "value", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("name", "path", "value", "message"), WRONG_VALUES.values(), ids=WRONG_VALUES)
 def test_wrong_shows_are_refused_with_the_place(name, path, value, message):
     files = skyc_files.create_lab_show()
     files = skyc_files.replace_value(files, name, path, value) if path else files | {name: value}
@@ -220,12 +220,12 @@ def test_archives_that_decompress_to_too_much_are_refused():
     small = Archive(skyc_files.pack_archive({f"{k}": b'"' + b"0" * 2**24 + b'"' for k in range(5)}), "small.skyc")
     with pytest.raises(ConfigError, match="at most 16777216 bytes, 67108864 in all"):
         [small.json(f"{k}") for k in range(5)]
-    lying = bytearray(skyc_files.pack_archive({"show.json": zeros}))
+    wrong_sizes = bytearray(skyc_files.pack_archive({"show.json": zeros}))
     for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # both state a size of 10 bytes
-        at = lying.index(signature) + offset
-        lying[at : at + 4] = (10).to_bytes(4, "little")
+        start = wrong_sizes.index(signature) + offset
+        wrong_sizes[start : start + 4] = (10).to_bytes(4, "little")
     with pytest.raises(ConfigError):
-        parse_show(bytes(lying))
+        parse_show(bytes(wrong_sizes))
     with pytest.raises(ConfigError, match="JSON"):
         parse_show(skyc_files.pack_archive({"show.json": b"[" * 10**6}))
     points = [[k / 100, [0, 0, 0], []] for k in range(20_001)]
@@ -248,7 +248,7 @@ def test_archives_that_decompress_to_too_much_are_refused():
         parse_show(skyc_files.pack_archive(many))
 
 
-SAMPLES = {name: skyc_files.pack_archive(make()) for name, make in skyc_files.ALL.items()}
+SAMPLES = {name: skyc_files.pack_archive(create_files()) for name, create_files in skyc_files.SHOW_CREATORS.items()}
 JUNK = st.sampled_from(
     [None, True, -1, 0, 1e308, float("nan"), "", "x", [], [[]], {}, {"$ref": "./show.json"}, 10**400]
 )
@@ -273,8 +273,8 @@ def load_or_refuse(content):
 )
 def test_damaged_archives_are_loaded_or_refused(name, changes, cut):
     content = bytearray(SAMPLES[name])
-    for at, value in changes:
-        content[at % len(content)] = value
+    for k, value in changes:
+        content[k % len(content)] = value
     load_or_refuse(bytes(content[:cut]))
 
 
@@ -287,14 +287,16 @@ def list_paths(value, path=()):
 
 
 @settings(max_examples=200)
-@given(name=st.sampled_from(sorted(skyc_files.ALL)), seed=st.integers(0, 10**6), value=JUNK, remove=st.booleans())
+@given(
+    name=st.sampled_from(sorted(skyc_files.SHOW_CREATORS)), seed=st.integers(0, 10**6), value=JUNK, remove=st.booleans()
+)
 def test_mutated_json_is_loaded_or_refused(name, seed, value, remove):
-    files = copy.deepcopy(skyc_files.ALL[name]())
+    files = copy.deepcopy(skyc_files.SHOW_CREATORS[name]())
     for tables in files.values():
         tables.pop("K", None)
-    pick = random.Random(seed)
-    member = pick.choice(sorted(files))
-    path = pick.choice([path for path in list_paths(files[member]) if path])
+    rng = random.Random(seed)
+    member = rng.choice(sorted(files))
+    path = rng.choice([path for path in list_paths(files[member]) if path])
     holder = files[member]
     for key in path[:-1]:
         holder = holder[key]

@@ -1,4 +1,4 @@
-"""Flying shows: closest approaches, collisions and tracking errors by hand, films, pages, the command."""
+"""Flown shows: closest approaches, collisions, tracking errors, films, pages, live shows and the command."""
 
 import json
 import os
@@ -70,9 +70,9 @@ def test_closest_approach_of_straight_lines():
 def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
     pos = np.random.default_rng(seed).normal(size=(n, n_drones, 3)).cumsum(axis=0)
     distance, when = sampled_approaches(0.5 * np.arange(n), pos)
-    between = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
-    off = ~np.eye(n_drones, dtype=bool)
-    assert np.all(distance[off] <= between[off] + 1e-12)
+    sample_distances = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
+    is_pair = ~np.eye(n_drones, dtype=bool)
+    assert np.all(distance[is_pair] <= sample_distances[is_pair] + 1e-12)
     assert np.all((when >= 0) & (when <= 0.5 * (n - 1)))
 
 
@@ -81,18 +81,18 @@ def screen(tmp_path_factory):
     yield from virtual_screen(tmp_path_factory.mktemp("screen"))
 
 
-PLAYED = """
+PLAY_SCRIPT = """
 import sys
 from crazysim.__main__ import main
 from crazysim.scene.scene_window import SceneWindow
 from crazysim.lab.shows import fly_show, view
 from crazysim.lab.show_files import load_show
 
-opened, frames = SceneWindow.__init__, []
+original_init, frames = SceneWindow.__init__, []
 
 def open_coarse(self, model, *settings):
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    opened(self, model, *settings)
+    original_init(self, model, *settings)
 
 SceneWindow.__init__ = open_coarse
 view.MAX_FPS = 10.0
@@ -119,7 +119,7 @@ def test_a_window_plays_the_show_from_its_start_until_it_is_closed(screen, tmp_p
     save_show(Show(names=("a",), trajectories=slow, lights=lights), tmp_path / "show.skyc")
     cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
     environment = os.environ | cache | {"DISPLAY": screen[0], "MUJOCO_GL": "glfw"}
-    arguments = [sys.executable, "-c", PLAYED, str(tmp_path / "show.skyc")]
+    arguments = [sys.executable, "-c", PLAY_SCRIPT, str(tmp_path / "show.skyc")]
     program = subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment, text=True)
     deadline, seen = time.monotonic() + 300, []
     while program.poll() is None and time.monotonic() < deadline:
@@ -141,9 +141,9 @@ def test_planned_positions_and_colours_are_those_of_the_show(flight):
     np.testing.assert_allclose(flight.planned[0], [[0, 0, 1], [1, 0.02, 1], [0.5, 2, 0.5]], atol=1e-6)
     np.testing.assert_allclose(flight.planned[-1], [[1, 0, 1], [0, 0.02, 1], [0.5, 2, 1.5]], atol=1e-6)
     np.testing.assert_allclose(flight.pos[0], flight.planned[0], atol=1e-6)
-    at = np.searchsorted(flight.times, [0.5, 1.0, 1.5])
-    np.testing.assert_allclose(flight.colors[at, 0], [(1, 0, 0), (0, 0, 1), (0, 0, 1)])
-    np.testing.assert_allclose(flight.colors[at, 1, 0], [0.25, 0.5, 0.75], atol=1e-6)
+    samples = np.searchsorted(flight.times, [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(flight.colors[samples, 0], [(1, 0, 0), (0, 0, 1), (0, 0, 1)])
+    np.testing.assert_allclose(flight.colors[samples, 1, 0], [0.25, 0.5, 0.75], atol=1e-6)
 
 
 def test_a_report_lists_distances_and_durations(flight):
@@ -223,8 +223,8 @@ def test_page_has_lights_that_change(flight, viser):
     from crazysim.media import web
 
     recorded = media_flight(flight)
-    still = np.broadcast_to(flight.colors[:1], flight.colors.shape)
-    sizes = [len(web.page(recorded)), len(web.page(recorded, lights=still)), len(page(flight))]
+    constant_colors = np.broadcast_to(flight.colors[:1], flight.colors.shape)
+    sizes = [len(web.page(recorded)), len(web.page(recorded, lights=constant_colors)), len(page(flight))]
     assert sizes[0] < sizes[1]
     assert sizes[1] + 300 < sizes[2]
     with pytest.raises(ConfigError, match="lights of shape"):
@@ -251,11 +251,11 @@ def test_the_show_command_writes_a_report(tmp_path, capsys):
 
 
 def test_a_live_show_has_lights():
-    """The LEDs of the show at three moments, and drones where the plan has them."""
+    """The lights are those of the show at three times, and the drones end at their planned positions."""
     seen = {}
     with live_show(SHOW, speed="max") as live:
-        for at in (0.5, 1.5):
-            live.call_at(at, lambda live: seen.update({live.step: live.lights[0].copy()}))
+        for t in (0.5, 1.5):
+            live.call_at(t, lambda live: seen.update({live.step: live.lights[0].copy()}))
         live.run(SHOW.duration)
         expected = SHOW.lights.colors([0.5, 1.5])
         np.testing.assert_allclose([seen[50], seen[150]], expected, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Closed loop against logs: logs that the simulation wrote itself are found again."""
+"""Comparison of simulated with logged flights, on logs of flights that were simulated."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ def circling_flight():
     t = np.arange(0, 9, 0.01)
     angle = np.clip(t - 3, 0, None)
     setpoint = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), np.clip(t / 2, 0.01, 1), 0.3 + 0 * t], axis=-1)
-    still = Flight("still", setpoint, np.tile([0.5, 0.0, 0.0], (len(t), 1)))
-    return setpoint, simulate_flights([still])[:, 0]
+    resting_flight = Flight("still", setpoint, np.tile([0.5, 0.0, 0.0], (len(t), 1)))
+    return setpoint, simulate_flights([resting_flight])[:, 0]
 
 
 def write_log(path, setpoint, pos, rest=0.06, before=100):
-    """Write a log with a second before the first setpoint, in which the tracked body rests on the floor."""
+    """Write a log in which the tracked body rests at a height, m, for ``before`` samples before the first setpoint."""
     n = len(pos) + before
     t = 1.7e9 + 0.01 * np.arange(n)
     setpoints = np.zeros((n, 4))
@@ -42,7 +42,7 @@ def test_a_flight_of_the_simulation_is_matched(circling_flight, tmp_path):
     flight = read_flight(path)
     np.testing.assert_allclose(
         flight.pos, circling_flight[1][: len(flight.pos)], rtol=0, atol=2e-3
-    )  # 1.7e9 s has 0.2 us
+    )  # times of 1.7e9 s are rounded to 0.2 us
     (row,) = compare_tracking([flight])
     assert row.logged_error > 0.1
     assert abs(row.ratio - 1) < 0.01
@@ -54,9 +54,9 @@ def test_a_flight_of_the_simulation_is_matched(circling_flight, tmp_path):
 
 def test_a_flight_that_fails_is_marked(circling_flight, tmp_path):
     setpoint, pos = circling_flight
-    away = pos + np.where(np.arange(len(pos)) > 700, 3.0, 0.0)[:, None]
+    departing_pos = pos + np.where(np.arange(len(pos)) > 700, 3.0, 0.0)[:, None]
     rows = compare_tracking(
-        [read_flight(write_log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, away))]
+        [read_flight(write_log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, departing_pos))]
     )
     assert [row.failed for row in rows] == [False, True]
     assert rows[1].ratio < 0.5
@@ -68,9 +68,9 @@ def test_a_table_of_text_is_the_same_flight(circling_flight, tmp_path):
         columns = dict(file)
     text = np.stack([*columns.values()], axis=-1)
     np.savetxt(tmp_path / "own.csv", text, delimiter=",", header=",".join(columns), comments="")
-    one, other = read_flight(path), read_flight(tmp_path / "own.csv")
-    np.testing.assert_allclose(other.pos, one.pos, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(other.setpoint, one.setpoint, rtol=0, atol=1e-12)
+    from_npz, from_csv = read_flight(path), read_flight(tmp_path / "own.csv")
+    np.testing.assert_allclose(from_csv.pos, from_npz.pos, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(from_csv.setpoint, from_npz.setpoint, rtol=0, atol=1e-12)
 
 
 def test_other_logs_are_refused(tmp_path):

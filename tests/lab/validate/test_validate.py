@@ -31,7 +31,7 @@ def test_the_function_returns_the_rows_of_the_command():
 
 
 def test_rows_with_a_series_are_drawn_and_shown(tmp_path):
-    images = pytest.importorskip("PIL.Image")
+    pil_image = pytest.importorskip("PIL.Image")
     section = next(section for section in sections(tmp_path) if section.name == "filter")
     section = dataclasses.replace(section, data_problem="")
     named = [Row(f"{k}", "", 0.5 * k, "", (0, 1.1), series="position", x=f"flight {k}") for k in range(1, 4)]
@@ -40,7 +40,7 @@ def test_rows_with_a_series_are_drawn_and_shown(tmp_path):
     ]
     for rows in (named, errors):
         draw_section(section, rows, tmp_path / "pictures" / "one.png")
-        image = images.open(tmp_path / "pictures" / "one.png")
+        image = pil_image.open(tmp_path / "pictures" / "one.png")
         assert image.width > 500
         assert len(image.getcolors()) > 8
     rows = [dataclasses.replace(row, section="filter") for row in named]

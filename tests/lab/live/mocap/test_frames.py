@@ -10,14 +10,14 @@ from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.mocap import Convention, Frame
 
 CONVENTIONS = [Convention(*c) for c in itertools.product("yz", ("xyzw", "wxyz"), (1.0, 0.001))]
-HALF = np.sqrt(0.5)
+SQRT_HALF = np.sqrt(0.5)
 
 
 def test_y_up_by_hand():
     """A body 1 m up and 2 m along the source's z, turned by 90 degrees about the vertical."""
-    pos, quat = Convention("y", "wxyz", 0.001).to_world([0, 1000, 2000], [HALF, 0, HALF, 0])
+    pos, quat = Convention("y", "wxyz", 0.001).to_world([0, 1000, 2000], [SQRT_HALF, 0, SQRT_HALF, 0])
     np.testing.assert_allclose(pos, [0, -2, 1])
-    np.testing.assert_allclose(quat, [0, 0, HALF, HALF])
+    np.testing.assert_allclose(quat, [0, 0, SQRT_HALF, SQRT_HALF])
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -1,4 +1,4 @@
-"""Sources: functions, shows, threads, programs; recordings that stay readable."""
+"""Sources of motion capture: functions, shows, threads, programs, and recordings that stay readable."""
 
 import json
 import sys
@@ -61,10 +61,10 @@ def test_a_show_is_a_source():
     frame = source.poll(200, 100).frames[-1]
     assert frame.names == ("vcf0", "vcf1")
     np.testing.assert_allclose(frame.pos[0], [1, 0, 1], atol=1e-6)
-    several = Trajectory.stack([line([0, 0, 1], [2, 0, 1], 4.0), line([0, 1, 1], [2, 1, 1], 4.0)])
-    assert show_source(several, ["x", "y"]).poll(0, 100).frames[0].names == ("x", "y")
+    two_trajectories = Trajectory.stack([line([0, 0, 1], [2, 0, 1], 4.0), line([0, 1, 1], [2, 1, 1], 4.0)])
+    assert show_source(two_trajectories, ["x", "y"]).poll(0, 100).frames[0].names == ("x", "y")
     with pytest.raises(ConfigError, match="2 different names"):
-        show_source(several, ["x", "x"])
+        show_source(two_trajectories, ["x", "x"])
 
 
 def test_a_thread_sends_in_real_time():
@@ -111,10 +111,11 @@ import json, sys
 print(json.dumps({"t": 1.5, "bodies": [["cf1", 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]]}), flush=True)
 print(json.dumps(%s), flush=True)
 """
+"""Program that sends one valid frame and a second output."""
 
 
 @pytest.mark.parametrize(
-    "second, reason",
+    "second_output, reason",
     [
         ({"error": f"no connection to {sys.platform}"}, "no connection"),
         ({"t": 2.0, "bodies": [["cf1", 1.0]]}, "a name and 7 numbers"),
@@ -122,9 +123,9 @@ print(json.dumps(%s), flush=True)
         ([1, 2], "TypeError"),
     ],
 )
-def test_frames_of_a_laboratory_come_from_a_process(second, reason, tmp_path):
+def test_frames_of_a_laboratory_come_from_a_process(second_output, reason, tmp_path):
     program = tmp_path / "worker.py"
-    program.write_text(WORKER % repr(second).replace("nan", "float('nan')"))
+    program.write_text(WORKER % repr(second_output).replace("nan", "float('nan')"))
     with MotionCaptureSource("vicon", "127.0.0.1", Convention("y"), [sys.executable, str(program)]) as source:
         wait_for(lambda: source.ended)
         (frame,) = source.poll(0, 500).frames
@@ -144,7 +145,7 @@ def test_a_silent_process_is_ended(tmp_path):
 
 @pytest.fixture
 def worker(tmp_path):
-    """A function that starts the program of a laboratory with another module ``motioncapture``."""
+    """Return a function that starts ``worker.py`` with a stand-in for the package ``motioncapture``, given as code."""
 
     def start_worker(motioncapture):
         (tmp_path / "motioncapture.py").write_text(motioncapture)
@@ -190,8 +191,8 @@ def test_unknown_systems_are_refused():
 
 
 def create_polls():
-    frame = [Frame.of(k / 3, {f"cf{i}": ((k, i, 0.1), LEVEL_QUAT) for i in range(k)}, 7 + k / 3) for k in range(5)]
-    return [Poll(7.0, frame[:2]), Poll(7.1, [], 4), Poll(7.2, frame[2:])]
+    frames = [Frame.of(k / 3, {f"cf{i}": ((k, i, 0.1), LEVEL_QUAT) for i in range(k)}, 7 + k / 3) for k in range(5)]
+    return [Poll(7.0, frames[:2]), Poll(7.1, [], 4), Poll(7.2, frames[2:])]
 
 
 def assert_polls_equal(found, expected):
@@ -245,7 +246,7 @@ def test_wrong_files(tmp_path):
     (tmp_path / "other").write_text("hello")
     with pytest.raises(ConfigError, match="first line is not"):
         ReplaySource(tmp_path / "other")
-    for kind, content in ((b"SAMP", b""), (b"POLL", b"x"), (b"NAME", b"{")):  # intact chunks of something else
+    for kind, content in ((b"SAMP", b""), (b"POLL", b"x"), (b"NAME", b"{")):  # intact chunks of another kind
         with Journal(tmp_path / "other", replace=True) as journal:
             journal.append(kind, content)
         with pytest.raises(DamagedFileError, match=r"expected a recording of motion capture, got .*other', which"):

@@ -1,4 +1,4 @@
-"""Rules for frames that are late, lost, repeated, wrong or out of order."""
+"""The tracker of motion capture: frames that are late, lost, repeated, wrong or out of order."""
 
 import math
 
@@ -13,8 +13,8 @@ from crazysim.lab.live.mocap import Frame, Rules, Tracker
 LEVEL_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
-def create_frame(t, received=None, quat=LEVEL_QUAT, **places):
-    return Frame.of(t, {name: (pos, quat) for name, pos in places.items()}, received)
+def create_frame(t, received=None, quat=LEVEL_QUAT, **positions):
+    return Frame.of(t, {name: (pos, quat) for name, pos in positions.items()}, received)
 
 
 def create_tracker(n=40, freq=100.0):
@@ -112,10 +112,10 @@ def test_frames_in_a_burst_do_not_make_a_body_fast():
 
 def test_unknown_and_duplicate_names():
     tracker, t = create_tracker()
-    twice = Frame(
+    frame = Frame(
         t, ("a", "ghost", "a", "b"), np.array([[9, 9, 9.0]] * 3 + [[0, 5, 0.01]]), np.tile(LEVEL_QUAT, (4, 1)), t
     )
-    tracker.accept(twice)
+    tracker.accept(frame)
     tracker.accept(create_frame(t + 0.01, ghost=(1, 1, 1), a=(t + 0.01, 0, 1)))
     assert report_kinds(tracker) == [("unknown", "ghost"), ("duplicate", "a")]
     np.testing.assert_allclose(tracker.pos, [[t + 0.01, 0, 1], [0, 5, 0.01]])
@@ -149,18 +149,18 @@ def test_a_name_twice_is_an_error():
         Tracker(["a", "a"])
 
 
-anything = st.floats(allow_nan=True, allow_infinity=True)
-hostile = st.lists(
+any_float = st.floats(allow_nan=True, allow_infinity=True)
+any_frames = st.lists(
     st.tuples(
-        anything,
-        st.lists(st.tuples(st.sampled_from(["a", "b", "c", ""]), st.tuples(*[anything] * 7)), max_size=4),
+        any_float,
+        st.lists(st.tuples(st.sampled_from(["a", "b", "c", ""]), st.tuples(*[any_float] * 7)), max_size=4),
     ),
     max_size=12,
 )
 
 
 @settings(max_examples=200, deadline=None)
-@given(frames=hostile)
+@given(frames=any_frames)
 def test_poses_stay_finite_whatever_arrives(frames):
     tracker = Tracker(["a", "b"], Rules())
     for stamp, bodies in frames:

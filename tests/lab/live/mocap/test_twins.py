@@ -31,14 +31,14 @@ class ManualSource(MocapSource):
     """Source of the frames that a test sends."""
 
     def __init__(self):
-        self.t, self.waiting = 0.0, []
+        self.t, self.frames = 0.0, []
 
     def send(self, **bodies):
         self.t += 0.01
-        self.waiting.append(Frame.of(self.t, {n: b if len(b) == 2 else (b, LEVEL_QUAT) for n, b in bodies.items()}))
+        self.frames.append(Frame.of(self.t, {n: b if len(b) == 2 else (b, LEVEL_QUAT) for n, b in bodies.items()}))
 
     def poll(self, step, freq):
-        frames, self.waiting = self.waiting, []
+        frames, self.frames = self.frames, []
         return Poll(self.t, frames)
 
 
@@ -205,16 +205,16 @@ def test_simulated_drones_measure_report_and_hit_a_real_one(step):
     sim.data = step(sim.data, 5)
     np.testing.assert_allclose(rays.read(sim.data).distance, 1.0, atol=0.01)
     assert not sim.contact_report(twins.handles["cf1"]).objects.any()
-    hit, touched = 0.0, False
+    impulse, has_touched = 0.0, False
     for k in range(100):  # the real drone flies at 1 m/s through the simulated drone
         source.send(cf1=(1.1 - 0.01 * k, 0, 1))
         twins.update(sim)
         for _ in range(5):
             sim.data = step(sim.data, 1)
-            hit = min(hit, float(response.read(sim.data).impulse[0, 0, 0]))
-        touched |= bool(sim.contact_report(twins.handles["cf1"]).objects.any())
-    assert touched
-    assert hit < -0.001  # pushed along -x, N s
+            impulse = min(impulse, float(response.read(sim.data).impulse[0, 0, 0]))
+        has_touched |= bool(sim.contact_report(twins.handles["cf1"]).objects.any())
+    assert has_touched
+    assert impulse < -0.001  # pushed along -x, N s
     assert float(sim.data.states.pos[0, 0, 0]) < -0.02  # it slides off a ball
 
 
@@ -229,10 +229,10 @@ def test_simulated_drones_avoid_a_real_one(sim):
         source.send(cf1=(1.5 - 0.01 * k, 0.05, 1))
         twins.update(sim)
         real = np.asarray(twins.handles["cf1"].pose(sim.data)[0])
-        away = np.asarray(sim.data.states.pos) - real
+        offset = np.asarray(sim.data.states.pos) - real
         command = np.zeros((2, 1, 16))
-        gap = np.linalg.norm(away, axis=-1, keepdims=True)
-        command[..., :3] = np.where(gap < 0.8, real + 0.8 * away / gap, np.asarray(sim.data.states.pos))
+        gap = np.linalg.norm(offset, axis=-1, keepdims=True)
+        command[..., :3] = np.where(gap < 0.8, real + 0.8 * offset / gap, np.asarray(sim.data.states.pos))
         command[..., 2] = 1.0
         sim.state_control(command)
         sim.step(5)
@@ -250,28 +250,28 @@ def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path, step):
     """A thread sends in real time, so that frames arrive between any two steps; the replay repeats all of it."""
 
     def bodies(t):
-        near = 0.25 * np.cos(3 * t)
-        return {"cf1": ((near, 0, 1.0), from_rpy([0, 0, t])), "cf2": ((0, near, 1.2), LEVEL_QUAT)}
+        swing = 0.25 * np.cos(3 * t)
+        return {"cf1": ((swing, 0, 1.0), from_rpy([0, 0, t])), "cf2": ((0, swing, 1.2), LEVEL_QUAT)}
 
     def run(source, record=None):
         sim, twins, *_ = create_meeting(source, Rules(stalled=0.01), record)
         command = np.zeros((2, 1, 16))
         command[..., 2] = 1.0
-        found = []
+        steps = []
         with twins:
             for _ in range(60):
                 twins.update(sim)
                 command[:, 0, :2] = 0.1 * np.asarray(sim.data.objects.pos)[:, 0, [0, 1], :2].sum(axis=1)
                 sim.state_control(command)
                 sim.data = step(sim.data, 5)
-                found.append([np.asarray(x) for x in (sim.data.states.pos, sim.data.states.quat, sim.data.objects.vel)])
-        return found, twins
+                steps.append([np.asarray(x) for x in (sim.data.states.pos, sim.data.states.quat, sim.data.objects.vel)])
+        return steps, twins
 
     path = tmp_path / "stream.mocap"
     live, twins = run(RealTimeSource(FunctionSource(bodies, 240.0)).start(), str(path))
     assert twins.tracker.n_frames > 5
-    again, _ = run(ReplaySource(path))
-    for a, b in zip(live, again, strict=True):
+    replayed, _ = run(ReplaySource(path))
+    for a, b in zip(live, replayed, strict=True):
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
     assert np.ptp([x[0][0, 0, 0] for x in live]) > 1e-4
