@@ -75,7 +75,7 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
 @pytest.mark.parametrize("name", ["bumblebee", "hexarotor"])
 @pytest.mark.parametrize("key", ["inertia", "lag"])
 def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, name):
-    """The number of each rotor is of the airframe with fewer or with more rotors."""
+    """The airframe whose rotors differ is the one with fewer or the one with more rotors."""
     fleet = {"bumblebee": load_airframe("bumblebee"), "hexarotor": load_airframe(HEXAROTOR)}
     n, value = fleet[name].n_rotors, np.asarray(fleet[name].value(f"rotors.{key}"))
     factors = np.linspace(0.9, 1.1, n).reshape(n, *[1] * (value.ndim if key == "lag" else 0))

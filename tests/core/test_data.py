@@ -16,9 +16,9 @@ from crazysim.core.data import SimState, as_key, command_shape, grid_2d
 def test_grid_2d_keeps_distance_and_fills_from_its_centre(n, spacing):
     points = grid_2d(n, spacing)
     assert points.shape == (n, 2)
-    between = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.where(np.eye(n), np.inf, 0)
+    distances = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.where(np.eye(n), np.inf, 0)
     if n > 1:
-        assert np.min(between) == pytest.approx(spacing)
+        assert np.min(distances) == pytest.approx(spacing)
     from_centre = np.linalg.norm(points, axis=-1)
     assert np.all(np.diff(from_centre) >= -1e-12)
     assert from_centre[-1] <= spacing * np.sqrt(n) / np.sqrt(2) + spacing
@@ -42,9 +42,9 @@ def test_drones_begin_at_rest_level_and_alike_in_every_world():
 @pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
 def test_the_cascade_of_crazyflow_uses_every_level_below(control):
     controls = Sim(control=control, controller="crazyflow").data.controls
-    below = {"state": {"state", "attitude"}}.get(control, {control}) | {"force_torque", "rotor_vel"}
+    used_levels = {"state": {"state", "attitude"}}.get(control, {control}) | {"force_torque", "rotor_vel"}
     fields = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
-    assert {name for name in fields if getattr(controls, name) is not None} == below
+    assert {name for name in fields if getattr(controls, name) is not None} == used_levels
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)

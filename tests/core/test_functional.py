@@ -29,13 +29,13 @@ def test_a_command_is_staged_and_nothing_else_changes(dynamics, control):
     else:
         ctrl = getattr(after.controls, control)
         staged, old = ctrl.staged_cmd, {control: getattr(data.controls, control)}
-        new = {"staged_cmd"} | ({"staged_feedforward"} if control == "state" else set())
-        assert trees_equal(ctrl.replace(**{name: getattr(old[control], name) for name in new}), old[control])
+        changed = {"staged_cmd"} | ({"staged_feedforward"} if control == "state" else set())
+        assert trees_equal(ctrl.replace(**{name: getattr(old[control], name) for name in changed}), old[control])
     np.testing.assert_array_equal(staged, command)
     assert trees_equal(after.replace(controls=after.controls.replace(**old)), data)
 
 
-PARTS = [
+SETPOINT_PARTS = [
     {"pos": (0.0, 1.0, 2.0)},
     {"pos": [[0, 1, 2], [3, 4, 5]], "yaw": 0.3},
     {"pos": np.arange(6.0).reshape(2, 1, 3), "vel": (1, 0, 0), "acc": np.ones((2, 2, 3)), "yaw": [0.1, -2.0]},
@@ -44,13 +44,13 @@ PARTS = [
 
 
 @pytest.mark.parametrize("on_device", [False, True])
-@pytest.mark.parametrize("parts", PARTS, ids=lambda parts: "-".join(parts))
+@pytest.mark.parametrize("parts", SETPOINT_PARTS, ids=lambda parts: "-".join(parts))
 def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
     """Parts are broadcast, on the host and on the device; missing parts and the body rates are zero."""
     data = get_sim("first_principles", "state").data
     expected = np.zeros((2, 2, 16))
-    for name, where in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
-        expected[..., where] = parts.get(name, 0.0)
+    for name, indices in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
+        expected[..., indices] = parts.get(name, 0.0)
     yaw = np.broadcast_to(parts.get("yaw", 0.0), (2, 2))
     expected[..., 11], expected[..., 12] = np.sin(yaw / 2), np.cos(yaw / 2)
     setpoint_parts = {name: jnp.asarray(x) for name, x in parts.items()} if on_device else parts

@@ -68,7 +68,7 @@ def halve_staged_command(data):
     return data.replace(controls=data.controls.replace(attitude=attitude))
 
 
-WRITES = {
+REFUSED_INFLUENCES = {
     "pos": (with_fields(states={"pos": lambda x: x + 1}), "got other values of states.pos. Use a stage"),
     "quat": (with_fields(states={"quat": lambda x: -x}), "got other values of states.quat"),
     "vel": (with_fields(states={"vel": lambda x: x + 1}), "got other values of states.vel"),
@@ -92,11 +92,12 @@ WRITES = {
     "nothing": (lambda data: None, "to return SimData, got NoneType. Use 'return data'"),
     "structure": (lambda data: data.replace(plugins={}), "to keep the structure of SimData"),
 }
+"""Influences that are refused, and words of the error."""
 
 
-@pytest.mark.parametrize("case", WRITES)
+@pytest.mark.parametrize("case", REFUSED_INFLUENCES)
 def test_law_09_an_influence_may_only_write_inputs_of_the_dynamics(case):
-    act, words = WRITES[case]
+    act, words = REFUSED_INFLUENCES[case]
     sim = Sim(control="attitude")
     sim.add(Tilt(act))
     with pytest.raises(ConfigError, match=rf"expected influence of plugin 'tilt' \(Tilt\) .*{words}"):
@@ -122,7 +123,7 @@ def test_an_influence_may_write_forces_commands_and_parameters():
     assert fitted.data.states.vel[0, 0, 2] > 0.01
 
 
-RATES = {
+REFUSED_DERIVATIVES = {
     "shape": (lambda data: {"angle": jnp.zeros(3)}, r"a rate of 'angle' with its shape \(2,\) .*, got shape \(3,\)"),
     "number": (lambda data: {"angle": 0.0}, r"a rate of 'angle' with its shape \(2,\) .*, got shape \(\)"),
     "type": (lambda data: {"count": jnp.ones(1)}, "a rate of 'count' with .* floating type int32, got .* float32"),
@@ -130,12 +131,13 @@ RATES = {
     "parameter": (lambda data: {"gain": jnp.zeros(1)}, "which are 'angle', 'count', got one of 'gain'"),
     "no dict": (lambda data: jnp.zeros(2), "a dict of fields of its record to rates, got"),
 }
+"""Derivatives that are refused, and words of the error."""
 
 
 @pytest.mark.parametrize("integrator", Integrator)
-@pytest.mark.parametrize("case", RATES)
+@pytest.mark.parametrize("case", REFUSED_DERIVATIVES)
 def test_law_09_a_wrong_rate_names_plugin_and_field(case, integrator):
-    rates, words = RATES[case]
+    rates, words = REFUSED_DERIVATIVES[case]
     sim = Sim(control="attitude", integrator=integrator)
     sim.add(Tilt(rates=rates))
     with pytest.raises(ConfigError, match=rf"expected derivative of plugin 'tilt' \(Tilt\) to return .*{words}"):

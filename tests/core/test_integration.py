@@ -52,6 +52,7 @@ def convergence_order(errors):
 
 
 def prepare_data(data, params=None, **states):
+    """Return the data with other states and parameters, without drag, thrust and torques that are not in ``params``."""
     new = {k: np.broadcast_to(np.asarray(v, float), getattr(data.states, k).shape) for k, v in states.items()}
     p = data.params
     params = {k: np.asarray(v, float) for k, v in (params or {}).items()}
@@ -102,7 +103,7 @@ def test_law_08_order_of_attitude_with_an_axis_that_turns(integrator, data, x64)
 
 
 def swaying_derivative(data):
-    """Return a derivative whose body rate depends on the attitude: feedback through the middle of the step."""
+    """Return a derivative whose body rate depends on the attitude, so that the middle stages of RK4 matter."""
     s = data.states
     ang_vel = jnp.stack([3 + 4 * s.quat[..., 1], 2 - 5 * s.quat[..., 0], 1 + 6 * s.quat[..., 3]], axis=-1)
     zero = jnp.zeros_like(s.vel)

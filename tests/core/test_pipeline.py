@@ -1,4 +1,4 @@
-"""Pipelines: named stages that are added, exchanged and taken out, and the checks on what a stage returns."""
+"""Pipelines: stages are added, replaced and removed by name, also in the pipelines of a simulation."""
 
 from functools import partial
 
@@ -109,7 +109,7 @@ def sim():
 
 @pytest.fixture(autouse=True)
 def restore(request):
-    """Give the shared simulation its own stages and data back."""
+    """Restore the stages and data of the shared simulation after a test."""
     if "sim" not in request.fixturenames:
         yield
         return

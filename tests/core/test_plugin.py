@@ -151,18 +151,20 @@ def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
     """``estimator`` and ``aero`` are short for plugins, which come before the listed plugins."""
     wind, battery = Wind((1.0, 0, 0), speed_20ft=7.7), Battery()
     settings = {"engine": "interpret", "drone": "cf21B_500_idsia", "control": "state", "rng_key": 4}
-    short = Sim(2, estimator="kalman", aero="identified", plugins=[wind, battery], **settings)
-    sensors = [short.plugins[name] for name in ("imu", "motion_capture")]
-    listed = Sim(2, plugins=[*sensors, short.plugins["kalman"], short.plugins["residual"], wind, battery], **settings)
+    shorthand = Sim(2, estimator="kalman", aero="identified", plugins=[wind, battery], **settings)
+    sensors = [shorthand.plugins[name] for name in ("imu", "motion_capture")]
+    listed = Sim(
+        2, plugins=[*sensors, shorthand.plugins["kalman"], shorthand.plugins["residual"], wind, battery], **settings
+    )
     added = Sim(2, **settings)
-    for plugin in short.plugins.values():
+    for plugin in shorthand.plugins.values():
         added.add(plugin)
-    assert [*short.plugins] == ["imu", "motion_capture", "kalman", "residual", "wind", "battery"]
+    assert [*shorthand.plugins] == ["imu", "motion_capture", "kalman", "residual", "wind", "battery"]
     for sim in (listed, added):
-        assert [*sim.plugins.items()] == [*short.plugins.items()]
-        assert [*sim.step_pipeline] == [*short.step_pipeline]
-        assert trees_equal(sim.data, short.data)
-        assert trees_equal(sim.default_data, short.default_data)
+        assert [*sim.plugins.items()] == [*shorthand.plugins.items()]
+        assert [*sim.step_pipeline] == [*shorthand.step_pipeline]
+        assert trees_equal(sim.data, shorthand.data)
+        assert trees_equal(sim.default_data, shorthand.default_data)
 
 
 @pytest.mark.parametrize("plugins", [Wind(), "imu", [Wind], None], ids=str)
@@ -314,49 +316,49 @@ def test_a_reset_restores_states_of_plugins_in_its_worlds_only():
     np.testing.assert_array_equal(after[1], flown[1])
 
 
-class PlaceData(PyTree):
+class StartData(PyTree):
     """Positions at which episodes began."""
 
     pos: Array = leaf("drone", 1, (3,))
     """Position, world frame, m. (n_worlds, n_drones, 3)"""
 
 
-class Place(Plugin):
+class StartRecorder(Plugin):
     """A plugin that stores where an episode begins."""
 
-    name: str = "place"
+    name: str = "start"
 
     def record(self, sim):
-        return self.fill_record(sim, PlaceData)
+        return self.fill_record(sim, StartData)
 
     def reset_episode(self, data):
-        return self.write(data, PlaceData(data.states.pos + 0.0))
+        return self.write(data, StartData(data.states.pos + 0.0))
 
 
-class LatePlace(Place):
+class LateStartRecorder(StartRecorder):
     """A plugin that stores where a drone is after the integration of the first step."""
 
     reset_before: ClassVar[str | None] = "increment_steps"
-    name: str = "late"
+    name: str = "late_start"
 
 
 def test_episodes_begin_at_resets_or_in_front_of_a_stage_of_their_first_step():
     sim = make_hovering_sim(engine="interpret")
-    place, late = sim.add(Place()), sim.add(LatePlace())
-    assert [*sim.reset_pipeline] == ["reset", "place"]
+    start, late_start = sim.add(StartRecorder()), sim.add(LateStartRecorder())
+    assert [*sim.reset_pipeline] == ["reset", "start"]
     sim.data = with_states(sim.data, vel=[0, 0, 1.0])
     before = np.array(sim.data.states.pos)
     sim.step()
     after = np.array(sim.data.states.pos)
     assert (after[..., 2] > before[..., 2]).all()
     for k in range(2):
-        np.testing.assert_array_equal(place.read(sim.data).pos, before, err_msg=f"after {k} more")
-        np.testing.assert_array_equal(late.read(sim.data).pos, after, err_msg=f"after {k} more")
+        np.testing.assert_array_equal(start.read(sim.data).pos, before, err_msg=f"after {k} more")
+        np.testing.assert_array_equal(late_start.read(sim.data).pos, after, err_msg=f"after {k} more")
         sim.step()
     sim.reset(np.array([True, False, False]))
-    np.testing.assert_array_equal(place.read(sim.data).pos[0], sim.default_data.states.pos[0])
-    np.testing.assert_array_equal(place.read(sim.data).pos[1:], before[1:])
-    np.testing.assert_array_equal(late.read(sim.data).pos[0], 0.0)
+    np.testing.assert_array_equal(start.read(sim.data).pos[0], sim.default_data.states.pos[0])
+    np.testing.assert_array_equal(start.read(sim.data).pos[1:], before[1:])
+    np.testing.assert_array_equal(late_start.read(sim.data).pos[0], 0.0)
 
 
 def test_all_parts_of_the_package_begin_episodes_by_one_method():
@@ -365,9 +367,9 @@ def test_all_parts_of_the_package_begin_episodes_by_one_method():
     sim.add(ESKF([imu, sim.plugins["motion_capture"]], False))
     sim.add(Complementary([imu, sim.add(Barometer())], False))
     sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
-    begin = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
+    begin_stages = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
     names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
-    assert begin == {f"{name}_begin": sim.plugins[name].reset_episode for name in names}
+    assert begin_stages == {f"{name}_begin": sim.plugins[name].reset_episode for name in names}
     assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"
 
 
@@ -425,24 +427,25 @@ def test_functions_can_be_a_plugin():
     np.testing.assert_array_equal(sim.data.plugins["count"].vel, 0.0)
 
 
-class Nameless(FunctionPlugin):
+class DuplicateStage(FunctionPlugin):
     """A plugin whose stage has the name of another stage."""
 
-    name: str = "nameless"
+    name: str = "duplicate"
     order: ClassVar[int] = 3
 
     def stages(self, sim):
         return [StagePlacement(lambda data: data, name="clip_floor_pos")]
 
 
-class Late(Plugin):
+class FailingPlugin(Plugin):
     """A plugin that fails after it has put an object into the scene."""
 
     fails: str = "never"
-    name: str = "late"
+    """Result that is wrong: ``"record"``, ``"stages"``, ``"pipeline"`` or ``"never"``."""
+    name: str = "failing"
 
     def record(self, sim):
-        sim.scene.add_once(PAINTED, "late", 2)
+        sim.scene.add_once(PAINTED_BOX, "failing", 2)
         return 3 if self.fails == "record" else None
 
     def stages(self, sim):
@@ -453,7 +456,7 @@ class Late(Plugin):
         return data
 
 
-PAINTED = """
+PAINTED_BOX = """
 <mujoco>
   <asset><texture name="paint" type="2d" builtin="flat" width="4" height="4"/><material name="paint" texture="paint"/>
   </asset>
@@ -468,16 +471,16 @@ def test_an_addition_that_fails_changes_nothing(fails):
     post = sim.scene.add("box")
     pipelines, data, default = (sim.step_pipeline, sim.reset_pipeline), sim.data, sim.default_data
     with pytest.raises(ValueError, match=r"expected|No stage named"):
-        sim.add(Late(fails))
+        sim.add(FailingPlugin(fails))
     assert (sim.step_pipeline, sim.reset_pipeline) == pipelines
     assert dict(sim.plugins) == {}
     assert trees_equal(sim.data, data)
     assert trees_equal(sim.default_data, default)
     assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy", "box:0"]
-    sim.add(Late())
+    sim.add(FailingPlugin())
     sim.data = post.set_pose(sim.data, (0, 0, 3))
-    assert sim.mj_model.body("late:1").id
-    assert sim.data.objects.names == ("box:0", "late:0", "late:1")
+    assert sim.mj_model.body("failing:1").id
+    assert sim.data.objects.names == ("box:0", "failing:0", "failing:1")
 
 
 class Unlisted(Plugin):
@@ -503,7 +506,7 @@ class Undeclared(Plugin):
     (lambda sim: sim.add("wind"), ConfigError, "expected a plugin, got 'wind'"),
     (lambda sim: sim.add(Wake(), name=""), ConfigError, "non-empty string as name of a Wake"),
     (lambda sim: sim.add(Wake(), name="mine"), ConfigError, "already has a record 'mine'"),
-    (lambda sim: sim.add(Nameless()), ConfigError, "already has a stage 'clip_floor_pos'"),
+    (lambda sim: sim.add(DuplicateStage()), ConfigError, "already has a stage 'clip_floor_pos'"),
     (lambda sim: sim.add(FunctionPlugin("a", None, [StagePlacement(lambda data: data, before="lunch")])),
      UnknownNameError, "No stage named 'lunch'"),
     (lambda sim: sim.add(Unlisted()), ConfigError, "expected stages of plugin 'unlisted' to return a list"),
@@ -534,16 +537,16 @@ def test_law_09_a_plugin_has_a_name():
             """A plugin without a name."""
 
 
-class Chosen(Plugin):
+class ArrayPlugin(Plugin):
     """A plugin with an array of any type."""
 
     which: jax.Array | None = None
     mask: np.ndarray | None = None
-    name: str = "chosen"
+    name: str = "arrays"
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
 @pytest.mark.parametrize("values", [[True, False], [1.0, 2.0]])
 def test_arrays_of_both_libraries_are_settings(xp, values):
-    np.testing.assert_array_equal(Chosen(xp.asarray(values)).which, values)
-    np.testing.assert_array_equal(Chosen(mask=xp.asarray(values)).mask, values)
+    np.testing.assert_array_equal(ArrayPlugin(xp.asarray(values)).which, values)
+    np.testing.assert_array_equal(ArrayPlugin(mask=xp.asarray(values)).mask, values)

@@ -1,4 +1,7 @@
-"""Populations: records with members, stages of one member, and programs of their own."""
+"""Populations: records with members, stages of one member, and programs of their own.
+
+The populations are the masses on springs of ``springs.py``.
+"""
 
 import warnings
 
@@ -55,15 +58,15 @@ def test_a_member_moves_like_a_single_member():
     sim = keep_mass_stages(build_springs(Springs, 3, 2, 4, engine="interpret"))
     sim.step(9)
     record = jax.device_get(sim.data.plugins["springs"])
-    one = Sim(engine="interpret")
-    one.add(Springs(1))
-    keep_mass_stages(one)
-    mass, start = one.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
+    single_sim = Sim(engine="interpret")
+    single_sim.add(Springs(1))
+    keep_mass_stages(single_sim)
+    mass, start = single_sim.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
     for world, member in ((0, 0), (2, 1), (1, 3)):
         own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
-        one.data = one.plugins["springs"].write(one.default_data, own)
-        one.step(9)
-        pos = np.asarray(one.data.plugins["springs"].pos)[0, 0]
+        single_sim.data = single_sim.plugins["springs"].write(single_sim.default_data, own)
+        single_sim.step(9)
+        pos = np.asarray(single_sim.data.plugins["springs"].pos)[0, 0]
         np.testing.assert_allclose(pos, record.pos[world, member], rtol=1e-6)
 
 
@@ -178,8 +181,8 @@ def test_random_numbers_are_those_of_world_and_member():
     data = sim.data
     core = jax.tree.map(lambda x: x.reshape(-1)[0], data.core)
     own = data.plugins["springs"].replace(member_id=np.asarray(data.plugins["springs"].member_id)[0, 0])
-    one = data.replace(core=core, plugins={"springs": own})
-    assert world_key(one, "kick") != member_key(one, "springs", "kick")
+    member_data = data.replace(core=core, plugins={"springs": own})
+    assert world_key(member_data, "kick") != member_key(member_data, "springs", "kick")
 
 
 def test_populations_that_depend_on_each_other_share_a_program():

@@ -9,14 +9,15 @@ from crazysim.core.pipeline import append_fn
 from crazysim.core.random import drone_keys
 from crazysim.pytree import select_worlds
 
-N_WORLDS, N_DRONES, N = 3, 2, 100
-T = N / 500
+N_WORLDS, N_DRONES, N_STEPS = 3, 2, 100
+DURATION = N_STEPS / 500
+"""Duration of a flight, s."""
 
 
 def draw(keys, low, high, shape=(1,)):
-    """Return one uniform draw for every key of (n_worlds, n_drones)."""
-    one = lambda key: jax.random.uniform(key, shape, minval=low, maxval=high)  # noqa: E731
-    return jax.vmap(jax.vmap(one))(keys)
+    """Return a uniform draw from each key. (n_worlds, n_drones, *shape)"""
+    draw_from_key = lambda key: jax.random.uniform(key, shape, minval=low, maxval=high)  # noqa: E731
+    return jax.vmap(jax.vmap(draw_from_key))(keys)
 
 
 def draw_mass(data, default_data, mask=None):
@@ -60,10 +61,10 @@ def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
     mass = np.asarray(sim.data.params.mass, np.float64)
     assert mass.shape == (N_WORLDS, N_DRONES, 1)
     assert len(np.unique(mass)) == N_WORLDS * N_DRONES
-    sim.step(N)
+    sim.step(N_STEPS)
     m0, drag = float(nominal.params.mass[0]), float(nominal.params.drag_matrix[2, 2])
     acc, rate = 9.81 * (m0 / mass[..., 0] - 1), -drag / mass[..., 0]
-    expected = acc / rate * (1 - np.exp(-rate * T))
+    expected = acc / rate * (1 - np.exp(-rate * DURATION))
     # explicit Euler is off by half a step in time, 0.5 % at 0.2 s with drag of 0.6 per s; hover in float32 by 1e-4 m/s
     np.testing.assert_allclose(sim.data.states.vel[..., 2], expected, rtol=2e-3, atol=2e-4)
     heavier = mass[..., 0] > m0

@@ -38,7 +38,7 @@ class Counter:
         return Counter(jnp.zeros((N_WORLDS, 1)), jnp.zeros(3), {"one": zeros}, jnp.zeros(N_WORLDS))
 
 
-class Own(PyTree):
+class NativeRecord(PyTree):
     """A record that declares its scopes as this project does."""
 
     count: jax.Array = leaf("world")
@@ -54,7 +54,7 @@ def count(data):
 def counting_sim():
     """Return a simulation whose plugins count steps: records of both kinds, a tuple, and arrays."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, engine="plain")
-    plugins = {"foreign": Counter.create(), "own": Own(jnp.zeros((N_WORLDS, 1))), "bare": jnp.zeros(2)}
+    plugins = {"foreign": Counter.create(), "own": NativeRecord(jnp.zeros((N_WORLDS, 1))), "bare": jnp.zeros(2)}
     sim.data = sim.data.replace(plugins=plugins | {"nested": (Counter.create(), jnp.zeros(()))})
     sim.build_default_data()
     insert_fn_before(sim.step_pipeline, "increment_steps", count)
@@ -117,12 +117,12 @@ def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
 def test_a_parameter_of_each_drone_returns_to_the_shared_default_and_stays_of_each_drone():
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES)
     mass = sim.data.params.mass
-    each = jnp.broadcast_to(2 * mass, (N_WORLDS, N_DRONES, 1))
-    sim.data = sim.data.replace(params=sim.data.params.replace(mass=each))
+    mass_of_each = jnp.broadcast_to(2 * mass, (N_WORLDS, N_DRONES, 1))
+    sim.data = sim.data.replace(params=sim.data.params.replace(mass=mass_of_each))
     sim.reset(MASK)
     np.testing.assert_allclose(np.asarray(sim.data.params.mass)[:, 0, 0], np.where(MASK, 1, 2) * mass)
     sim.reset()
-    np.testing.assert_array_equal(sim.data.params.mass, np.broadcast_to(mass, each.shape))
+    np.testing.assert_array_equal(sim.data.params.mass, np.broadcast_to(mass, mass_of_each.shape))
 
 
 def test_a_plugin_that_the_default_data_lack_stays():
@@ -133,7 +133,7 @@ def test_a_plugin_that_the_default_data_lack_stays():
 
 
 def test_the_default_data_outlive_a_flight_that_began_from_them():
-    """Law 11: what a full reset returns is not the default's own buffers, which a rollout may give away."""
+    """Law 11: a full reset copies the buffers of the default data, since a rollout may donate those of its data."""
     sim = Sim(control="rotor_vel")
     sim.data = sim.data.replace(plugins={"bare": jnp.ones(2)})
     sim.build_default_data()

@@ -12,10 +12,10 @@ from crazysim.pytree import PyTree, leaf
 class Numbers(PyTree):
     """A record with leaves of every scope."""
 
-    own: jax.Array = leaf("drone", 1)
-    ours: jax.Array = leaf("world", 1)
-    row: jax.Array = leaf("batched")
-    all: jax.Array = leaf("shared", 1)
+    of_drone: jax.Array = leaf("drone", 1)
+    of_world: jax.Array = leaf("world", 1)
+    batched: jax.Array = leaf("batched")
+    shared: jax.Array = leaf("shared", 1)
     opaque: jax.Array = leaf("opaque")
 
 
@@ -33,30 +33,34 @@ def test_the_function_is_applied_to_every_world(n_worlds, n_drones):
     def fn(world, factor):
         assert [x.shape for x in jax.tree.leaves(world)] == [(n_drones, 2), (2,), (5,), (2,), (n_worlds,)]
         assert factor.shape == ()
-        new = world.replace(own=factor * world.own + world.ours, ours=world.ours + world.all, row=world.row[::-1])
-        return new, world.own.sum(), world.ours
+        new = world.replace(
+            of_drone=factor * world.of_drone + world.of_world,
+            of_world=world.of_world + world.shared,
+            batched=world.batched[::-1],
+        )
+        return new, world.of_drone.sum(), world.of_world
 
     after, total, ours = vmap_worlds(fn)(record, factor)
-    np.testing.assert_allclose(after.own, factor[:, None, None] * record.own + record.ours, rtol=1e-6)
-    np.testing.assert_allclose(after.ours, record.ours + record.all, rtol=1e-6)
-    np.testing.assert_array_equal(after.row, record.row[:, ::-1])
-    np.testing.assert_allclose(total, record.own.sum(axis=(1, 2)), rtol=1e-5)
-    np.testing.assert_array_equal(ours, record.ours[:, 0])
-    assert after.all is record.all
+    np.testing.assert_allclose(after.of_drone, factor[:, None, None] * record.of_drone + record.of_world, rtol=1e-6)
+    np.testing.assert_allclose(after.of_world, record.of_world + record.shared, rtol=1e-6)
+    np.testing.assert_array_equal(after.batched, record.batched[:, ::-1])
+    np.testing.assert_allclose(total, record.of_drone.sum(axis=(1, 2)), rtol=1e-5)
+    np.testing.assert_array_equal(ours, record.of_world[:, 0])
+    assert after.shared is record.shared
     assert after.opaque is record.opaque
 
 
 def test_a_leaf_that_is_not_written_is_returned_unchanged():
     record = numbers(2, 3)
-    after = vmap_worlds(lambda world: world.replace(own=world.own + 1))(record)
-    assert all(getattr(after, name) is getattr(record, name) for name in ("ours", "row", "all", "opaque"))
+    after = vmap_worlds(lambda world: world.replace(of_drone=world.of_drone + 1))(record)
+    assert all(getattr(after, name) is getattr(record, name) for name in ("of_world", "batched", "shared", "opaque"))
 
 
 def test_a_shared_leaf_may_be_returned_for_every_world():
-    np.testing.assert_array_equal(vmap_worlds(lambda world: world.all)(numbers(3, 1)).shape, (3, 2))
+    np.testing.assert_array_equal(vmap_worlds(lambda world: world.shared)(numbers(3, 1)).shape, (3, 2))
 
 
-@pytest.mark.parametrize("name", ["all", "opaque"])
+@pytest.mark.parametrize("name", ["shared", "opaque"])
 def test_leaves_that_all_worlds_share_cannot_be_changed(name):
     def greedy(world):
         return world.replace(**{name: getattr(world, name) + 1})

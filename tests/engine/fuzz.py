@@ -65,7 +65,7 @@ class Inputs(PyTree):
 
 
 class Results(PyTree):
-    """Values of the programs: floating point, and other types."""
+    """Values of the programs, by the name of the stage with the suffix ``f`` (floats) or ``o`` (other types)."""
 
     drone: dict = leaf("drone", 1)
     """Values from stages of one drone. (n,)"""
@@ -103,7 +103,7 @@ def draw_inputs(rng: np.random.Generator) -> Inputs:
 
 
 def inputs_by_name(g: Inputs) -> dict:
-    """Return inputs by name."""
+    """Return all inputs by name: the letter of the type and the shape, such as ``f23``."""
     return {**g.numbers, **g.vectors, **g.matrices}
 
 
@@ -281,7 +281,7 @@ class Fuzzer:
         return self.data.replace(plugins=plugins), stages
 
     def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
-        """Return the values of programs on an engine."""
+        """Return the values of each line of each program on an engine, for all worlds."""
         data, stages = self._build_stages(cases)
         results = Step(stages, engine, self.platform, device=self.device)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
@@ -326,13 +326,13 @@ class Fuzzer:
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other_results, strict=True)):
-            line = functools.partial(_apply_to_values, case.program.lines[j])
+            line_fn = functools.partial(_apply_to_values, case.program.lines[j])
             signed = case.signed[j]
             bad = ~is_close(a, b, signed)
             lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
             # A compiler may compute an operand once more and round it differently, so the inputs are tried as well.
             value_fn = functools.partial(_apply_to_inputs, case.program, n + j)
-            for fn, operands in ((line, [*inputs, *other_results[:j]]), (value_fn, inputs)):
+            for fn, operands in ((line_fn, [*inputs, *other_results[:j]]), (value_fn, inputs)):
                 if len(lanes):
                     self.counts["examined for rounding"] += 1
                     lanes = lanes[~are_within_rounding(fn, [x[lanes] for x in operands], b[lanes], signed)]

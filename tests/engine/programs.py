@@ -67,15 +67,15 @@ class Draw:
         """Shape of the value that was chosen last."""
 
     def choice(self, options: Sequence):
-        """Return one of some options."""
+        """Return a random option."""
         return options[int(self.rng.integers(len(options)))]
 
     def int(self, low: int, high: int) -> int:
-        """Return an integer between two, both included."""
+        """Return a random integer from ``low`` to ``high``, both included."""
         return int(self.rng.integers(low, high + 1))
 
     def value(self, kinds: str = "biuf", min_ndim: int = 0, max_ndim: int = 9) -> str:
-        """Return the name of a value of one of some kinds, more often of the last such value."""
+        """Return the name of a random value whose type is of one of the kinds; the last such value is the likeliest."""
         fits = [k for k, a in enumerate(self.avals)
                 if _kind(a.dtype) in kinds and min_ndim <= len(a.shape) <= max_ndim]  # fmt: skip
         if not fits:
@@ -90,12 +90,12 @@ class Draw:
         return f"v{self.choice(fits)}" if fits else self.value(kinds)
 
     def axis(self) -> int:
-        """Return an axis of the value chosen last."""
+        """Return a random axis of the value chosen last."""
         n = len(self.shape)
         return self.int(-n, n - 1) if n else 0
 
     def real(self) -> str:
-        """Return a number."""
+        """Return a random floating-point number, as text."""
         return self.choice(["0.5", "2.0", "-1.0", "3.0", "0.25", "1e-3", "-2.5", "1.0", "7.0"])
 
 
@@ -108,7 +108,7 @@ TEMPLATES: list[tuple[str, Template]] = []
 
 
 def template(group: str, weight: int = 1) -> Callable[[Template], Template]:
-    """Register a function that draws a line."""
+    """Register a function that draws a line; the probability of its choice is proportional to ``weight``."""
 
     def register(fn: Template) -> Template:
         TEMPLATES.extend([(group, fn)] * weight)
@@ -149,6 +149,7 @@ BINARY_INT = (
 
 
 def _split_names(text: Sequence[str] | str) -> list[str]:
+    """Return the names in a text, without the disabled ones, which end in an underscore."""
     names = text.split() if isinstance(text, str) else text
     return [name for name in names if not name.endswith("_")]
 
@@ -389,15 +390,15 @@ def gathers(d: Draw) -> str:
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
     mode = d.choice(["clip", "fill", "wrap", "drop", "promise_in_bounds"])
     inside = f"jnp.clip({i}, 0, {length - 1})"
-    where = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
+    known = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
     return d.choice([
         f"{x}[{i}]", f"{x}[{inside}]", f"{x}[{i}, ...]", f"{x}[..., {j}]", f"{x}[{i}, {j}]",
         f"{x}[{inside}, {d.int(0, 1)}]",
         f"{x}.at[{i}].get(mode={mode if mode != 'promise_in_bounds' else 'clip'!r}, fill_value={d.int(0, 3)})",
         f"{x}.at[{inside}].get(mode={mode!r}, unique_indices=True)",
         f"jnp.take({x}, {i}, {axis}, mode={mode if mode in ('clip', 'fill', 'wrap') else 'clip'!r})",
-        f"jnp.take({x}, np.array({where}), {axis})", f"{x}[np.array({where})]", f"{x}[:, {i}]", f"{x}[{i}, :, None]",
-        f"jnp.take({x}, np.array({where}), {axis}, mode='fill')", f"{x}.at[np.array({where})].get(mode={mode!r})",
+        f"jnp.take({x}, np.array({known}), {axis})", f"{x}[np.array({known})]", f"{x}[:, {i}]", f"{x}[{i}, :, None]",
+        f"jnp.take({x}, np.array({known}), {axis}, mode='fill')", f"{x}.at[np.array({known})].get(mode={mode!r})",
         f"jnp.take_along_axis({x}, {d.value('i', 1)}, {axis}, mode={d.choice(['clip', 'fill'])!r})",
         f"lax.dynamic_slice_in_dim({x}, {d.value('iu', 0, 0)}, {d.int(1, length)}, 0)",
         f"lax.dynamic_slice({x}, [{d.value('iu', 0, 0)}] * {x}.ndim, {[d.int(1, max(s, 1)) for s in d.shape]})",
@@ -430,11 +431,11 @@ def scatters(d: Draw) -> str:
     x = d.value(min_ndim=1)
     length, n = max(d.shape[0], 1), len(d.shape)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
-    where = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
-    places = [f"{i}", f"np.array({where})", f"{d.int(-length, length - 1)}", f"{d.int(0, 1)}:", f"{i}, {j}",
+    known = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
+    places = [f"{i}", f"np.array({known})", f"{d.int(-length, length - 1)}", f"{d.int(0, 1)}:", f"{i}, {j}",
               f"..., {j}",
-              f"jnp.clip({i}, 0, {length - 1})", "::2", f":, {i}", f"np.array({where}), ...", f"{i}, :",
-              f"np.array({where}), {j}", "...", f"{d.int(-2, 0)}, {d.int(0, 1)}"]  # fmt: skip
+              f"jnp.clip({i}, 0, {length - 1})", "::2", f":, {i}", f"np.array({known}), ...", f"{i}, :",
+              f"np.array({known}), {j}", "...", f"{d.int(-2, 0)}, {d.int(0, 1)}"]  # fmt: skip
     place = d.choice(places)
     flags = d.choice(["", "", ", mode='clip'", ", mode='drop'", ", mode='fill'", ", mode='wrap'"])
     if place in ("...", "::2") and d.rng.random() < 0.5:
@@ -486,7 +487,7 @@ def control_flow(d: Draw) -> str:
     test, index = d.value("b", 0, 0), d.value("iu", 0, 0)
     length = d.shape[0] if d.shape else 1
     body = d.choice(["c * 0.5 + 1", "jnp.sin(c)", "-c", "c[::-1]", "c * c", "jnp.where(c > 1, c - 1, c + 2)", "c + k"])
-    two = d.choice(["c + y, c * y", "y, c", "jnp.maximum(c, y), c", "c, (y, c - y)[0]", "c * 0.5 + y, None"])
+    pair = d.choice(["c + y, c * y", "y, c", "jnp.maximum(c, y), c", "c, (y, c - y)[0]", "c * 0.5 + y, None"])
     back = d.choice(["True", "False"])
     inner = d.choice(["jnp.sin(t) * t", "t * t", "jnp.sum(t)", "jax.nn.relu(t)", "jnp.linalg.norm(t)", "jnp.tanh(t)"])
     limit, count = d.int(1, 9), d.value("i", 0, 0)
@@ -499,8 +500,8 @@ def control_flow(d: Draw) -> str:
         f"lax.while_loop(lambda c: (c[1] < {limit}) & (c[0].sum() < 9), "
         f"lambda c: (c[0] + c[0], c[1] + 1), ({x}, 0))[0]",
         f"lax.while_loop(lambda c: c < {limit}, lambda c: c + 1 + jnp.sign(c) ** 2, jnp.clip({count}, -5, 5))",
-        f"lax.scan(lambda c, y: ({two}), {x}[0], {x}, reverse={back})[0]",
-        f"lax.scan(lambda c, y: ({two}), {x}[0], {x}, reverse={back})[1]",
+        f"lax.scan(lambda c, y: ({pair}), {x}[0], {x}, reverse={back})[0]",
+        f"lax.scan(lambda c, y: ({pair}), {x}[0], {x}, reverse={back})[1]",
         f"lax.scan(lambda c, _: (c * 0.5 + 1, c), {x}, None, length={d.int(1, 4)})[{d.int(0, 1)}]",
         f"lax.scan(lambda c, y: (c + 1, c * y), 0, {x}, unroll={d.int(1, 2)})[1]",
         f"lax.map(lambda t: {inner}, {x})", f"jax.jit(lambda t: {inner})({x})", f"jax.vmap(lambda t: {inner})({x})",
@@ -539,7 +540,7 @@ def draw_program(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtyp
 
     Args:
         rng: Source of random choices.
-        input_shapes: Shapes and types of the leaves that it may read.
+        input_shapes: Shapes and types of the inputs that it may use, by name.
         n_lines: Number of lines.
     """
     inputs = tuple(input_shapes)

@@ -1,4 +1,4 @@
-"""Comparison of the results of two engines: they must be equal, or differ only by rounding.
+"""Comparison of the results of two engines, which must be equal or differ only by rounding.
 
 Numbers that were rounded may differ by a few units in the last place: XLA and the host's library approximate functions
 differently, and compilers contract a product and a sum. A larger difference must come from an ill-conditioned
@@ -109,7 +109,7 @@ UNDISTURBED_PRIMITIVES = SIGN_PRESERVING_PRIMITIVES | {
     "clamp",
     "random_bits",
 }
-"""Primitives whose results are not disturbed, because they do not round or consist of other primitives."""
+"""Primitives whose results are not disturbed: they do not round, or they consist of other primitives."""
 
 
 def _abs_finite(x):

@@ -1,4 +1,7 @@
-"""Cases for every rule of lowering: functions of one drone's arrays."""
+"""Cases for every rule of lowering: functions of one drone's arrays.
+
+A rule translates a primitive of JAX into operations of the engine (``crazysim.engine.lowering``).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +37,7 @@ CASES = {}
 
 
 def case(fn):
+    """Add a function of ``Inputs`` to the cases."""
     CASES[fn.__name__] = fn
     return fn
 
@@ -52,11 +56,11 @@ def arithmetic(g):
 @case
 def functions(g):
     x, p = g.x, jnp.abs(g.x) + 0.1
-    few = [jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.exp(x), jnp.log(p), jnp.sqrt(p), jnp.tanh(x), jax.lax.rsqrt(p)]
-    more = [jnp.arctan2(x, x[::-1]), jnp.arcsin(x / 4), jnp.arccos(x / 4), jnp.arctan(x), jnp.sinh(x), jnp.cosh(x)]
-    rest = [jnp.expm1(x), jnp.log1p(p), jnp.cbrt(x), jnp.exp2(x), p**x, x**3, p**-2, jax.nn.sigmoid(x)]
-    last = [jax.lax.erf(x), jax.lax.erf_inv(x / 4), jnp.arcsinh(x), jnp.arctanh(x / 4), jnp.arccosh(p + 1)]
-    return jnp.stack(few + more + rest + last)
+    first = [jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.exp(x), jnp.log(p), jnp.sqrt(p), jnp.tanh(x), jax.lax.rsqrt(p)]
+    second = [jnp.arctan2(x, x[::-1]), jnp.arcsin(x / 4), jnp.arccos(x / 4), jnp.arctan(x), jnp.sinh(x), jnp.cosh(x)]
+    third = [jnp.expm1(x), jnp.log1p(p), jnp.cbrt(x), jnp.exp2(x), p**x, x**3, p**-2, jax.nn.sigmoid(x)]
+    fourth = [jax.lax.erf(x), jax.lax.erf_inv(x / 4), jnp.arcsinh(x), jnp.arctanh(x / 4), jnp.arccosh(p + 1)]
+    return jnp.stack(first + second + third + fourth)
 
 
 @case

@@ -37,7 +37,7 @@ def source():
 
 
 def test_an_architecture_is_that_of_the_device():
-    """Not the architecture of the first device that was requested."""
+    """It does not depend on which device was asked about first."""
     assert [cuda.architecture(d) for d in (NEW, OLD, NEW)] == ["compute_90", "compute_86", "compute_90"]
     assert cuda.architecture(None) == cuda.DEFAULT_ARCHITECTURE
     assert jaxcompat.compute_capability(Gpu("12.0")) == 120
@@ -102,7 +102,7 @@ def test_a_wider_block_has_more_whole_worlds():
 
 
 def test_long_kernels_on_a_gpu_read_shared_numbers_where_they_use_them(source):
-    """A kernel with an estimator has too few registers for them. In a short kernel, reads would cost more."""
+    """A kernel with an estimator has no registers left for shared numbers. A short kernel reads them once."""
     sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
     long_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
     texts = [k.text[k.text.index(" advance(") :] for k in (long_kernel, source)]

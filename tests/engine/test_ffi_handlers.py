@@ -12,7 +12,7 @@ from crazysim.engine.backends import ffi_handlers
 
 @pytest.fixture(scope="module")
 def scaled():
-    """Function that a handler computes: from an array, a factor and a text to factor x + length of the text."""
+    """Return a compiled function of x, a factor and a text: a handler computes factor * x + length of the text."""
 
     def handle(call):
         n, factor = call.attribute("n"), call.attribute("factor")

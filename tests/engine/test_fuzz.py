@@ -55,7 +55,7 @@ PROGRAMS_ONCE_WRONG = {
         "jax.sharding.reshard(v0, jax.sharding.NamedSharding(jax.make_mesh((1,), ('i',)), jax.P())) + 1",
     ),
 }  # fmt: skip
-"""Inputs and a line, by the former defect."""
+"""Inputs and the line of a program, by the former defect. Inputs are those of ``fuzz``: ``f23`` is float32, (2, 3)."""
 
 REFUSED_PROGRAMS = {
     "platform_index": (("f3",), "lax.platform_dependent(v0, cpu=jnp.sin, default=jnp.cos)"),
@@ -63,7 +63,7 @@ REFUSED_PROGRAMS = {
     "svd": (("f33",), "jnp.linalg.svd(jnp.nan_to_num(v0))[1]"),
     "float16": (("f3",), "v0.astype(np.float16)"),
 }
-"""Inputs and a line, by a word of the reason for which they are refused."""
+"""Inputs and the line of a program, by a word of the reason for which the engine refuses it."""
 
 
 @pytest.fixture(scope="module")

@@ -31,8 +31,8 @@ def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
         sim = Sim(n_worlds, n_drones, engine=engine, **options)
         for stage_fn in stages:
             insert_fn_before(sim.step_pipeline, "integration", stage_fn)
-        apart = jnp.arange(n_worlds * n_drones * 3.0).reshape(n_worlds, n_drones, 3)
-        start = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.sin(apart)))
+        phases = jnp.arange(n_worlds * n_drones * 3.0).reshape(n_worlds, n_drones, 3)
+        start = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.sin(phases)))
         step = Step(sim.step_pipeline, engine)
 
         def losses(x, step=step, start=start, mass=sim.data.params.mass):
@@ -62,8 +62,8 @@ OPERATIONS = {
     "functions": lambda x, y: jnp.sin(x) * jnp.exp(-y) + jnp.sqrt(x * x + 1.0) + jnp.arctan2(x, y),
     "selections": lambda x, y: jnp.where(x > y, x * y, jnp.maximum(x, 2.0 * y)) + jnp.clip(x, -0.5, 0.5) + jnp.abs(y),
     "loop": lambda x, y: jax.lax.fori_loop(0, 50, lambda _, z: jnp.cos(z) * y, x),  # in several parts
-    "own derivative": lambda x, y: jax.nn.relu(x) * jax.nn.softplus(y) + jax.nn.silu(x * y),
-    "unused": lambda x, y: jnp.floor(x) + jax.lax.stop_gradient(y) * x,
+    "custom derivative": lambda x, y: jax.nn.relu(x) * jax.nn.softplus(y) + jax.nn.silu(x * y),
+    "zero derivative": lambda x, y: jnp.floor(x) + jax.lax.stop_gradient(y) * x,
 }
 
 
@@ -114,10 +114,10 @@ def test_a_kernel_computes_the_gradient(x64, monkeypatch):
     assert_close(jit_gradient(in_intervals)(point), jit_gradient(plain)(point))
     assert "gradient: one kernel" in explain(step, data)
 
-    many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), point)
-    expected = jax.vmap(jit_gradient(plain))(many)
-    assert_close(jax.vmap(jit_gradient(in_intervals))(many), expected)
-    assert_close(jit_gradient(jax.vmap(in_intervals))(many), expected)
+    points = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), point)
+    expected = jax.vmap(jit_gradient(plain))(points)
+    assert_close(jax.vmap(jit_gradient(in_intervals))(points), expected)
+    assert_close(jit_gradient(jax.vmap(in_intervals))(points), expected)
     assert "lanes" not in explain(step, data)
 
 
@@ -130,7 +130,7 @@ def test_a_kernel_computes_tangents(x64):
     mass = data.params.mass
     expected = jacobian(plain)(point, mass)
     assert_close(jacobian(fast)(point, mass), expected)
-    slope = jax.jit(lambda mass, way: jax.jvp(lambda mass: fast(point, mass=mass), (mass,), (way,))[1])
+    slope = jax.jit(lambda mass, direction: jax.jvp(lambda mass: fast(point, mass=mass), (mass,), (direction,))[1])
     assert_close(slope(mass, 3.0 * mass), 3.0 * expected[1] @ mass)
     descriptions = [line for line in explain(step, data).splitlines() if "jvp" in line]
     assert descriptions

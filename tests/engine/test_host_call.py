@@ -28,7 +28,7 @@ def sim():
 
 
 def step_on_xla(sim, n):
-    """Return the data some steps later, by the compiled function."""
+    """Return the data after ``n`` steps of the function that XLA compiled."""
     return sim.step_fn(sim.data, jnp.int32(n))
 
 
@@ -159,7 +159,7 @@ def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim, fiel
     assert trees_equal(sim.data.states, twin.data.states)
 
 
-def test_a_command_of_the_device_may_be_donated_later(sim):
+def test_a_command_on_the_device_may_be_donated_later(sim):
     command = jax.device_put(COMMAND.astype(np.float32), sim.device)
     sim.attitude_control(command)
     jax.jit(lambda x: x * 0 + 7, donate_argnums=0)(command)

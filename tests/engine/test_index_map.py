@@ -21,7 +21,10 @@ def tables():
 
 
 def sum_positive_rows(index, numbers, places):
-    """Sum rows whose first number is positive; the number of rows depends on the index, and differs between lanes."""
+    """Sum numbers of the rows whose first number is positive, among the first ``index % 10`` rows.
+
+    The number of iterations differs between lanes.
+    """
     (place,) = table_rows(places, jax.lax.rem(index, jnp.int32(50)))
     own = table_row(numbers, place)
 
@@ -36,6 +39,7 @@ def sum_positive_rows(index, numbers, places):
 
 
 def compute_by_hand(numbers, places):
+    """Return the results of ``sum_positive_rows`` for all indices. (4, N)"""
     out = []
     for i in range(N):
         rows = numbers[: i % 10]

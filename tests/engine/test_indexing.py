@@ -23,7 +23,7 @@ def fuzzer():
     return Fuzzer(0)
 
 
-class Written(PyTree):
+class Results(PyTree):
     """Results of all functions."""
 
     rows: jax.Array = leaf("drone", 2)
@@ -44,7 +44,7 @@ WRITES = [
     (lambda x, k: x.at[jnp.array([0, 1])].set(x[:2] + 4 + k), [4, 4, 0]),
     (lambda x, k: (x + 3).at[jnp.array([0, 0])].min(jnp.array([2.0, 1.0]) + k), [1, 3, 3]),
 ]
-"""Functions of a zero vector and the number of the step, which is zero, and their results."""
+"""Functions of a zero vector ``x`` and of the step count ``k``, which is 0, and their results."""
 
 
 def test_updates_at_indices_equal_those_of_plain(sim):
@@ -53,10 +53,10 @@ def test_updates_at_indices_equal_those_of_plain(sim):
     @stage("drone")
     def write(data):
         rows = [fn(jnp.zeros_like(data.states.pos), data.core.steps) for fn, _ in WRITES]
-        return data.replace(plugins={"written": Written(jnp.stack(rows))})
+        return data.replace(plugins={"written": Results(jnp.stack(rows))})
 
     expected = np.float32([row for _, row in WRITES])
-    data = sim.data.replace(plugins={"written": Written(np.full((2, 2, *expected.shape), -1, np.float32))})
+    data = sim.data.replace(plugins={"written": Results(np.full((2, 2, *expected.shape), -1, np.float32))})
     found = np.asarray(Step({"write": write}, strict=True)(data).plugins["written"].rows)
     for k, row in enumerate(expected):
         np.testing.assert_array_equal(found[:, :, k], np.broadcast_to(row, (2, 2, 3)), err_msg=f"function {k}")
@@ -65,7 +65,7 @@ def test_updates_at_indices_equal_those_of_plain(sim):
 WINDOW = "lax.ScatterDimensionNumbers((1,), (), (0,))"
 ROWS = "lax.ScatterDimensionNumbers((0,), (0,), (0,))"
 BATCHED = "lax.ScatterDimensionNumbers((), (1,), (1,), (0,), (0,))"
-PICK = "lax.GatherDimensionNumbers((), (1,), (1,), (0,), (0,))"
+ELEMENTS = "lax.GatherDimensionNumbers((), (1,), (1,), (0,), (0,))"
 SLICES = "lax.GatherDimensionNumbers((1,), (), (0,))"
 MODES = ("clip", "fill", "promise_in_bounds")
 INDICES = {"clip": "v1", "fill": "v1", "promise_in_bounds": "jnp.clip(v1, 0, 1)"}
@@ -89,7 +89,7 @@ PROGRAMS = {
     **{
         f"batched reads in mode {mode}": (
             ("f23", "i3"),
-            f"lax.gather(v0, {INDICES[mode]}[:2, None], {PICK}, (1, 1), mode={mode!r})",
+            f"lax.gather(v0, {INDICES[mode]}[:2, None], {ELEMENTS}, (1, 1), mode={mode!r})",
         )
         for mode in MODES
     },
@@ -119,7 +119,7 @@ PROGRAMS = {
     "along an axis": (("f33",), "jnp.take_along_axis(v0, jnp.argsort(v0, 0), 0)"),
     "keys": (("i3", "i"), "jax.random.key_data(jax.random.split(jax.random.key(v0[0]), 3)[v1])"),
 }
-"""Inputs and a line, by the tested case."""
+"""Inputs and the line of a program, by the tested case. Inputs are those of ``fuzz``: ``f23`` is float32, (2, 3)."""
 
 
 def test_windows_batches_and_modes(fuzzer):
@@ -133,8 +133,8 @@ def test_windows_batches_and_modes(fuzzer):
 def test_too_many_places_are_refused_when_the_step_is_planned(sim):
     @stage("drone")
     def write(data):
-        far = jnp.zeros(100).at[data.core.steps].set(1.0)
-        return data.replace(states=data.states.replace(vel=far[:3]))
+        row = jnp.zeros(100).at[data.core.steps].set(1.0)
+        return data.replace(states=data.states.replace(vel=row[:3]))
 
     with pytest.warns(EngineWarning, match="stage 'write' is not fused: .* has 100 possible values"):
         Step({"write": write}, "lanes").plan(sim.data)

@@ -158,7 +158,7 @@ def test_equal_engines_do_not_differ(moving_data):
 
 
 def test_the_first_difference_has_stage_field_element_and_operation(moving_data, monkeypatch):
-    """A defect in XLA's form of one operation."""
+    """The sine that ``lanes`` uses is made wrong."""
     import dataclasses
 
     wrong = dataclasses.replace(ops.TABLE["sin"], xla=lambda x: jax.lax.sin(x) + 0.01)

@@ -40,7 +40,7 @@ def test_an_observer_gets_every_operation_with_its_results():
 
 @pytest.fixture(scope="module")
 def step():
-    """Return the program of a built-in step, and its leaves, followed by the packed leaf."""
+    """Return the program of a built-in step and its leaves, the last of which packs all shared numbers."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     program = optimise(
         lower_stages(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
@@ -53,10 +53,10 @@ def step():
 def test_vmap_is_a_loop(step):
     program, leaves = step
     i = next(i for i, leaf in enumerate(program.leaves) if leaf.name == "states.vel")
-    many = jnp.stack([leaves[i], leaves[i] + 1.0])
+    batch = jnp.stack([leaves[i], leaves[i] + 1.0])
     run = jax.jit(jax.vmap(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0]))
-    one = jax.jit(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(many[1])
-    for x, y in zip(run(many), one, strict=True):
+    single = jax.jit(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(batch[1])
+    for x, y in zip(run(batch), single, strict=True):
         np.testing.assert_array_equal(x[1], y)
 
 

@@ -103,7 +103,7 @@ def test_a_file_of_another_user_is_not_loaded(cache):
 
 
 def test_enable_cache_checks_its_folder_at_once(tmp_path):
-    """With ``enable_cache``, an error rather than a warning."""
+    """A folder that others can write is an error here, not a warning."""
     mask = os.umask(0)
     try:
         shared_folder = tmp_path / "open"
@@ -137,19 +137,19 @@ def make_remains(tmp_path):
 def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
     here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process_id()
     machine = here.split("-")[0]
-    day = 1.01 * kernel_cache.ABANDONMENT_AGE
+    old = 1.01 * kernel_cache.ABANDONMENT_AGE
     remains = [
         make_remains(f"key.{machine}-{gone}-140.tmp"),
         make_remains(f"crazysim-{machine}-{gone}-abc"),
-        make_remains(f"key.{other}-{os.getpid()}-1.tmp", day),
-        make_remains("key.4711.140.tmp", day),  # as 0.1 named them
+        make_remains(f"key.{other}-{os.getpid()}-1.tmp", old),
+        make_remains("key.4711.140.tmp", old),  # as version 0.1 named them
     ]
     needed = [
-        make_remains(f"key.{here}-140.tmp", day),
-        make_remains(f"crazysim-{here}-abc", day),
+        make_remains(f"key.{here}-140.tmp", old),
+        make_remains(f"crazysim-{here}-abc", old),
         make_remains(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
         make_remains("key.4711.140.tmp2.tmp"),
-        make_remains("crazysim-mine", day),
+        make_remains("crazysim-mine", old),
     ]
     for pattern in ("*.tmp", "crazysim-*"):
         kernel_cache.remove_abandoned_files(tmp_path, pattern)

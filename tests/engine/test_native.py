@@ -125,7 +125,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
     (library,) = cache_folder.iterdir()
     library.unlink()
     (folder / "other.c").write_text("void crazysim_advance() { __builtin_trap(); } int crazysim_call() { return -1; }")
-    other = [
+    command = [
         *COMPILER.split()[:1],
         "-x",
         "c",
@@ -135,7 +135,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
         "-o",
         str(folder / "other.so"),
     ]
-    subprocess.run(other, check=True)
+    subprocess.run(command, check=True)
     kernel_cache.store_file(cache_folder, key, (folder / "other.so").read_bytes(), ".so")
 
     assert register_anew(source) != f"crazysim_advance_{key}"
@@ -304,8 +304,8 @@ def test_a_compiler_is_a_command_with_options(source, cache_folder, monkeypatch)
         native.compiler.cache_clear()
 
 
-def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, cache_folder, monkeypatch, tmp_path_factory):
-    """That takes one second instead of 20, without the libraries of ziglang. The key ignores the working directory."""
+def test_ziglang_compiles_where_there_is_no_other_compiler(source, cache_folder, monkeypatch, tmp_path_factory):
+    """Without the libraries of ziglang this takes 1 s instead of 20 s. The key ignores the working directory."""
     pytest.importorskip("ziglang")
     monkeypatch.setenv("CXXFLAGS", "")  # the tests have options of g++
     which = shutil.which
@@ -350,8 +350,13 @@ else:
 """
 
 
-def compile_in_another_process(folder, speed):
-    """Start a process that compiles a kernel into a folder."""
+def compile_in_another_process(folder, mode):
+    """Start a process that compiles kernels into a folder.
+
+    Args:
+        folder: Folder of the cache and of temporary files.
+        mode: ``"quick"`` or ``"slow"`` for one such kernel, ``"threads"`` for four slow ones in two threads.
+    """
     cache_folder = folder / "cache"
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
@@ -359,10 +364,10 @@ def compile_in_another_process(folder, speed):
         "JAX_COMPILATION_CACHE_DIR": str(cache_folder),
     }
     cache_folder.mkdir(exist_ok=True)
-    return subprocess.Popen([sys.executable, "-c", COMPILE, speed], env=environment, stderr=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-c", COMPILE, mode], env=environment, stderr=subprocess.DEVNULL)
 
 
-def compilers(folder):
+def compiler_commands(folder):
     """Return the commands of running compilers whose files are in a folder."""
     done = subprocess.run(["ps", "-eww", "-o", "args"], capture_output=True, text=True, check=True)
     return [line for line in done.stdout.splitlines() if str(folder) in line and "kernel.cpp" in line]
@@ -391,18 +396,18 @@ def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
 
 
 @pytest.mark.parametrize(
-    ("end", "where"),
+    ("end_signal", "mode"),
     [(signal.SIGKILL, "threads"), (signal.SIGTERM, "slow"), (signal.SIGINT, "slow"), (signal.SIGINT, "threads")],
 )
-def test_compilers_end_with_their_process(tmp_path, end, where):
-    with compile_in_another_process(tmp_path, where) as process:
+def test_compilers_end_with_their_process(tmp_path, end_signal, mode):
+    with compile_in_another_process(tmp_path, mode) as process:
         try:
-            wait_for(lambda: len(compilers(tmp_path)) >= 3)  # the script, the driver and the compiler
-            process.send_signal(end)
+            wait_for(lambda: len(compiler_commands(tmp_path)) >= 3)  # the script, the driver and the compiler
+            process.send_signal(end_signal)
             process.wait(300)
         finally:
             process.kill()
-    wait_for(lambda: not compilers(tmp_path))
+    wait_for(lambda: not compiler_commands(tmp_path))
     assert compile_in_another_process(tmp_path, "quick").wait(300) == 0
     assert [path.suffix for path in (tmp_path / "cache" / "crazysim").iterdir()] == [".so"]
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
@@ -432,9 +437,9 @@ def test_machines_that_share_a_home_never_call_kernels_of_each_other(tmp_path):
     other.write_text("flags : none of the first machine's\n")
     swap = f"import pathlib, crazysim.cache as c; c.CPU_INFO = pathlib.Path({str(other)!r})\n"
     speeds, files = [], []
-    for begin in ("", swap, ""):
+    for prefix in ("", swap, ""):
         done = subprocess.run(
-            [sys.executable, "-c", begin + FLY, str(tmp_path / "cache")],
+            [sys.executable, "-c", prefix + FLY, str(tmp_path / "cache")],
             capture_output=True,
             text=True,
             env=os.environ | {"JAX_PLATFORMS": "cpu"},

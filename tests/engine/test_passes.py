@@ -23,7 +23,7 @@ F32 = np.float32
 
 
 def numbers_by_slot(program, leaves):
-    """Return the numbers of worlds with one drone, by slot. (N_WORLDS,) or ()"""
+    """Return the numbers of worlds with one drone, by slot: (leaf, element of the leaf). (N_WORLDS,) or ()"""
     numbers = {}
     for i, x in enumerate(leaves):
         leaf, x = program.leaves[i], np.asarray(jax.random.key_data(x) if is_key(x) else x)
@@ -106,7 +106,7 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
         np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
 
 
-# Programs of two numbers --------------------------------------------------------------------------------------------
+# Programs of a few numbers ------------------------------------------------------------------------------------------
 
 X, Y, Z, SHARED = (0, 0), (1, 0), (2, 0), (3, 0)
 LEAVES = tuple(Leaf(name, "drone", (N_WORLDS, 1), np.dtype(np.float32)) for name in "xyz") + (
@@ -136,11 +136,11 @@ def guarded_segment(name, reads, write, fn):
     return Segment("drone", (name,), "each", b.finish(new), (X, write, *reads), (write,))
 
 
-@pytest.mark.parametrize("last", [Y, Z])
-def test_stages_of_the_same_ticks_are_joined(last):
+@pytest.mark.parametrize("result", [Y, Z])
+def test_stages_of_the_same_ticks_are_joined(result):
     """The second stage reads a number that the first writes, and may write it too. Other worlds do not change."""
     half = guarded_segment("half", [SHARED], Y, lambda b, x: b.add("mul", (x, np.float32(0.5)), np.float32))
-    sine = guarded_segment("sine", [Y, SHARED], last, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
+    sine = guarded_segment("sine", [Y, SHARED], result, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
     fused = schedule.fuse(Program(LEAVES, 1, (half, sine)))
     joined = verify(schedule.join_ticks(fused))
     assert [op.name for op in fused.segments[0].block.operations].count("when") == 2
@@ -149,7 +149,7 @@ def test_stages_of_the_same_ticks_are_joined(last):
     numbers = {X: x, Y: x + 10, Z: x + 20, SHARED: np.float32(3)}
     expected, found = run_program(fused, numbers, 2), run_program(joined, numbers, 2)
     assert all((found[slot] == expected[slot]).all() for slot in (X, Y, Z))
-    assert (found[last] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[last])).all()
+    assert (found[result] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[result])).all()
 
 
 def test_stages_of_other_ticks_are_not_joined():
@@ -206,7 +206,7 @@ def new_value(dtype=np.float32):
 
 
 WELL_FORMED = segment("a", [X], [Y], apply_fn("exp"))
-BROKEN = {
+BROKEN_PROGRAMS = {
     "used before it is defined": (
         broken_program(block=dataclasses.replace(WELL_FORMED.block, outputs=(new_value(),))),
         "before it is defined",
@@ -245,11 +245,12 @@ BROKEN = {
         "further inputs for 1 hoisted",
     ),
 }
+"""Programs and words of the error, by the defect."""
 
 
-@pytest.mark.parametrize("what", BROKEN)
-def test_verification_finds_each_defect(what):
-    program, message = BROKEN[what]
+@pytest.mark.parametrize("defect", BROKEN_PROGRAMS)
+def test_verification_finds_each_defect(defect):
+    program, message = BROKEN_PROGRAMS[defect]
     with pytest.raises(VerificationError, match=message):
         verify(program)
 

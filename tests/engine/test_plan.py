@@ -1,4 +1,4 @@
-"""Planning a step: everything that an engine does not support is reported then, once, and bugs are not hidden."""
+"""Planning a step reports everything that an engine does not support, once, and hides no bug."""
 
 import dataclasses
 import re
@@ -161,6 +161,7 @@ def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
 
 
 def use_compiler(monkeypatch, folder, script):
+    """Replace the C++ compiler by a shell script."""
     path = folder / "compiler"
     path.write_text(f"#!/bin/sh\n{script}\n")
     path.chmod(0o755)
@@ -210,15 +211,15 @@ def is_running(pid):
 
 
 class Bytes(PyTree):
-    """Small integers."""
+    """Integers of 8 bits."""
 
     counts: jax.Array = leaf("drone", 1)
-    names: jax.Array = leaf("drone")
+    labels: jax.Array = leaf("drone")
 
 
 @stage("drone")
 def count(data):
-    """Count with numbers that overflow."""
+    """Add 100 to the counts, which overflow."""
     record = data.plugins["bytes"]
     counts = record.counts + record.counts.dtype.type(100)
     return data.replace(plugins={"bytes": record.replace(counts=counts)})
@@ -228,28 +229,28 @@ def count(data):
 def label(data):
     """Write a number without an operation."""
     record = data.plugins["bytes"]
-    return data.replace(plugins={"bytes": record.replace(names=jnp.asarray(7, record.names.dtype))})
+    return data.replace(plugins={"bytes": record.replace(labels=jnp.asarray(7, record.labels.dtype))})
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.uint8])
-@pytest.mark.parametrize("writes", [count, label])
-def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, dtype, writes):
+@pytest.mark.parametrize("writer", [count, label])
+def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, dtype, writer):
     record = Bytes(jnp.full((3, 2, 2), 90, dtype), jnp.zeros((3, 2), dtype))
     data = sim.data.replace(plugins={"bytes": record})
-    stages = {"sway": sway, writes.__name__: writes}
+    stages = {"sway": sway, writer.__name__: writer}
     after = Step(stages, "lanes")(data, jnp.int32(2)).plugins["bytes"]
-    assert after.counts.dtype == after.names.dtype == dtype
+    assert after.counts.dtype == after.labels.dtype == dtype
     np.testing.assert_array_equal(
-        after.counts, np.full((3, 2, 2), (290 if writes is count else 90) % 256).astype(dtype)
+        after.counts, np.full((3, 2, 2), (290 if writer is count else 90) % 256).astype(dtype)
     )
-    np.testing.assert_array_equal(after.names, 0 if writes is count else 7)
+    np.testing.assert_array_equal(after.labels, 0 if writer is count else 7)
     if native.compiler() is not None:
         name = np.dtype(dtype).name
         with pytest.raises(
-            ConfigError, match=rf"'fused' cannot run .* {name}.*\(stage '{writes.__name__}', jax.*Use 'lanes'"
+            ConfigError, match=rf"'fused' cannot run .* {name}.*\(stage '{writer.__name__}', jax.*Use 'lanes'"
         ):
             Step(stages, "fused").plan(data)
-        with pytest.warns(EngineWarning, match=f"stage '{writes.__name__}' has no kernel: .*{name}"):
+        with pytest.warns(EngineWarning, match=f"stage '{writer.__name__}' has no kernel: .*{name}"):
             assert Step(stages).plan(data).engine == "lanes"
 
 
@@ -307,6 +308,7 @@ def lift(data):
 
 
 drop = Stage(lambda data: data.replace(states=data.states.replace(force=0 * data.states.force)), "drone", batched=True)
+"""Set the forces to zero, in a stage that accepts leading axes."""
 
 
 def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tmp_path):

@@ -1,4 +1,4 @@
-"""The fuzzer's comparison explains differences by rounding, and no other differences."""
+"""The fuzzer's comparison accepts differences that rounding explains, and no others."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ DENORMAL = 2.0**-130
 
 
 def is_within_rounding(fn, values, found, dtype=np.float32):
-    """Return whether a result for one lane is within rounding."""
+    """Return True if ``found`` is the result of a function for the values of one lane, within rounding."""
     arrays = [np.asarray([x], None if isinstance(x, int) else np.float32) for x in values]
     arrays = [x.astype(np.int32) if x.dtype.kind == "i" else x for x in arrays]
     return bool(are_within_rounding(fn, arrays, np.asarray([found], dtype), signed=False)[0])
@@ -37,7 +37,7 @@ def is_within_rounding(fn, values, found, dtype=np.float32):
         pytest.param(lax.div, [0.0, DENORMAL], 0.0, None, id="division by a denormal number"),
     ],
 )
-def test_differences_by_rounding_are_told_from_wrong_results(fn, values, found, wrong):
+def test_rounding_is_distinguished_from_wrong_results(fn, values, found, wrong):
     """Rounding must not explain ``wrong``, which is None where any number is possible."""
     assert is_within_rounding(fn, values, found)
     assert wrong is None or not is_within_rounding(fn, values, wrong)

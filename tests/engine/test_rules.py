@@ -74,7 +74,7 @@ def write_first_number(data, x):
     return data.replace(states=data.states.replace(pos=jnp.zeros(3).at[0].set(jnp.ravel(x)[0])))
 
 
-REFUSED = {
+REFUSED_STAGES = {
     "eigh": (
         lambda d: write_first_number(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]),
         "primitive 'eigh' has no rule",
@@ -96,6 +96,7 @@ REFUSED = {
         "65",
     ),
 }
+"""By operation that the engine refuses: the function of a stage that uses it, and words of the error."""
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +104,9 @@ def data():
     return Sim(n_worlds=2, n_drones=1, control="rotor_vel", engine="lanes").data
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED_STAGES)
 def test_a_refused_operation_is_named_with_its_stage(data, name):
-    fn, words = REFUSED[name]
+    fn, words = REFUSED_STAGES[name]
     (unfused,) = lower_stages(as_stages({"mine": stage("drone")(fn)}), data).unfused_stages
     assert words in str(unfused.error)
     assert f"stage 'mine', jax {jax.__version__}" in str(unfused.error)
@@ -114,7 +115,7 @@ def test_a_refused_operation_is_named_with_its_stage(data, name):
 
 def test_a_refused_stage_runs_without_fusion(data):
     """The stage splits the step."""
-    mine = {"mine": stage("drone")(REFUSED["eigh"][0])}
+    mine = {"mine": stage("drone")(REFUSED_STAGES["eigh"][0])}
     expected = mine["mine"](mine["mine"](data)).states.pos
     with pytest.warns(EngineWarning, match="stage 'mine' is not fused: primitive 'eigh' has no rule"):
         found = Step(mine)(data, jnp.int32(2)).states.pos
@@ -130,7 +131,7 @@ def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsup
         lower_function(jnp.tanh, jax.ShapeDtypeStruct((2,), np.float32))
 
 
-# Numbers that ordinary arithmetic leaves open -------------------------------------------------------------------------
+# Special numbers -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fn", [
@@ -148,12 +149,12 @@ def test_powers_and_angles_of_special_numbers():
     """Host kernels compute these functions themselves: test signs of zero, infinities, over- and underflow."""
     if native.compiler() is None:
         pytest.skip("no C++ compiler here")
-    sides = np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -2.0, 1e-30, 1e30])
-    y, x = (v.ravel() for v in np.meshgrid(sides, sides))
-    powers = [0.0, -0.0, np.inf, -np.inf, np.nan, 88.7, 88.8, -87.0, -95.0, -103.9, -110.0, 1e-8, 200.0, -1e30]
-    z = np.resize(np.float32(powers), y.shape)
-    one = jax.ShapeDtypeStruct((), np.float32)
-    block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], one, one, one)
+    operands = np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -2.0, 1e-30, 1e30])
+    y, x = (v.ravel() for v in np.meshgrid(operands, operands))
+    exponents = [0.0, -0.0, np.inf, -np.inf, np.nan, 88.7, 88.8, -87.0, -95.0, -103.9, -110.0, 1e-8, 200.0, -1e30]
+    z = np.resize(np.float32(exponents), y.shape)
+    scalar = jax.ShapeDtypeStruct((), np.float32)
+    block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], scalar, scalar, scalar)
     program, leaves = make_program(block, [y, x, z], len(y))
     found, _ = jax.jit(lambda leaves: build(program, Location("cpu"))(leaves, 1))(leaves)
     with np.errstate(all="ignore"):
@@ -163,5 +164,5 @@ def test_powers_and_angles_of_special_numbers():
         a = np.asarray(a)[:, 0]
         # XLA flushes subnormal numbers to zero.
         np.testing.assert_allclose(a, b, rtol=4 * ULP, atol=np.finfo(np.float32).tiny, err_msg=name)
-        known = ~np.isnan(b)
-        np.testing.assert_array_equal(np.signbit(a[known]), np.signbit(b[known]), err_msg=name)
+        is_number = ~np.isnan(b)
+        np.testing.assert_array_equal(np.signbit(a[is_number]), np.signbit(b[is_number]), err_msg=name)

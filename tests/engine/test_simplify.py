@@ -1,4 +1,7 @@
-"""A builder simplifies operations only by identities that hold for every number."""
+"""A builder simplifies operations only by identities that hold for every number.
+
+A known zero is a zero of a shared parameter: its products may be left out, even if the other number could be infinite.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ F = np.float32
 
 
 def build_operation(name, *args, dtype=F):
-    """Return the result of an operation on inputs, the input in place of ``...``, and the number of operations."""
+    """Return the result of an operation, the input that replaces ``...`` in ``args``, and the number of operations."""
     b = Builder()
     x = b.input(dtype)
     out = b.add(name, [x if a is ... else a for a in args], dtype)
@@ -140,5 +143,5 @@ def test_a_known_zero_less_a_number_is_its_negative():
     x = b.input(F)
     b.add("sub", (known_zero(F), x), F)
     assert [(op.name, op.args) for op in b.operations] == [("neg", (x,))]
-    b.add("sub", (F(0), x), F)  # of any other zero the sign counts
+    b.add("sub", (F(0), x), F)  # the sign of any other zero counts
     assert b.operations[-1].name == "sub"

@@ -37,20 +37,23 @@ DYNAMICS_AND_CONTROL = [("first_principles", c.value) for c in Control] + [
 
 
 def scatter_drones(sim, extreme=False, dtype=np.float32):
-    """Return the data with a different state and command for each drone, and different step counts of worlds."""
+    """Return the data with a random state and command of each drone, and a random step count of each world.
+
+    If ``extreme``, heights, velocities and most commands are 20 times as large.
+    """
     rng = np.random.default_rng(1)
     shape = (sim.n_worlds, sim.n_drones)
-    far = 20.0 if extreme else 1.0
+    scale = 20.0 if extreme else 1.0
     n_rotors = sim.data.states.rotor_vel.shape[-1]
     quat = rng.normal(size=(*shape, 4))
     rotors = 0.1 * rng.uniform(size=(*shape, n_rotors)) if "rotor" in sim.dynamics else None
     rotors = rng.uniform(0, 22000, (*shape, n_rotors)) if sim.dynamics == Dynamics.first_principles else rotors
     data = sim.data
     states = data.states.replace(
-        pos=dtype(rng.uniform(-1, 2, (*shape, 3)) * [1, 1, far]),
+        pos=dtype(rng.uniform(-1, 2, (*shape, 3)) * [1, 1, scale]),
         quat=dtype(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
-        vel=dtype(far * rng.normal(size=(*shape, 3))),
-        ang_vel=dtype(far * rng.normal(size=(*shape, 3))),
+        vel=dtype(scale * rng.normal(size=(*shape, 3))),
+        ang_vel=dtype(scale * rng.normal(size=(*shape, 3))),
         force=dtype(0.1 * rng.normal(size=(*shape, 3))),
         torque=dtype(1e-4 * rng.normal(size=(*shape, 3))),
         **({} if rotors is None else {"rotor_vel": dtype(rotors)}),
@@ -58,7 +61,7 @@ def scatter_drones(sim, extreme=False, dtype=np.float32):
     core = data.core.replace(steps=jnp.asarray(rng.integers(0, 10, (sim.n_worlds, 1)), jnp.int32))
     data = put_on_device(data.replace(states=states, core=core), sim.device)
     size = command_size(sim.control, n_rotors)
-    command = far * 0.2 * rng.normal(size=(*shape, size))
+    command = scale * 0.2 * rng.normal(size=(*shape, size))
     if sim.control == Control.rotor_vel:
         command = rng.uniform(-1000, 30000, (*shape, size))
     elif sim.control != Control.state:
@@ -151,9 +154,9 @@ def test_a_nan_in_one_drone_stays_in_that_drone():
     np.testing.assert_array_equal(np.asarray(after.core.nonfinite)[:, 0], [False, True, False])
     for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
         mine, theirs = np.asarray(getattr(after.states, name)), np.asarray(getattr(good.states, name))
-        keep = np.ones((3, 2), bool)
-        keep[1, 0] = False
-        np.testing.assert_array_equal(mine[keep], theirs[keep])
+        is_other = np.ones((3, 2), bool)
+        is_other[1, 0] = False
+        np.testing.assert_array_equal(mine[is_other], theirs[is_other])
 
 
 # Stages of the user -------------------------------------------------------------------------------------------------
@@ -165,13 +168,13 @@ class Gust(PyTree):
     force: jax.Array = leaf("drone", 1)
     """Force, world frame, N. (3,)"""
     strength: jax.Array = leaf("world", 0)
-    """Standard deviation of its change per step, N. ()"""
+    """Standard deviation of the change of the force per step, N. ()"""
     is_on: jax.Array = leaf("world", 0)
     """True where the force acts. ()"""
     was_strong: jax.Array = leaf("drone", 0)
-    """True where it was strong at any step. ()"""
+    """True where the x component of the force has ever exceeded 0.001 N. ()"""
     count: jax.Array = leaf("drone", 0)
-    """Number of steps at which it was strong. ()"""
+    """Number of steps at which that component exceeded 0.001 N. ()"""
 
 
 @stage("drone")
@@ -358,11 +361,11 @@ def test_vmap_over_commands_and_parameters_is_a_loop():
         return step(ready, jnp.int32(7)).states
 
     cases = [(jax.vmap(fly), masses), (jax.vmap(fly, (0, None)), np.asarray(data.params.mass))]
-    one = jax.jit(fly)
-    for batched, mass in cases:
-        many = jax.device_get(jax.jit(batched)(commands, mass))
+    compiled = jax.jit(fly)
+    for batched_fly, mass in cases:
+        many = jax.device_get(jax.jit(batched_fly)(commands, mass))
         for k in range(4):
-            single = one(commands[k], mass[k] if mass.ndim > 1 else mass)
+            single = compiled(commands[k], mass[k] if mass.ndim > 1 else mass)
             for name in ("pos", "vel"):
                 np.testing.assert_allclose(getattr(many, name)[k], getattr(single, name), rtol=1e-5, atol=1e-6)
 
@@ -410,7 +413,7 @@ def climb_policy(gain, data):
 
 
 def test_a_rollout_equals_its_loop_of_steps(capfd):
-    """Its records equal those of a loop, at the requested rate, and the simulation continues from its end."""
+    """The kept values equal those of a loop, at the requested interval, and the simulation goes on from the end."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude", attitude_freq=100)
     start, gain = sim.data, jnp.float32(0.3)
     records = sim.rollout(climb_policy, gain, 40, keep=lambda d: {"z": d.states.pos[..., 2]}, every=10)

@@ -1,4 +1,4 @@
-"""Data between calls of the compiled step is flattened while it advances, and a record when it is read."""
+"""``Stepper`` keeps data flattened between calls of the compiled step, and creates a record when the data is read."""
 
 import contextlib
 
@@ -72,13 +72,13 @@ def test_a_command_is_staged_in_flattened_data(settings):
     command = np.random.default_rng(0).uniform(0.1, 0.4, shape).astype(np.float32)
     send = getattr(F, f"{sim.control.value}_control")
     sim.step(2)
-    before, kept = sim.data, [np.array(x) for x in jax.tree.leaves(sim.data.controls)]
+    before, values_before = sim.data, [np.array(x) for x in jax.tree.leaves(sim.data.controls)]
     for _ in range(2):
         getattr(sim, f"{sim.control.value}_control")(command)
     assert trees_equal(sim.data, send(before, command))
     sim.step(3)
     assert trees_equal(sim.data, sim.step_fn(send(before, command), jnp.int32(3)))
-    for x, y in zip(jax.tree.leaves(before.controls), kept, strict=True):
+    for x, y in zip(jax.tree.leaves(before.controls), values_before, strict=True):
         np.testing.assert_array_equal(x, y)
 
 
@@ -116,8 +116,8 @@ def test_a_new_step_takes_over_the_data(stepper, sim):
 
 
 def test_assigned_data_is_moved_to_the_device_and_marked_as_unsynced(stepper):
-    far = jax.devices("cpu")[1]
-    states = stepper.data.states.replace(pos=jax.device_put(np.ones((3, 2, 3), np.float32), far))
+    other_device = jax.devices("cpu")[1]
+    states = stepper.data.states.replace(pos=jax.device_put(np.ones((3, 2, 3), np.float32), other_device))
     stepper.assign(stepper.data.replace(states=states, core=stepper.data.core.replace(mjx_synced=np.True_)))
     assert stepper.data.states.pos.devices() == {stepper.device}
     assert not stepper.data.core.mjx_synced

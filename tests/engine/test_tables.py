@@ -31,17 +31,17 @@ class Tables(PyTree):
     """Shared arrays, and indices of every drone, some of which are out of range."""
 
     numbers: jax.Array = leaf("shared", 3)
-    """(9, 5, 4)"""
+    """Table of numbers. (9, 5, 4)"""
     ends: jax.Array = leaf("shared", 1)
-    """(100,)"""
+    """Table of numbers. (100,)"""
     integers: jax.Array = leaf("shared", 1)
-    """(20,)"""
+    """Table of integers. (20,)"""
     flags: jax.Array = leaf("shared", 1)
-    """(12,)"""
+    """Table of bools. (12,)"""
     places: jax.Array = leaf("drone", 1)
-    """(n_worlds, n_drones, 3)"""
+    """Indices into the tables. (n_worlds, n_drones, 3)"""
     out: jax.Array = leaf("drone", 1)
-    """(n_worlds, n_drones, 8)"""
+    """Elements that a case reads, filled with zeros. (n_worlds, n_drones, 8)"""
 
 
 def bisection(x, value):
@@ -88,6 +88,7 @@ CASES = {
     "a search in constants": lambda t, i, j, k: jnp.searchsorted(jnp.asarray(DESCENDING_NUMBERS)[::-1] * 0.5, i * 0.3),
     "a search in a table": lambda t, i, j, k: t.ends[jnp.searchsorted(t.ends[::-1], i * 0.3, side="right")],
 }
+"""Functions of the tables and of three indices of a drone."""
 
 
 KERNEL_CASES = [name for name in CASES if name != "small places"]
@@ -111,6 +112,8 @@ def make_data():
 
 
 def case_stage(name, scope="drone"):
+    """Return a stage that reads the elements of a case in every other step."""
+
     def read_case(tables, places):
         found = jnp.ravel(CASES[name](tables, *places))[:8]
         return jnp.pad(found.astype(jnp.float32), (0, 8 - len(found)))
@@ -118,8 +121,8 @@ def case_stage(name, scope="drone"):
     @stage(scope, when=lambda data: data.core.steps % 2 == 0)
     def read(data):
         tables = data.plugins["tables"]
-        one = functools.partial(read_case, tables)
-        out = one(tables.places) if scope == "drone" else jnp.stack([one(p) for p in tables.places])
+        read_drone = functools.partial(read_case, tables)
+        out = read_drone(tables.places) if scope == "drone" else jnp.stack([read_drone(p) for p in tables.places])
         return data.replace(plugins={"tables": tables.replace(out=out)})
 
     return read
@@ -172,6 +175,7 @@ def test_a_kernel_reads_the_same_elements_as_the_stage(scope, names):
 
 
 def pack_leaves(program, leaves):
+    """Return the leaf that packs the shared numbers of a program."""
     return np.concatenate([np.ravel(leaves[i]) for i in program.packed]) if program.packed else np.zeros(0)
 
 

@@ -38,7 +38,7 @@ DOMAINS = {"acos": (-1, 1), "asin": (-1, 1), "atanh": (-0.99, 0.99), "erf_inv": 
 
 
 def numbers(dtype, name, seed):
-    """Return special numbers first, then random ones. (N_LANES,)"""
+    """Return random and special numbers of a type, from the domain of an operation if it has one. (N_LANES,)"""
     rng = np.random.default_rng(seed)
     if name in DOMAINS:
         return rng.uniform(*DOMAINS[name], N_LANES).astype(dtype)
@@ -49,7 +49,7 @@ def numbers(dtype, name, seed):
 
 
 def cases():
-    """Return the operations with the types of T that kernels have: name, types of operands, type of the result."""
+    """Return all operations on the types that kernels have: name, types of the operands, type of the result."""
     out = []
     for row in ops.TABLE.values():
         if row.structured:
@@ -104,11 +104,13 @@ def assert_agree(found, expected, engine):
             same = x == y
         else:
             with np.errstate(all="ignore"):
-                least = max(ABSOLUTE_TOLERANCE.get(name, 0), 1.2e-38)  # XLA flushes subnormal numbers to zero
-                close = np.abs(x.astype(np.float64) - y) <= TOLERANCE.get(name, 4) * 2.0**-23 * np.abs(y) + least
+                smallest_error = max(ABSOLUTE_TOLERANCE.get(name, 0), 1.2e-38)  # XLA flushes subnormal numbers to zero
+                close = (
+                    np.abs(x.astype(np.float64) - y) <= TOLERANCE.get(name, 4) * 2.0**-23 * np.abs(y) + smallest_error
+                )
             # The sign of a zero that max and min return is not defined.
-            zeros = np.signbit(x) == np.signbit(y) if name not in ("max", "min", "clamp") else np.ones_like(x, bool)
-            same = (np.isnan(x) & np.isnan(y)) | ((x == y) & ((y != 0) | zeros)) | (close & (y != 0))
+            same_sign = np.signbit(x) == np.signbit(y) if name not in ("max", "min", "clamp") else np.ones_like(x, bool)
+            same = (np.isnan(x) & np.isnan(y)) | ((x == y) & ((y != 0) | same_sign)) | (close & (y != 0))
         if not same.all():
             k = int(np.argmin(same))
             wrong.append((*case, k, x[k], y[k]))

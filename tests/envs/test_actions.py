@@ -19,7 +19,7 @@ CASES = [
     if dynamics in supported_dynamics(drone)
 ]
 LEVEL_QUAT = jnp.array([0.0, 0.0, 0.0, 1.0])
-STILL = jnp.zeros(3)
+ZEROS = jnp.zeros(3)
 
 
 def params_of(airframe, dynamics):
@@ -30,7 +30,7 @@ def params_of(airframe, dynamics):
 
 @pytest.mark.parametrize(("drone", "dynamics", "control"), CASES)
 def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
-    """A state command is 1 m above the origin; with any other, the derivatives of a level drone at rest are zero."""
+    """A state command is 1 m above the origin; at other levels, the derivatives of a level drone at rest are zero."""
     params = params_of(load_airframe(drone), dynamics)
     actions = actions_of(load_airframe(drone), params, Control(control))
     command = actions.command(jnp.zeros(actions.size))
@@ -48,7 +48,7 @@ def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
     else:
         rotor_vel, command_of_motors = command[3:], command
     model = first_principles.dynamics if dynamics == "first_principles" else fitted.dynamics
-    derivatives = model(STILL, LEVEL_QUAT, STILL, STILL, command_of_motors, rotor_vel, params=params)
+    derivatives = model(ZEROS, LEVEL_QUAT, ZEROS, ZEROS, command_of_motors, rotor_vel, params=params)
     vel, acc, ang_acc, rotor_acc = map(np.asarray, derivatives)
     np.testing.assert_array_equal(vel, np.zeros(3))
     np.testing.assert_allclose(acc, np.zeros(3), atol=2e-5)
@@ -71,14 +71,14 @@ def test_the_map_is_affine_from_minus_one_to_one_and_clipped_beyond(control):
     np.testing.assert_array_equal(command_at(1.7), command_at(1.0))
     np.testing.assert_array_equal(command_at(-9.0), command_at(-1.0))
     max_thrust = 4 * airframe.value("rotors.thrust_max", ())
-    ends = {
+    upper_limits = {
         "state": np.array([0, 0, 1]) + MAX_OFFSET,
         "attitude": [MAX_TILT, MAX_TILT, MAX_YAW, max_thrust],
         "body_rate": [*MAX_BODY_RATES, max_thrust],
         "force_torque": [max_thrust, *command_at(1.0)[1:]],
         "rotor_vel": np.broadcast_to(first_principles.Params.create(airframe).rotor_vel_max, 4),
     }[control]
-    np.testing.assert_allclose(command_at(1.0), ends, rtol=1e-6)
+    np.testing.assert_allclose(command_at(1.0), upper_limits, rtol=1e-6)
 
 
 def test_torques_at_one_are_a_quarter_of_the_largest_ones():

@@ -20,15 +20,15 @@ def mesh():
 
 
 def sequence(n, shape):
-    """Yield a random sequence of resets with a seed, restarts of some worlds, and steps with random actions."""
+    """Yield random calls with their arguments: ``reset`` and a seed, ``restart`` and a mask, ``step`` and actions."""
     rng = np.random.default_rng(3)
     yield "reset", 7
     for kind in ["restart", *rng.choice(["step", "restart"], n, p=[0.8, 0.2]), "step"]:
         yield kind, rng.uniform(-1, 1, shape).astype(np.float32) if kind == "step" else rng.random(N_WORLDS) < 0.4
 
 
-def assert_equal(one, several, n_devices=4):
-    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(several), jax.tree.leaves(one), strict=True):
+def assert_equal(unsharded, sharded, n_devices=4):
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(sharded), jax.tree.leaves(unsharded), strict=True):
         name = jax.tree_util.keystr(path)
         assert len(x.sharding.device_set) == n_devices, name
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -67,11 +67,11 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mes
         assert jax.eval_shape(env.flatten, state).plan.rows  # a rollout updates them in place
 
     n_ended = 0
-    for one, several in zip(fly_on_mesh(None), fly_on_mesh(mesh), strict=True):
-        assert_equal(one, several)
-        assert several.obs["vel"].sharding.is_equivalent_to(several.reward.sharding, several.reward.ndim)
-        assert several.reward.addressable_shards[0].data.shape[0] == N_WORLDS // 4
-        n_ended += int(one.done.sum())
+    for unsharded, sharded in zip(fly_on_mesh(None), fly_on_mesh(mesh), strict=True):
+        assert_equal(unsharded, sharded)
+        assert sharded.obs["vel"].sharding.is_equivalent_to(sharded.reward.sharding, sharded.reward.ndim)
+        assert sharded.reward.addressable_shards[0].data.shape[0] == N_WORLDS // 4
+        n_ended += int(unsharded.done.sum())
     assert n_ended >= N_WORLDS
 
 
@@ -108,10 +108,10 @@ def test_depth_images_on_four_devices_are_those_of_one(mesh):
         program = measure_depth.lower(sim.data).compile()
         return program(sim.data), exchanged_bytes(program.as_text()), sim
 
-    one, exchanged_of_one, _ = images(None)
-    several, exchanged_of_four, sim = images(mesh)
+    unsharded, exchanged_of_one, _ = images(None)
+    sharded, exchanged_of_four, sim = images(mesh)
     assert (exchanged_of_one, exchanged_of_four) == ({}, {})
-    assert_equal(one, several)
-    assert several.distance.addressable_shards[0].data.shape == (2, 1, 8, 12)
+    assert_equal(unsharded, sharded)
+    assert sharded.distance.addressable_shards[0].data.shape == (2, 1, 8, 12)
     assert "one kernel with a lane for each ray" in sim.explain()
-    np.testing.assert_array_equal(sim.depth("fpv_cam", 12, 8), one.distance)
+    np.testing.assert_array_equal(sim.depth("fpv_cam", 12, 8), unsharded.distance)

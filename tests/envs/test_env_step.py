@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError, EngineWarning
 from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
 
 pytestmark = pytest.mark.skipif(fused.unavailable_reason("cpu") is not None, reason="there is no C++ compiler")
-N = 6
+N_WORLDS = 6
 
 
 def assert_close(actual, expected, tolerance=2e-5):
@@ -56,24 +56,24 @@ class HalfRewards(Wrapper):
 
 
 def noisy_hover(engine):
-    env = envs.make("hover", N, seconds=0.3, engine=engine)
+    env = envs.make("hover", N_WORLDS, seconds=0.3, engine=engine)
     return AutoReset(HalfRewards(envs.EpisodeStatistics(envs.ObservationNoise(env, {"pos": 0.1}))), "SameStep")
 
 
 def lopsided_hover(engine):
     env = envs.RandomizeWith(
-        envs.make("hover", N, seconds=0.3, engine=engine), draw_products_of_inertia, ("J", "J_inv")
+        envs.make("hover", N_WORLDS, seconds=0.3, engine=engine), draw_products_of_inertia, ("J", "J_inv")
     )
     return AutoReset(envs.FrameStack(envs.ActionDelay(env, 1), 2), "NextStep")
 
 
 def swarm(engine):
-    return AutoReset(envs.make("swarm", N, n_drones=3, seconds=0.3, engine=engine), "Disabled")
+    return AutoReset(envs.make("swarm", N_WORLDS, n_drones=3, seconds=0.3, engine=engine), "Disabled")
 
 
 def normalised_hover(engine):
     """Return an environment whose step is split by a wrapper of all worlds."""
-    return AutoReset(envs.Normalize(envs.make("hover", N, seconds=0.3, engine=engine)), "SameStep")
+    return AutoReset(envs.Normalize(envs.make("hover", N_WORLDS, seconds=0.3, engine=engine)), "SameStep")
 
 
 @pytest.mark.long("compiles each case for two engines")
@@ -99,24 +99,24 @@ def test_an_engine_steps_an_environment_like_the_reference(make, engine):
 
 @pytest.fixture(scope="module")
 def hover():
-    return envs.make("hover", N, seconds=0.3)
+    return envs.make("hover", N_WORLDS, seconds=0.3)
 
 
 @pytest.mark.long("compiles a rollout and a loop, and derivatives of both")
 def test_a_rollout_is_a_loop_of_steps(hover):
     """Observations of the policy, recorded values and the last state are equal, and so are derivatives and ``vmap``."""
-    env = AutoReset(envs.make("hover", N, seconds=0.3, control="rotor_vel"))
+    env = AutoReset(envs.make("hover", N_WORLDS, seconds=0.3, control="rotor_vel"))
     start = jax.jit(env.reset)(jax.random.key(0))
     key = jax.random.key(1)
 
     def act(gain, obs, memory, key):
-        noise = jax.random.uniform(key, (N, 1, 4), minval=-0.3, maxval=0.3)
+        noise = jax.random.uniform(key, (N_WORLDS, 1, 4), minval=-0.3, maxval=0.3)
         return noise - gain * (0.1 * obs["vel"][..., :1] + memory[:, None, None]), memory + 0.01, memory
 
     def fly(gain):
         policy = lambda obs, memory, key: act(gain, obs, memory, key)  # noqa: E731
         keep = lambda t: (t.reward, t.done, t.state.info["error"], t.final_obs["pos"], t.extras, t.action)  # noqa: E731
-        return envs.rollout(env, start, policy, key, 20, keep, jnp.zeros(N))
+        return envs.rollout(env, start, policy, key, 20, keep, jnp.zeros(N_WORLDS))
 
     def loop(gain):
         def step(carry, key):
@@ -127,7 +127,7 @@ def test_a_rollout_is_a_loop_of_steps(hover):
             kept = state.reward, state.done, state.info["error"], state.info["final_obs"]["pos"], extras, action
             return (state, memory), kept
 
-        (state, memory), kept = jax.lax.scan(step, (start, jnp.zeros(N)), jax.random.split(key, 20))
+        (state, memory), kept = jax.lax.scan(step, (start, jnp.zeros(N_WORLDS)), jax.random.split(key, 20))
         return state, memory, kept
 
     actual, expected = jax.jit(fly)(1.0), jax.jit(loop)(1.0)
@@ -203,7 +203,7 @@ class WithInfo(Wrapper):
 
 def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
     """An axis whose length is the number of drones is not an axis of drones, unless it is declared."""
-    env = envs.make("hover", N, n_drones=2, control="rotor_vel", engine="interpret")
+    env = envs.make("hover", N_WORLDS, n_drones=2, control="rotor_vel", engine="interpret")
     auto = AutoReset(WithInfo(WithMemory(env)), "Disabled")
     state = auto.reset(jax.random.key(0))
     after = auto.step(state, state.action)
@@ -211,8 +211,12 @@ def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
     scopes = {x.name: x.scope for x in auto.step_fn.plan(state.full_data, ()).program.leaves if ".memory" in x.name}
     assert sorted(scopes.values()) == ["drone", "world", "world"]
     plain, record = after.memory["WithMemory"]
-    assert (plain.shape, record.of_drones.shape, record.of_world.shape) == ((N, 2), (N, 2), (N, 1, 2))
-    assert (after.info["n"].shape, after.info["each"].shape) == ((N,), (N, 2, 3))
+    assert (plain.shape, record.of_drones.shape, record.of_world.shape) == (
+        (N_WORLDS, 2),
+        (N_WORLDS, 2),
+        (N_WORLDS, 1, 2),
+    )
+    assert (after.info["n"].shape, after.info["each"].shape) == ((N_WORLDS,), (N_WORLDS, 2, 3))
     for wrong, message in (
         (WorldObservations(env), r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"),
         (
@@ -248,13 +252,13 @@ class Ranked(Hover):
 
 
 def with_reset_stage(env):
-    sim = envs.make("hover", N).sim
+    sim = envs.make("hover", N_WORLDS).sim
     sim.reset_pipeline["own"] = lambda data, default, mask: data
     return AutoReset(envs.DroneEnv(sim, env.task))
 
 
 def with_other_defaults(env):
-    sim = envs.make("hover", N).sim
+    sim = envs.make("hover", N_WORLDS).sim
     pos = sim.data.states.pos.at[0, 0, 0].set(1.0)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     sim.build_default_data()
@@ -269,7 +273,7 @@ class WorldNumbers(PyTree):
 
 def with_world_numbers(env):
     """Return an environment with a record that holds the array of ``core.world_id``."""
-    sim = envs.make("hover", N).sim
+    sim = envs.make("hover", N_WORLDS).sim
     sim.data = sim.data.replace(plugins=sim.data.plugins | {"numbers": WorldNumbers(sim.data.core.world_id)})
     sim.build_default_data()
     return AutoReset(envs.DroneEnv(sim, env.task))
@@ -284,8 +288,8 @@ class Counts:
 
 
 def with_foreign_record(env):
-    sim = envs.make("hover", N).sim
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {"counts": Counts(jnp.zeros(N))})
+    sim = envs.make("hover", N_WORLDS).sim
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"counts": Counts(jnp.zeros(N_WORLDS))})
     sim.build_default_data()
     return AutoReset(envs.DroneEnv(sim, env.task))
 
@@ -299,14 +303,15 @@ SPLIT_STEPS = {
     "episodes begin from different data in different worlds": with_other_defaults,
     "different data in different worlds": with_world_numbers,
 }
+"""Functions that make an environment from ``hover``, by the reason why its step is split."""
 
 
-@pytest.mark.parametrize("why", SPLIT_STEPS)
-def test_a_step_that_is_split_says_where_and_why(hover, why):
-    env = SPLIT_STEPS[why](hover)
+@pytest.mark.parametrize("reason", SPLIT_STEPS)
+def test_a_step_that_is_split_says_where_and_why(hover, reason):
+    env = SPLIT_STEPS[reason](hover)
     text = env.explain()
     assert text.startswith("engine: fused\n")
-    assert why in next(line for line in text.split("\n") if line.startswith("splits the step: "))
+    assert reason in next(line for line in text.split("\n") if line.startswith("splits the step: "))
 
 
 def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
@@ -315,7 +320,7 @@ def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
         text = env.explain()
     assert "splits the step: 'observe' is not fused" in text
     assert env.explain() == text  # without another warning, which would be an error here
-    strict = AutoReset(envs.DroneEnv(envs.make("hover", N, strict=True).sim, Fourier()))
+    strict = AutoReset(envs.DroneEnv(envs.make("hover", N_WORLDS, strict=True).sim, Fourier()))
     with pytest.raises(ConfigError, match="complex64"):
         strict.explain()
 
@@ -361,14 +366,14 @@ def test_episodes_begin_as_the_simulation_resets(hover, make):
         np.testing.assert_array_equal(state.data.controls.rotor_vel, 7.0)
     else:
         fresh = np.asarray(jax.jit(env.base.episode_reset.make_default)(state.data).states.pos)
-        np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
+        np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N_WORLDS - 1)])
 
 
 def test_records_of_other_libraries_are_reset_with_their_world(hover):
     env = with_foreign_record(hover)
     state = jax.jit(env.reset)(jax.random.key(0))
-    data = state.data.replace(plugins=state.data.plugins | {"counts": Counts(jnp.ones(N))})
-    mask = np.arange(N) == 1
+    data = state.data.replace(plugins=state.data.plugins | {"counts": Counts(jnp.ones(N_WORLDS))})
+    mask = np.arange(N_WORLDS) == 1
     after = jax.jit(env.restart)(state.replace(data=data), mask)
     np.testing.assert_array_equal(after.data.plugins["counts"].count, ~mask)
 
@@ -437,12 +442,12 @@ def test_a_rollout_in_rows_takes_commands_of_every_level():
     for control in ("rotor_vel", "state"):
         sim = Sim(2, control=control)
         command = jnp.zeros((2, 1, 4)) + 15e3 if control == "rotor_vel" else jnp.zeros((2, 1, 16)).at[..., 2].set(1.0)
-        step, ends = sim.step_fn, []
+        step, final_states = sim.step_fn, []
         for platform in ("cpu", "gpu"):
             step.platform = platform  # which only decides whether rows are used
             fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
-            ends.append(jax.jit(fly)(sim.data))
-        assert_close(*ends)
+            final_states.append(jax.jit(fly)(sim.data))
+        assert_close(*final_states)
 
 
 @pytest.mark.long("compiles a step for one device and for two")
@@ -460,8 +465,8 @@ def test_law_10_worlds_over_devices_step_by_the_same_kernel_to_the_same_numbers(
         assert env.explain().startswith("engine: fused")
         return start_state, state, kept
 
-    one, several = fly_on(), fly_on(mesh=world_mesh(jax.devices()[:2]))
-    assert all(len(x.devices()) == 2 for x in (several[0].obs["pos"], several[1].obs["pos"]))
-    for x, y in zip(*map(jax.tree.leaves, (one, several)), strict=True):
+    unsharded, sharded = fly_on(), fly_on(mesh=world_mesh(jax.devices()[:2]))
+    assert all(len(x.devices()) == 2 for x in (sharded[0].obs["pos"], sharded[1].obs["pos"]))
+    for x, y in zip(*map(jax.tree.leaves, (unsharded, sharded)), strict=True):
         if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(x, y)

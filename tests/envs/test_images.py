@@ -124,7 +124,7 @@ def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode(
         # The images of steps 0, 2, 4 ... of an episode arrive 1.5 steps later, the first one at once.
         taken_steps = np.maximum((2 * steps - 3) // 4 * 2, 0)
         expected = np.stack(
-            [images[k - now + then][world] for world, (now, then) in enumerate(zip(steps, taken_steps, strict=True))]
+            [images[k - now + taken][world] for world, (now, taken) in enumerate(zip(steps, taken_steps, strict=True))]
         )
         np.testing.assert_allclose(state.obs["camera.depth"], expected, rtol=1e-6)
     assert steps.tolist() != [12] * 3

@@ -171,6 +171,7 @@ WRONG_METHODS = {
                       r"terminated of type bool and shape \(\), got shape \(2,\) .*jnp.any"),
     "ends as a number": ("terminated", lambda s, d: jnp.float32(0), "terminated of type bool .*float32"),
 }  # fmt: skip
+"""Name of a method of a task, a wrong one in its place, and words of the error."""
 
 
 @pytest.mark.parametrize("case", WRONG_METHODS)

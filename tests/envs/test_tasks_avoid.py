@@ -70,10 +70,10 @@ def test_observations_are_the_nearest_points_of_the_nearest_obstacles(start_stat
     obs = jax.jit(vmap_worlds(env.task.observe))(inside)
     to_surface, to_middle = (np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle"))
     # A report measures from the ball around the drone, whose middle is 2 cm above the start of the vectors.
-    far = np.linalg.norm(to_surface, axis=-1) - 0.086
+    expected_gaps = np.linalg.norm(to_surface, axis=-1) - 0.086
     outside = gaps > 0.05
     assert outside.mean() > 0.5
-    assert np.abs(far - gaps)[outside].max() < 0.021
+    assert np.abs(expected_gaps - gaps)[outside].max() < 0.021
     is_box = np.any(to_middle != 0, axis=-1)
     assert 0.2 < is_box.mean() < 0.5, "a third of the obstacles"
     middle = np.asarray(inside.states.pos)[:, :, None] + to_surface + to_middle

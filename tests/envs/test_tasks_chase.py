@@ -8,15 +8,15 @@ from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import make
 
-CONTACT = 0.066
+CONTACT_HEIGHT = 0.066
 """Height of the centre of mass over a level roof that the drone touches, m: radius 0.086 less 0.02."""
 CASES = {
     # Position relative to the roof's middle, m, and velocity relative to it, m/s.
-    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3)),
-    "to the side": ((0.0, 0.07, CONTACT + 0.003), (0, 0, -0.3)),
-    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7)),
-    "sliding": ((0.0, 0.0, CONTACT + 0.003), (0.6, 0, -0.3)),
-    "hood": ((0.2, 0.0, CONTACT - 0.057), (0, 0, -0.3)),
+    "soft": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3)),
+    "to the side": ((0.0, 0.07, CONTACT_HEIGHT + 0.003), (0, 0, -0.3)),
+    "fast": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.7)),
+    "sliding": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0.6, 0, -0.3)),
+    "hood": ((0.2, 0.0, CONTACT_HEIGHT - 0.057), (0, 0, -0.3)),
     "floor": ((-0.7, 0.0, -0.085), (0, 0, -0.1)),
     "far": ((0.0, 3.05, 0.5), (0, 0, 0)),
     "high": ((0.0, 0.0, 2.45), (0, 0, 0)),
@@ -53,21 +53,22 @@ def recorded_flight(start_state, step, roof_motion):
     """Return the state after a step from all cases, over cars at their full speed."""
     data = start_state.data
     car = data.plugins["cars"]
-    ahead = {name: np.zeros_like(getattr(car, name)) for name in ("yaw", "yaw_rate", "steer", "command", "body_vel")}
+    straight = {name: np.zeros_like(getattr(car, name)) for name in ("yaw", "yaw_rate", "steer", "command", "body_vel")}
     for name in ("command", "body_vel"):
-        ahead[name][..., 0] = 0.8
-    car = car.replace(**ahead)
+        straight[name][..., 0] = 0.8
+    car = car.replace(**straight)
     data = data.replace(plugins=data.plugins | {"cars": car})
     offset, vel = (np.array(x, np.float32)[:, None] for x in zip(*CASES.values(), strict=True))
-    roof, along = map(np.asarray, roof_motion(data))
-    np.testing.assert_allclose(along, np.broadcast_to([0.8, 0, 0], along.shape), atol=1e-6)
+    roof, roof_vel = map(np.asarray, roof_motion(data))
+    np.testing.assert_allclose(roof_vel, np.broadcast_to([0.8, 0, 0], roof_vel.shape), atol=1e-6)
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), data.states.quat.shape)
-    states = data.states.replace(pos=roof + offset, vel=along + vel, quat=level, ang_vel=np.zeros_like(roof))
+    states = data.states.replace(pos=roof + offset, vel=roof_vel + vel, quat=level, ang_vel=np.zeros_like(roof))
     state = start_state.replace(data=data.replace(states=states))
     return step(state, state.action)
 
 
 def names(mask):
+    """Return the names of the cases in whose worlds a mask of drones is True."""
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 

@@ -1,4 +1,4 @@
-"""Following a car: the motion of the car, images of it, rewards, and ends of episodes."""
+"""Following a car: its motion, images of it, rewards for being at a point behind and above it, and ends of episodes."""
 
 import jax
 import jax.numpy as jnp
@@ -82,9 +82,9 @@ def test_images_show_the_car(env, start_state):
     distance = np.linalg.norm(
         np.asarray(start_state.data.plugins["cars"].pos - start_state.data.states.pos)[:, 0], axis=-1
     )
-    for image, depths, far in zip(mask, depth, distance, strict=True):
-        assert not image.any() or depths[image > 0].min() < far + 0.3
-        assert not image.any() or depths[image > 0].max() < far + 0.3
+    for image, depths, car_distance in zip(mask, depth, distance, strict=True):
+        assert not image.any() or depths[image > 0].min() < car_distance + 0.3
+        assert not image.any() or depths[image > 0].max() < car_distance + 0.3
 
 
 def test_an_episode_ends_where_the_drone_is_too_low_or_too_far_away(env, start_state, step, target_motion):

@@ -18,13 +18,13 @@ from crazysim.envs.tasks.forest import (
     Forest,
 )
 
-N_WORLDS, SEEN = 64, 6
+N_WORLDS, N_OBSERVED_TREES = 64, 6
 
 
 @pytest.fixture(scope="module")
 def start_state():
     """Return an environment without images, its state at the start of episodes, and its step."""
-    env = make("forest", N_WORLDS, camera=(), trees_seen=SEEN, engine="interpret")
+    env = make("forest", N_WORLDS, camera=(), trees_seen=N_OBSERVED_TREES, engine="interpret")
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
@@ -80,7 +80,7 @@ def test_nearest_trees_are_those_of_the_forest(start_state):
     offset = xy - np.asarray(data.states.pos)[..., :2]
     gap = np.linalg.norm(offset, axis=-1) - radius
     obs = {k: np.asarray(x)[:, 0] for k, x in jax.jit(vmap_worlds(env.task.observe))(data).items()}
-    near = obs["trees_near"].reshape(N_WORLDS, SEEN, 3)
+    near = obs["trees_near"].reshape(N_WORLDS, N_OBSERVED_TREES, 3)
     outside = gap.min(axis=-1) > 0.05
     assert outside.mean() > 0.8
     nearest = np.argmin(gap, axis=-1)

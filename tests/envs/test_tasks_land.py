@@ -13,16 +13,16 @@ from crazysim.envs.tasks.land import Land
 from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, SPEED = 2048, 0.5
-CONTACT = 0.066
+CONTACT_HEIGHT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
 CASES = {
     # Position relative to the pad's middle, m, velocity relative to the pad, m/s, tilt, rad.
-    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
-    "edge": ((0.24, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
-    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7), 0.0),
-    "sliding": ((0.0, 0.0, CONTACT + 0.003), (0.6, 0, -0.3), 0.0),
-    "tilted": ((0.0, 0.0, CONTACT - 0.001), (0, 0, -0.3), 0.45),
-    "rim": ((0.27, 0.0, CONTACT - 0.02), (0, 0, -0.3), 0.0),
+    "soft": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3), 0.0),
+    "edge": ((0.24, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3), 0.0),
+    "fast": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.7), 0.0),
+    "sliding": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0.6, 0, -0.3), 0.0),
+    "tilted": ((0.0, 0.0, CONTACT_HEIGHT - 0.001), (0, 0, -0.3), 0.45),
+    "rim": ((0.27, 0.0, CONTACT_HEIGHT - 0.02), (0, 0, -0.3), 0.0),
     "below": ((0.0, 0.0, -0.1), (0, 0, 0.0), 0.0),
     "floor": ((0.6, 0.0, -0.135), (0, 0, -0.1), 0.0),
     "far": ((0.0, 1.5, 0.5), (0, 0, 0.0), 0.0),

@@ -9,14 +9,14 @@ from crazysim import ConfigError, Sim, rotation
 from crazysim.envs import PrivilegedObservation, make
 from crazysim.envs.tasks.target_camera import TargetCamera
 
-CONTACT = 0.066
+CONTACT_HEIGHT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
 CASES = {
     # Position relative to the marker's middle, m, velocity, m/s, yaw, rad.
-    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
-    "edge": ((0.24, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
-    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7), 0.0),
-    "floor": ((0.6, 0.0, CONTACT - 0.02), (0, 0, -0.3), 0.0),
+    "soft": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3), 0.0),
+    "edge": ((0.24, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3), 0.0),
+    "fast": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.7), 0.0),
+    "floor": ((0.6, 0.0, CONTACT_HEIGHT - 0.02), (0, 0, -0.3), 0.0),
     "above": ((0.0, 0.0, 1.0), (0, 0, 0), 0.0),
     "ahead of it": ((0.8, 0.0, 1.0), (0, 0, 0), 0.0),
     "right of it": ((0.0, -0.8, 1.0), (0, 0, 0), 0.0),
@@ -25,6 +25,7 @@ CASES = {
 }
 """Cases, each in its own world."""
 LANDED, CRASHED = {"soft", "edge"}, {"fast", "floor"}
+"""Cases that end by a landing and by a crash."""
 SIDE, FOCAL = 16, 8 / np.tan(np.radians(60))
 """Side of the image and focal length, pixels."""
 
@@ -52,6 +53,7 @@ def state_after(env, state_before):
 
 
 def names(mask):
+    """Return the names of the cases in whose worlds a mask of drones is True."""
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 

@@ -1,4 +1,4 @@
-"""The race: its rules, its levels, observations of the course, and its courses."""
+"""The race: its rules, its levels of difficulty, observations of the course, and its courses."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from crazysim.train.evaluation import evaluate
 
 TRACK = Track()
 CASES = {
-    # Gate, position in its frame, m, speed along its axis, m/s, and gates passed before.
+    # Gate, position in its frame, m, speed along its axis, m/s, and gates passed before. The frame is the world's if
+    # the gate is None.
     "forwards": (0, (-0.01, 0.1, -0.1), 2.0, 0),
     "backwards": (0, (0.01, 0.0, 0.0), -2.0, 0),
     "beside": (0, (-0.01, 0.45, 0.0), 2.0, 0),
@@ -59,13 +60,13 @@ def cases():
     env = make_env(len(CASES))
     pos, vel = np.zeros((len(CASES), 1, 3)), np.zeros((len(CASES), 1, 3))
     passed = np.zeros((len(CASES), 1), np.int32)
-    turns = Rotation.from_euler("xyz", TRACK.gates_rpy)
+    gate_rotations = Rotation.from_euler("xyz", TRACK.gates_rpy)
     for world, (gate, offset, speed, before) in enumerate(CASES.values()):
         passed[world] = before
         pos[world] = offset
         if gate is not None:
-            pos[world] = np.asarray(TRACK.gates_pos[gate]) + turns[gate].apply(offset)
-            vel[world] = speed * turns[gate].apply([1.0, 0.0, 0.0])
+            pos[world] = np.asarray(TRACK.gates_pos[gate]) + gate_rotations[gate].apply(offset)
+            vel[world] = speed * gate_rotations[gate].apply([1.0, 0.0, 0.0])
     before = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=jnp.asarray(passed))
     step = jax.jit(env.step)
     return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
@@ -136,10 +137,10 @@ def test_observations_in_the_drones_frame_are_those_of_the_course(cases):
         middle = pos + Rotation.from_quat(quat).apply(corner.mean(axis=0))
         np.testing.assert_allclose(middle, TRACK.gates_pos[gate], atol=1e-5)
         np.testing.assert_allclose(np.linalg.norm(corner - corner.mean(axis=0), axis=-1), 0.225 * np.sqrt(2), atol=1e-5)
-    near = np.asarray(before.data.states.pos)[world["obstacle"], 0]
+    drone_pos = np.asarray(before.data.states.pos)[world["obstacle"], 0]
     poles = np.asarray(after.obs["obstacles_near"])[world["obstacle"], 0].reshape(2, 3)
     np.testing.assert_allclose(poles[0], [-0.05, 0, 0], atol=2e-3)
-    assert np.linalg.norm(poles[1]) > 0.5, near
+    assert np.linalg.norm(poles[1]) > 0.5, drone_pos
 
 
 def test_drones_out_of_the_race_do_not_matter_to_others():
@@ -172,7 +173,7 @@ def data_of_levels():
 
 
 def test_levels_draw_starts_parameters_poses_and_courses(data_of_levels):
-    varies = {}
+    varies = {}  # by level: starts, masses, poses of objects, and nominal poses
     for level, (_, data) in data_of_levels.items():
         shared = data.params.mass.ndim == 1
         pos, objects, nominal = data.states.pos, data.objects.pos, data.plugins["task"].nominal_pos
@@ -265,9 +266,9 @@ def test_the_same_key_gives_the_same_course_in_any_world(data_of_levels):
     default, keys = env.episode_reset.make_default(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
     data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
     for name in ("pos", "quat"):
-        one, twice, moved = (np.asarray(getattr(x.states, name)) for x in (data, again, other))
-        np.testing.assert_array_equal(twice, one)
-        np.testing.assert_array_equal(moved[1:], one[:-1])
+        first, repeated, shifted = (np.asarray(getattr(x.states, name)) for x in (data, again, other))
+        np.testing.assert_array_equal(repeated, first)
+        np.testing.assert_array_equal(shifted[1:], first[:-1])
     np.testing.assert_array_equal(np.asarray(other.params.mass)[1:], np.asarray(data.params.mass)[:-1])
     assert not np.allclose(other.params.mass, data.params.mass)
 
@@ -291,9 +292,9 @@ def test_practice_begins_episodes_behind_gates():
     assert np.bincount(passed, minlength=4).min() > 60, "each gate as often as the others"
     drone, gates = np.asarray(data.states.pos)[:, 0], jax.tree.map(np.asarray, rules.gates_of(data))
     for k in (1, 2, 3):
-        here = passed == k
-        pos, quat = (x[here, 0, k - 1] for x in gates)
-        inside = Rotation.from_quat(quat).inv().apply(drone[here] - pos)
+        is_behind_gate = passed == k
+        pos, quat = (x[is_behind_gate, 0, k - 1] for x in gates)
+        inside = Rotation.from_quat(quat).inv().apply(drone[is_behind_gate] - pos)
         assert np.all((inside[:, 0] > 0.14) & (inside[:, 0] < 0.31)), "behind it, and clear of it"
         np.testing.assert_allclose(inside[:, 1:], 0, atol=1e-5)
     env.sim.data = data

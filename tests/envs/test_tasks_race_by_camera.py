@@ -17,7 +17,7 @@ SIZES = {"ang_vel": 3, "height": 1, "next_gate": 4, "rot": 9, "vel_body": 3}
 
 @pytest.fixture(scope="module")
 def start_state():
-    """Return an environment with practice, and its state at the start of episodes."""
+    """Return an environment whose episodes may begin behind any gate, and its state at the start of episodes."""
     env = make("race_by_camera", N_WORLDS, camera=(), practice=True, engine="interpret")
     return env, jax.jit(env.reset)(jax.random.key(0))
 
@@ -63,9 +63,9 @@ def test_drones_face_the_first_gate_or_along_the_gate_that_they_passed(start_sta
     passed, s = np.asarray(state.data.plugins["task"].passed)[:, 0], state.data.states
     assert set(passed) == {0, 1, 2, 3}
     yaw = np.asarray(rotation.to_rpy(s.quat))[:, 0, 2]
-    way = np.asarray(TRACK.gates_pos[0]) - np.asarray(s.pos)[:, 0]
+    to_gate = np.asarray(TRACK.gates_pos[0]) - np.asarray(s.pos)[:, 0]
     gates_yaw = np.asarray(TRACK.gates_rpy)[np.maximum(passed - 1, 0), 2]
-    expected = np.where(passed > 0, gates_yaw, np.arctan2(way[:, 1], way[:, 0]))
+    expected = np.where(passed > 0, gates_yaw, np.arctan2(to_gate[:, 1], to_gate[:, 0]))
     assert np.abs((yaw - expected + np.pi) % (2 * np.pi) - np.pi).max() < 0.1 + 1e-5
 
 

@@ -39,8 +39,8 @@ def test_separation_is_that_of_an_ellipsoid_longer_in_z():
     pos = np.float32([[0.0, 0, 1], [0.24, 0, 1], [0, -0.48, 1], [0, 0, 2.2]])
     np.testing.assert_allclose(separations(pos), [1, 1, 2, 2], rtol=1e-6)
     np.testing.assert_allclose(separations(pos[[0, 3]]), [2, 2], rtol=1e-6)
-    at_one_point = jax.jit(jax.grad(lambda p: separation(p).sum()))(jnp.zeros((2, 3)))
-    assert np.all(np.isfinite(at_one_point))
+    gradient = jax.jit(jax.grad(lambda p: separation(p).sum()))(jnp.zeros((2, 3)))
+    assert np.all(np.isfinite(gradient))
 
 
 def test_starts_are_clear_and_drones_exchange_their_positions(start_state):

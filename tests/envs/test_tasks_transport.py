@@ -35,6 +35,7 @@ CASES = {
 }
 """Cases, each in its own world with an unturned gate."""
 SAFE = {"through", "backwards", "before", "behind", "load just inside"}
+"""Cases without a crash."""
 AT_GOAL = {
     # Position of the load relative to its goal, m, velocity, m/s, and x of the goal, m.
     "there": ((0.0, 0.05, 0.0), (0.0, 0.0, 0.0), 1.4),
@@ -70,12 +71,12 @@ def place_drones(state, drone, load, vel, goal=GOAL):
 def recorded_flight():
     """Return the world of each case, and the state after a step."""
     env = make_env(len(CASES))
-    place, hang, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
-    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + hang, vel)
+    place, load_offset, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
+    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + load_offset, vel)
     return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
 
 
-def test_touching_and_missing_the_gate_or_leaving_the_lane_is_a_crash(recorded_flight):
+def test_touching_and_missing_the_gate_or_leaving_the_corridor_is_a_crash(recorded_flight):
     world, after = recorded_flight
     crashed = np.asarray(after.info["crashed"])[:, 0]
     assert {name for name, k in world.items() if crashed[k]} == set(CASES) - SAFE
@@ -96,8 +97,8 @@ def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_t
     state = place_drones(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
     step, hold = jax.jit(env.step), round(env.task.hold * env.sim.freq)
     waiting = np.array([[hold - 15]] * len(AT_GOAL), np.int32)
-    own = state.data.plugins["task"].replace(steps_at_goal=jnp.asarray(waiting))
-    state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"task": own}))
+    task_record = state.data.plugins["task"].replace(steps_at_goal=jnp.asarray(waiting))
+    state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"task": task_record}))
     first = step(state, state.action)
     assert not first.info["delivered"].any()
     np.testing.assert_array_equal(first.data.plugins["task"].steps_at_goal[:, 0], [hold - 5, 0, 0, 0])
@@ -112,21 +113,21 @@ def test_progress_is_rewarded_by_its_length_and_passing_the_gate_never_costs(rng
     env = make_env(64)
     state = jax.jit(env.reset)(jax.random.key(0))
     corner = np.array([0.0, 0.35, 0.35])
-    at = GATE + rng.uniform(-corner, corner, (64, 3))
+    crossing_points = GATE + rng.uniform(-corner, corner, (64, 3))
     aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
-    at[0] = aim
+    crossing_points[0] = aim
     remaining_ways, remaining_way = [], jax.jit(vmap_worlds(env.task.remaining_way))
     for x in (-1.0, -1e-3, 1e-3, 1.0):
-        load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
+        load = (crossing_points + np.array([x, 0.0, 0.0])).astype(np.float32)
         remaining_ways.append(np.asarray(remaining_way(place_drones(state, load - DOWN, load, 0.0).data))[:, 0])
-        around = np.linalg.norm(load - aim, axis=-1) + np.linalg.norm(GOAL - aim)
-        expected = around if x < 0 else np.linalg.norm(load - GOAL, axis=-1)
+        way_through_gate = np.linalg.norm(load - aim, axis=-1) + np.linalg.norm(GOAL - aim)
+        expected = way_through_gate if x < 0 else np.linalg.norm(load - GOAL, axis=-1)
         np.testing.assert_allclose(remaining_ways[-1], expected, atol=1e-5)
     assert np.all(remaining_ways[1] - remaining_ways[2] > -1e-3)
     np.testing.assert_allclose(remaining_ways[1][0], remaining_ways[2][0], atol=3e-3)
     data = place_drones(state, GOAL - DOWN, GOAL, 0.0).data
-    own = data.plugins["task"].replace(remaining_way_before=jnp.asarray(remaining_ways[0])[:, None])
-    data = data.replace(plugins=data.plugins | {"task": own})
+    task_record = data.plugins["task"].replace(remaining_way_before=jnp.asarray(remaining_ways[0])[:, None])
+    data = data.replace(plugins=data.plugins | {"task": task_record})
     paid = jax.jit(vmap_worlds(env.task.rewards))(data, state.action, state.action)
     np.testing.assert_allclose(paid["progress"][:, 0], 5 * remaining_ways[0], rtol=1e-4)
     np.testing.assert_allclose(paid["proximity"], 1.5, rtol=1e-3)
@@ -139,20 +140,20 @@ def test_starts_are_clear_of_the_gates_and_links_are_taut():
     env.sim.data = data
     report = env.sim.contact_report()
     assert report.floor_distance.min() > 0.5
-    own, load, s = data.plugins["task"], data.plugins["load"], data.states
+    task_record, load, s = data.plugins["task"], data.plugins["load"], data.states
     link, swing = np.asarray(load.pos) - s.pos, np.asarray(load.vel) - s.vel
     np.testing.assert_allclose(np.linalg.norm(link, axis=-1), LENGTH, rtol=1e-5)
     np.testing.assert_allclose(np.sum(link * swing, axis=-1), 0.0, atol=1e-5)
     assert 0.1 < np.linalg.norm(swing, axis=-1).mean() < 0.4
     tilt = np.arctan2(np.linalg.norm(link[..., :2], axis=-1), -link[..., 2])
     assert 0.5 < tilt.max() < 0.9
-    rows = own.gates.rows
+    rows = task_record.gates.rows
     pos, quat = (np.asarray(x)[:, 0, rows[0] :] for x in (data.objects.pos, data.objects.quat))
     assert np.ptp(pos[..., 1], axis=0).min() > 0.5
     np.testing.assert_allclose(pos[:, 1, 1].mean() - pos[:, 0, 1].mean(), 3.0, atol=0.1)
     assert np.asarray(jax.jit(gate_axis)(quat))[..., 0].min() > 0.95
     behind = jax.jit(is_behind)
-    for place, expected in ((s.pos, False), (load.pos, False), (own.goal, True)):
+    for place, expected in ((s.pos, False), (load.pos, False), (task_record.goal, True)):
         assert np.all(np.asarray(behind(place, pos, quat)) == expected)
     assert np.all(np.asarray(jax.jit(vmap_worlds(env.task.error))(data)) > 2.0)
 

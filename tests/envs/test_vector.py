@@ -66,11 +66,11 @@ def test_episodes_stay_on_the_device_that_was_asked_for():
     default, device = jax.devices()[:2]
     env = make("hover", 3, device="cpu:1")
     state = jax.jit(env.reset)(jax.random.key(0))
-    action, both = np.zeros(state.action.shape, np.float32), np.array([True, False, True])
+    action, mask = np.zeros(state.action.shape, np.float32), np.array([True, False, True])
     after = jax.jit(env.step)(state, jnp.asarray(action))
     vec = gymnasium.make_vec(ID, num_envs=3, device="cpu:1")
     start_state = vec.reset(seed=0)
-    uncompiled = env.reset(jax.random.key(0)), env.step(state, action), env.restart(after, both)
+    uncompiled = env.reset(jax.random.key(0)), env.step(state, action), env.restart(after, mask)
     auto = AutoReset(env)
     again = auto.step(auto.reset(jax.random.key(0)), action)
     for tree in (state, after, start_state, vec.step(zeros(vec)), uncompiled, again):
@@ -258,12 +258,14 @@ def test_pictures_show_the_drone_as_it_is():
     later = env.render()[0]
     assert (later != picture).any(), "the drone has moved"
     env.close()
-    wide = DroneVectorEnv(env.unwrapped.env.env, render_mode="rgb_array", render_worlds=(2, 0), render_size=(64, 48))
-    wide.reset(seed=0)
-    pictures = wide.render()
+    two_worlds = DroneVectorEnv(
+        env.unwrapped.env.env, render_mode="rgb_array", render_worlds=(2, 0), render_size=(64, 48)
+    )
+    two_worlds.reset(seed=0)
+    pictures = two_worlds.render()
     assert [p.shape for p in pictures] == [(48, 64, 3)] * 2
     assert (pictures[0] != pictures[1]).any()
-    wide.close()
+    two_worlds.close()
 
 
 @pytest.mark.usefixtures("opengl")
@@ -340,13 +342,13 @@ def test_one_world_is_an_environment_that_gymnasium_accepts():
         with pytest.raises(ConfigError, match="expected one integer from 0"):
             env.unwrapped.reset(seed=seed)
     vec = gymnasium.make_vec(ID, num_envs=1, seconds=1.0, autoreset_mode="Disabled")
-    many = vec.reset(seed=5)[0]
+    vector_obs = vec.reset(seed=5)[0]
     truncated = False
     for steps in range(1, 51):  # noqa: B007
         for name, x in first.items():
-            np.testing.assert_allclose(x, np.asarray(many[name])[0], rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(x, np.asarray(vector_obs[name])[0], rtol=1e-5, atol=1e-5)
         first, reward, terminated, truncated, _ = env.step(np.zeros(4, np.float32))
-        many, rewards, *_ = vec.step(np.zeros((1, 4), np.float32))
+        vector_obs, rewards, *_ = vec.step(np.zeros((1, 4), np.float32))
         assert reward == pytest.approx(float(rewards[0]), rel=1e-5, abs=1e-5)
         if terminated or truncated:
             break

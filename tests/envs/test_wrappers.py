@@ -27,7 +27,7 @@ from crazysim.envs import (
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 
-FIRST = np.array([True, False, False, False])
+FIRST_WORLD = np.array([True, False, False, False])
 KEY = jax.random.key(0)
 
 
@@ -93,7 +93,7 @@ class Recorder(Wrapper):
 def test_shared_parameters_stay_when_episodes_begin(env):
     state = env.reset(jax.random.key(0))
     heavier_params = state.data.params.replace(mass=state.data.params.mass * 2)
-    after = env.restart(state.replace(data=state.data.replace(params=heavier_params)), jnp.asarray(FIRST))
+    after = env.restart(state.replace(data=state.data.replace(params=heavier_params)), jnp.asarray(FIRST_WORLD))
     assert trees_equal(after.data.params, heavier_params)
 
 
@@ -120,7 +120,7 @@ def test_hooks_change_actions_and_remember(env):
     after = wrapped.step(state, action)
     np.testing.assert_allclose(after.action, action / 4)
     np.testing.assert_array_equal(after.memory["inner"], np.ones(4))
-    again = wrapped.restart(wrapped.step(after, action), jnp.asarray(FIRST))
+    again = wrapped.restart(wrapped.step(after, action), jnp.asarray(FIRST_WORLD))
     np.testing.assert_array_equal(again.memory["outer"], [0, 2, 2, 2])
 
 
@@ -188,23 +188,23 @@ def test_episode_statistics(env, mode):
     auto = AutoReset(EpisodeStatistics(env), mode)
     start_state = auto.reset(jax.random.key(0))
     assert not start_state.info["episode_length"].any()
-    one, two = random_steps(auto, start_state, 2)
-    last = auto.step(set_last_step(env, two, FIRST), random_action(start_state, 7))
-    np.testing.assert_array_equal(last.done, FIRST)
+    first, second = random_steps(auto, start_state, 2)
+    last = auto.step(set_last_step(env, second, FIRST_WORLD), random_action(start_state, 7))
+    np.testing.assert_array_equal(last.done, FIRST_WORLD)
     np.testing.assert_array_equal(last.info["episode_length"], [3, 0, 0, 0])
-    total = one.reward + two.reward + last.reward
-    np.testing.assert_allclose(last.info["episode_return"], total * FIRST[:, None], rtol=1e-5)
+    total = first.reward + second.reward + last.reward
+    np.testing.assert_allclose(last.info["episode_return"], total * FIRST_WORLD[:, None], rtol=1e-5)
     after = auto.step(last, random_action(start_state, 8))
     if mode == "Disabled":  # the episode continues and ends again
         np.testing.assert_array_equal(after.info["episode_length"], [1, 0, 0, 0])
-        again = auto.restart(after, jnp.asarray(FIRST))
+        again = auto.restart(after, jnp.asarray(FIRST_WORLD))
         assert not again.info["episode_length"].any()
         np.testing.assert_array_equal(again.memory["EpisodeStatistics"].length[:, 0], [0, 4, 4, 4])
     else:
         assert not after.info["episode_length"].any()
         assert not after.info["episode_return"].any()
-        begins = 0 if mode == "NextStep" else 1
-        np.testing.assert_array_equal(after.memory["EpisodeStatistics"].length[:, 0], [begins, 4, 4, 4])
+        length = 0 if mode == "NextStep" else 1
+        np.testing.assert_array_equal(after.memory["EpisodeStatistics"].length[:, 0], [length, 4, 4, 4])
 
 
 def test_observe_changes_observations_of_resets_steps_and_restarts(env):
@@ -217,7 +217,7 @@ def test_observe_changes_observations_of_resets_steps_and_restarts(env):
         assert_same_world(state.obs["all"], np.concatenate([plain.obs[n] for n in names], axis=-1))
         np.testing.assert_array_equal(state.obs["clock"][:, 0, 0], state.data.core.steps[:, 0])
         state, plain = wrapped.step(state, random_action(plain)), env.step(plain, random_action(plain))
-    state, plain = wrapped.restart(state, jnp.asarray(FIRST)), env.restart(plain, jnp.asarray(FIRST))
+    state, plain = wrapped.restart(state, jnp.asarray(FIRST_WORLD)), env.restart(plain, jnp.asarray(FIRST_WORLD))
     assert_same_world(state.obs["all"], flatten(plain.obs))
 
 
@@ -229,13 +229,13 @@ def test_observations_are_normalised_by_all_observations_so_far(env):
     seen = [s.obs["pos"] for s in (plain, *random_steps(env, plain, 9))]
     stats = states[-1].memory["Normalize"]["pos"]
     flat = np.concatenate([np.asarray(x, float).reshape(-1, 3) for x in seen])
-    # float32, and the weight of 1e-4 that the prior has among 40: relative to a variance of one
+    # Errors are rounding of float32, and a prior with variance 1 that counts as 1e-4 of the 40 observations.
     np.testing.assert_allclose(stats.mean, flat.mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(stats.var, flat.var(axis=0), atol=1e-4)
     expected = (seen[-1] - flat.mean(axis=0)) / np.sqrt(flat.var(axis=0) + 1e-6)
     np.testing.assert_allclose(states[-1].obs["pos"], expected, rtol=1e-3, atol=1e-3)
     # a new episode is normalised by the same statistics, and its first observation is not counted twice
-    again = wrapped.restart(states[-1], jnp.asarray(FIRST))
+    again = wrapped.restart(states[-1], jnp.asarray(FIRST_WORLD))
     assert trees_equal(again.memory, states[-1].memory)
     np.testing.assert_array_equal(again.obs["pos"][1:], states[-1].obs["pos"][1:])
 
@@ -277,7 +277,7 @@ def test_noise_has_its_standard_deviation_and_is_reproducible(env):
     assert trees_equal(again.obs, wrapped.reset(jax.random.key(0)).obs)
     assert not trees_equal(again.obs["pos"], wrapped.reset(jax.random.key(1)).obs["pos"])
     assert_same_world(again.data, plain.data)  # the states have no noise
-    restarted = wrapped.restart(again, jnp.asarray(FIRST))
+    restarted = wrapped.restart(again, jnp.asarray(FIRST_WORLD))
     assert trees_equal(restarted.obs["pos"][1:], again.obs["pos"][1:]), "observations of other worlds stay"
 
 
@@ -302,10 +302,10 @@ def test_frames_are_stacked_oldest_first(env):
             assert_same_world(x, np.concatenate([frame[name] for frame in seen[-3:]], axis=-1))
         state, plain = wrapped.step(state, random_action(plain, i)), env.step(plain, random_action(plain, i))
         seen.append(plain.obs)
-    restarted = wrapped.restart(state, jnp.asarray(FIRST))
-    first = env.restart(plain, jnp.asarray(FIRST)).obs["pos"][0]
+    restarted = wrapped.restart(state, jnp.asarray(FIRST_WORLD))
+    first = env.restart(plain, jnp.asarray(FIRST_WORLD)).obs["pos"][0]
     assert_same_world(restarted.obs["pos"][0], np.tile(first, 3))
-    assert trees_equal(select_state(restarted, ~FIRST), select_state(state, ~FIRST))
+    assert trees_equal(select_state(restarted, ~FIRST_WORLD), select_state(state, ~FIRST_WORLD))
 
 
 def test_delayed_actions_arrive_after_their_steps(env):
@@ -317,7 +317,7 @@ def test_delayed_actions_arrive_after_their_steps(env):
         state, plain = delayed.step(state, sent[-1]), env.step(plain, sent[i])
         assert_same_world(state.data, plain.data)
         np.testing.assert_array_equal(state.action, sent[i])
-    state, plain = delayed.restart(state, jnp.asarray(FIRST)), env.restart(plain, jnp.asarray(FIRST))
+    state, plain = delayed.restart(state, jnp.asarray(FIRST_WORLD)), env.restart(plain, jnp.asarray(FIRST_WORLD))
     sent.append(random_action(plain, 9))
     for i in (4, 5):
         action = np.array(sent[i])
@@ -360,9 +360,9 @@ def test_every_drone_has_its_own_randomised_parameters(env, randomized_state):
 
 
 def test_only_restarted_worlds_are_randomised_again(randomized, randomized_state):
-    new = jax.jit(randomized.restart)(randomized_state, jnp.asarray(FIRST))
+    new = jax.jit(randomized.restart)(randomized_state, jnp.asarray(FIRST_WORLD))
     assert new.data.params.mass[0] != randomized_state.data.params.mass[0]
-    assert trees_equal(select_state(new, ~FIRST), select_state(randomized_state, ~FIRST))
+    assert trees_equal(select_state(new, ~FIRST_WORLD), select_state(randomized_state, ~FIRST_WORLD))
 
 
 def test_randomisation_does_not_depend_on_the_number_of_worlds(randomized_state):

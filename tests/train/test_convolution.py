@@ -27,7 +27,7 @@ from crazysim.train.seeds import stack_swept_values, take_seed
 from crazysim.train.show import color_depth, film
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
-SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
+SMALL_CONFIG = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
 OPTIONS = {"seconds": 0.1, "depth_image": (5, 4)}
 
 
@@ -163,11 +163,11 @@ def test_c_gives_the_actions_of_jax(tmp_path, meta, episode):
 def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     """Each pixel of the depth image is a block of pixels of the film; near ones are brighter."""
     options = OPTIONS | {"seconds": 0.04, "engine": "interpret"}
-    short = make("hover", 1, **options)
-    film(short, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
-    short.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
+    short_env = make("hover", 1, **options)
+    film(short_env, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
+    short_env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
     frame = read_frames(tmp_path / "film.gif", 360, 480, "-vf", "scale=480:360").astype(int)[0]
-    depth = np.asarray(jax.jit(short.reset)(jax.random.key(1)).obs["depth"]).reshape(4, 5)
+    depth = np.asarray(jax.jit(short_env.reset)(jax.random.key(1)).obs["depth"]).reshape(4, 5)
     assert np.ptp(depth) > 3
     expected = color_depth(depth, 10.0)
     assert expected.sum(axis=-1)[depth.argmin() // 5, depth.argmin() % 5] == expected.sum(axis=-1).max()
@@ -196,7 +196,7 @@ def test_a_film_has_maps_from_above_if_policies_observe_images(tmp_path, monkeyp
 
 def train_quietly(folder, iterations=2, **options):
     """Train hover with images, a tiny convolution and a privileged critic."""
-    config = SHORT | {"iterations": iterations, "memory": 3, "critic": "privileged"}
+    config = SMALL_CONFIG | {"iterations": iterations, "memory": 3, "critic": "privileged"}
     config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
     return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
 
@@ -257,14 +257,14 @@ def test_a_student_learns_from_images(env, rng):
 
 def test_law_09_convolutions_that_do_not_fit_are_refused(env):
 
-    def begin(env, **config):
+    def init_learner(env, **config):
         jax.eval_shape(lambda key: ppo.init(AutoReset(env), (ppo.Config(minibatches=1, **config),), key), keys)
 
     keys = jax.random.key(0)[None]
     with pytest.raises(ConfigError, match=r"expected an image among the observations .*, got ang_vel, .*Use depth_im"):
-        begin(env.env, convolution=(2,))
+        init_learner(env.env, convolution=(2,))
     with pytest.raises(ConfigError, match=r"expected a critic of one drone with a convolution, got 'all_drones'"):
-        begin(env, convolution=(2,), critic="all_drones")
+        init_learner(env, convolution=(2,), critic="all_drones")
     with pytest.raises(ConfigError, match=r"expected convolution as the channels of the layers, got 8\. Use for"):
         ppo.Config(convolution=8)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"convolution\[1\] is 0; it must be a positive"):

@@ -1,4 +1,4 @@
-"""A student learns what its teacher does from other observations, in Python and by the command."""
+"""A student learns the actions of its teacher from other observations, in Python and by the command."""
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +84,7 @@ def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
 
 @pytest.fixture
 def recipe_with_teacher(monkeypatch):
-    """A recipe of hover with a teacher that flies shorter, and the settings of its small runs."""
+    """Give hover a recipe whose teacher has shorter episodes; return the logged lines and settings of small runs."""
     teacher = Recipe(n_worlds=4, config=SMALL | {"iterations": 2}, options={"seconds": 0.1}, evaluate_every=1)
     recipe = Recipe("dagger", n_worlds=2, config=SMALL | {"iterations": 1}, teacher=teacher)
     monkeypatch.setitem(configs.RECIPES, "hover", recipe)

@@ -20,13 +20,13 @@ from crazysim.train.devices import exchanged_bytes, find_devices, learner_shardi
 from crazysim.train.show import read_curve
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
-PPO = ppo.Config(iterations=3, n_steps=8, minibatches=4, epochs=2, hidden=(8,), learning_rate=1e-2)
-APG = apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=1e-2)
-DAGGER = dagger.Config(iterations=3, n_steps=8, minibatches=4, epochs=2, hidden=(8,), learning_rate=1e-3)
+PPO_CONFIG = ppo.Config(iterations=3, n_steps=8, minibatches=4, epochs=2, hidden=(8,), learning_rate=1e-2)
+APG_CONFIG = apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=1e-2)
+DAGGER_CONFIG = dagger.Config(iterations=3, n_steps=8, minibatches=4, epochs=2, hidden=(8,), learning_rate=1e-3)
 
 
 def key_of(seed):
-    """Return the key that a run gives a seed."""
+    """Return the key that a run derives from a seed."""
     return jax.random.fold_in(jax.random.key(seed), 1)
 
 
@@ -42,12 +42,12 @@ class Training:
             init = functools.partial(init, teacher=steer)
             env = dagger.TeacherObservation(env, env.task.observe)
         env = env if algorithm is apg else AutoReset(env)
-        everywhere = replicated_sharding(env.sim)
-        keys = jax.device_put(jax.numpy.stack([key_of(seed) for seed in range(n_seeds)]), everywhere)
+        replicated = replicated_sharding(env.sim)
+        keys = jax.device_put(jax.numpy.stack([key_of(seed) for seed in range(n_seeds)]), replicated)
         shapes = jax.eval_shape(functools.partial(init, env, configs), keys)
         self.shardings = learner_shardings(shapes, env.sim, n_seeds)
         init = jax.jit(init, static_argnums=(0, 1), out_shardings=self.shardings)
-        iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(self.shardings, everywhere))
+        iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(self.shardings, replicated))
         learner = self.initial_learner = init(env, configs, keys)
         self.program = iterate.lower(learner, env, configs).compile()
         for _ in range(3):
@@ -73,7 +73,7 @@ def agent_of(training, seed):
 
 
 @pytest.mark.long("compiles each algorithm for one device and for four")
-@pytest.mark.parametrize(("algorithm", "config"), [(ppo, PPO), (apg, APG)], ids=["ppo", "apg"])
+@pytest.mark.parametrize(("algorithm", "config"), [(ppo, PPO_CONFIG), (apg, APG_CONFIG)], ids=["ppo", "apg"])
 def test_four_devices_train_the_policy_of_one(algorithm, config):
     """The first episodes are equal bit for bit, weights and statistics after three iterations to rounding. Devices only
     exchange sums."""
@@ -95,13 +95,13 @@ def test_four_devices_train_the_policy_of_one(algorithm, config):
 @pytest.mark.long("compiles the training of a student for one device and for two")
 def test_two_devices_train_the_student_of_one():
     """DAgger: the same first episodes, and the same student within a hundredth of what its 24 updates change."""
-    one, two = (Training(dagger, DAGGER, 1, 16, n) for n in (1, 2))
+    one, two = (Training(dagger, DAGGER_CONFIG, 1, 16, n) for n in (1, 2))
     assert_same(two.initial_learner.env, one.initial_learner.env, atol=0)
-    moved = [
+    weight_changes = [
         x - y
         for x, y in zip(*(jax.tree.leaves(x.agents.student) for x in (one.learner, one.initial_learner)), strict=True)
     ]
-    assert max(np.abs(x).max() for x in moved) > 1e-2
+    assert max(np.abs(x).max() for x in weight_changes) > 1e-2
     assert_same(two.learner, one.learner, atol=1e-4)
     assert_same(two.metrics, one.metrics, atol=1e-5)
     assert two.learner.env.obs["pos"].addressable_shards[0].data.shape[0] == 8
@@ -110,8 +110,8 @@ def test_two_devices_train_the_student_of_one():
 @pytest.mark.long("compiles a training of two seeds and of three for two devices")
 def test_seeds_are_divided_among_devices_or_trained_on_all():
     """Devices that divide the seeds train them without exchange. Seeds are trained as in runs of one seed."""
-    single_training = Training(ppo, PPO, 1, 16, 1)
-    two, three = (Training(ppo, PPO, n, 16, 2) for n in (2, 3))
+    single_training = Training(ppo, PPO_CONFIG, 1, 16, 1)
+    two, three = (Training(ppo, PPO_CONFIG, n, 16, 2) for n in (2, 3))
     for training in (two, three):
         assert_same(agent_of(training, 0), agent_of(single_training, 0), atol=1e-5)
         assert np.any(agent_of(training, 1).log_std != agent_of(training, 0).log_std)
@@ -126,7 +126,7 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     in one checkpoint that does not hold the devices."""
     monkeypatch.setattr(configs, "make", functools.cache(make))
     options, lines = {"seconds": 0.2}, []
-    settings = {"n_worlds": 16, "options": options, "config": dataclasses.asdict(PPO)}
+    settings = {"n_worlds": 16, "options": options, "config": dataclasses.asdict(PPO_CONFIG)}
 
     def train_quietly(devices, **others):
         config = TrainConfig.create("hover", devices=devices, **settings)
@@ -143,7 +143,7 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     train_quietly("2,0", resume=True)
     assert re.search(r"in 16 worlds, 8 on each of 2 devices, .*; continues after iteration 2", lines[0])
     arrays, meta = checkpoint.read(tmp_path / CHECKPOINT_FILE)
-    one = Training(ppo, PPO, 1, 16, 1).learner
+    one = Training(ppo, PPO_CONFIG, 1, 16, 1).learner
     found = checkpoint.restore("", {k: x for k, x in arrays.items() if k.startswith("['learner']")}, {"learner": one})
     assert_same(found["learner"], one, atol=1e-5)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0, 2, 3]

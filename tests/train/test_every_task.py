@@ -15,10 +15,10 @@ N_WORLDS, ITERATIONS = {"ppo": 256, "apg": 64}, {"ppo": 30, "apg": 15}
 @pytest.mark.slow("trains every task; the tests of both algorithms on one task are quicker")
 @pytest.mark.parametrize("task", [task for task in TASKS if task in BUILT_IN_TASKS])
 def test_the_reward_rises(task):
-    """In the last ten iterations it exceeds that of an untrained policy by more than two standard errors.
+    """The reward of the last ten iterations exceeds that of an untrained policy by more than two standard errors.
 
-    All episodes begin together, so rewards of different iterations are of different times of an episode. If the recipe
-    has a teacher, the teacher is trained.
+    All episodes begin together, so different iterations have rewards of different parts of an episode. The untrained
+    policy flies the same parts. If the recipe has a teacher, the teacher is trained.
     """
     recipe = TrainConfig.create(task)
     recipe = recipe.teacher_config() or recipe

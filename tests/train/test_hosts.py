@@ -20,7 +20,7 @@ from crazysim.train import checkpoint
 from crazysim.train.training import CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE
 
 SMALL = "--worlds 64 --no-film --set seconds=0.2 --config n_steps=4 minibatches=2 epochs=1 hidden=[8]".split()
-HEARTBEAT = 20
+HEARTBEAT_TIMEOUT = 20
 """Time without a heartbeat after which a host is lost, s; it is long, as other processes use the processor too."""
 
 
@@ -60,7 +60,7 @@ class Process:
 def start(folder, arguments, others=((), ())):
     """Return the processes of two hosts that run a command, with further arguments of each host."""
     address = free_address()
-    common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT}".split()
+    common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT_TIMEOUT}".split()
     return [
         Process(folder, f"host{i}", sys.executable, "-m", "crazysim", *arguments, *common, "--host-id", str(i), *own)
         for i, own in enumerate(others)
@@ -88,8 +88,10 @@ def assert_same_files(actual_folder, expected_folder):
 
 @pytest.mark.long("six processes import JAX, and compile or load a training")
 def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_path):
-    """One training: complete; continued, and interrupted by Ctrl-C on one host; continued, until a host is killed;
-    continued by one process with all devices."""
+    """A training runs to its end, is continued until Ctrl-C on one host, and again until a host is killed.
+
+    One process with all devices then continues it.
+    """
     out, one_process_folder = tmp_path / "two", tmp_path / "one"
     ended = [process.end() for process in start(tmp_path, training_arguments(out, "--iterations", "3"))]
     assert [status for status, _ in ended] == [0, 0], ended
@@ -109,13 +111,13 @@ def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_pa
     assert f"interrupted after iteration {iteration(out)}" in text
     assert "start all hosts again" not in text, "no host was lost"
 
-    stopped = iteration(out)
+    stopped_iteration = iteration(out)
     first, second = start(tmp_path, endless)
-    wait_for(lambda: iteration(out) > stopped or first.has_ended)
+    wait_for(lambda: iteration(out) > stopped_iteration or first.has_ended)
     second.signal(signal.SIGKILL)
     (status, text), (other_status, _) = first.end(), second.end()
     assert (status, other_status) == (128 + signal.SIGABRT, -signal.SIGKILL)
-    assert f"host 1 lost: no heartbeat for {HEARTBEAT} s. The last checkpoint continues the training" in text
+    assert f"host 1 lost: no heartbeat for {HEARTBEAT_TIMEOUT} s. The last checkpoint continues the training" in text
     assert f"crazysim train hover {shlex.join(SMALL)}" in text
 
     last = iteration(out)
@@ -133,7 +135,7 @@ def test_hosts_with_other_settings_stop_together(tmp_path):
     assert not (tmp_path / "out" / CHECKPOINT_FILE).exists()
 
 
-VERSION = """
+VERSION_PROGRAM = """
 import sys, jax, crazysim
 from crazysim.train.hosts import require_same_versions
 crazysim.__version__ = f"0.{sys.argv[2]}"
@@ -144,7 +146,7 @@ require_same_versions()
 
 def test_hosts_with_other_versions_are_an_error(tmp_path):
     address = free_address()
-    command = (sys.executable, "-c", VERSION, address)
+    command = (sys.executable, "-c", VERSION_PROGRAM, address)
     for process in [Process(tmp_path, str(i), *command, str(i)) for i in range(2)]:
         status, text = process.end()
         assert status == 1

@@ -20,7 +20,7 @@ from crazysim.train import mlp_kernel
 from crazysim.train.mlp_kernel import CAPABILITY, INTRINSICS, DistributedMlp, apply_mlp, choose_mlp, cuda_source
 from crazysim.train.networks import MEMORYLESS_NETWORK, gru_network, init_mlp, mlp
 
-HOST = Path(__file__).with_name("gpu_on_host.h")
+HOST_HEADER = Path(__file__).with_name("gpu_on_host.h")
 H100 = SimpleNamespace(platform="gpu", compute_capability=f"{CAPABILITY / 10}")
 
 
@@ -38,7 +38,7 @@ def compile_for_host(tmp_path_factory):
             arguments = ", ".join(f"({x.rpartition(' ')[0]})p[{i}]" for i, x in enumerate(parameters.split(", ")))
             body = re.sub(r"extern __shared__.*;", "", source)
             call = f"run([](void** p) {{ {name}({arguments}); }}, p, x, y, {n_threads});"
-            text = f'#include "{HOST}"\n{body}\nextern "C" void call(void** p, int x, int y) {{ {call} }}\n'
+            text = f'#include "{HOST_HEADER}"\n{body}\nextern "C" void call(void** p, int x, int y) {{ {call} }}\n'
             source_path.write_text(text)
             words = ["g++", "-std=c++17", "-O1", "-w", "-shared", "-fPIC", "-Wl,-Bsymbolic"]
             subprocess.run([*words, source_path, "-o", path], check=True)
@@ -67,7 +67,7 @@ def on_host(monkeypatch, compile_for_host):
 
 
 def networks(sizes, n_seeds):
-    """Return layers with biases of several seeds."""
+    """Return the layers of a network for each seed, with biases that are not zero."""
     keys = jax.random.split(jax.random.key(0), n_seeds)
     return jax.vmap(lambda key: [(weight, weight[0] + 0.2) for weight, _ in init_mlp(key, sizes, 1.0)])(keys)
 
@@ -124,7 +124,7 @@ def test_gradients_of_zeros_are_zero_and_inputs_get_none(on_host):
 
 
 def test_gradients_that_grow_through_large_weights_are_finite(on_host):
-    """Each of 32 units passes on 12 times the gradient, and each of 48 then 1,536 times: a tenth of 16 bits' range."""
+    """The gradient is multiplied by 12 up to the 32 units, by 1,536 up to the 48: a tenth of the range of 16 bits."""
     layers = [(jnp.full(w.shape[1:], 4.0), jnp.zeros(b.shape[1:])) for w, b in networks((13, 48, 32, 3), 1)]
     x = jnp.zeros((5, 13))
     found, expected = (

@@ -33,8 +33,8 @@ from crazysim.train.show import film
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
-SHORT = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
-SIZES = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic"}}
+SMALL_CONFIG = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+RUN_SETTINGS = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic"}}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -47,13 +47,15 @@ def shared_environments():
 
 def train_quietly(folder, config, network=None, iterations=2, **options):
     """Train hover with a tiny network."""
-    config = TrainConfig.create("hover", **SIZES, config=SHORT | {"iterations": iterations} | config, network=network)
+    config = TrainConfig.create(
+        "hover", **RUN_SETTINGS, config=SMALL_CONFIG | {"iterations": iterations} | config, network=network
+    )
     return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
 
 
 def init_learner(env, **config):
     """Return an untrained learner of one seed, and its configuration."""
-    config = ppo.Config(**SHORT | config)
+    config = ppo.Config(**SMALL_CONFIG | config)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     return learner, config
 
@@ -174,8 +176,8 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     memory = policy.initial_memory(8, 1)
     for _ in range(2):
         action, memory = policy.act(obs, memory)
-        one = {name: np.asarray(x[0, 0]) for name, x in obs.items()}
-        link._compute_observations = lambda _, one=one: one
+        drone_obs = {name: np.asarray(x[0, 0]) for name, x in obs.items()}
+        link._compute_observations = lambda _, drone_obs=drone_obs: drone_obs
         np.testing.assert_allclose(link(None), link._centre + link._scale * action[0, 0], atol=1e-6)
     np.testing.assert_allclose(link._memory, memory[0, 0], atol=1e-6)
     link.reset()
@@ -184,16 +186,16 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
 
 def test_policies_of_several_seeds_have_separate_memories(rng):
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))
-    config = ppo.Config(**SHORT | {"minibatches": 1, "memory": 3})
+    config = ppo.Config(**SMALL_CONFIG | {"minibatches": 1, "memory": 3})
     keys = jax.random.split(jax.random.key(0), 2)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,) * 2, keys)
     policies, obs = learner.as_policy(), learner.env.obs
     memory = jnp.asarray(rng.normal(size=(4, 1, 3)), jnp.float32)
     action, after = Policies(policies).act(obs, memory)
     for i, worlds in enumerate((slice(2), slice(2, 4))):
-        one = take_seed(policies, i).act({name: x[worlds] for name, x in obs.items()}, memory[worlds])
-        np.testing.assert_allclose(action[worlds], one[0], atol=1e-6)
-        np.testing.assert_allclose(after[worlds], one[1], atol=1e-6)
+        action_and_memory = take_seed(policies, i).act({name: x[worlds] for name, x in obs.items()}, memory[worlds])
+        np.testing.assert_allclose(action[worlds], action_and_memory[0], atol=1e-6)
+        np.testing.assert_allclose(after[worlds], action_and_memory[1], atol=1e-6)
     assert Policies(policies).initial_memory(4, 1).shape == (4, 1, 3)
 
 
@@ -343,7 +345,7 @@ def test_a_custom_network_is_trained_saved_and_loaded(tmp_path, make_network):
 
 def test_wrong_networks_are_errors():
     network = plain_network()
-    settings = {"task": "hover", **SIZES}
+    settings = {"task": "hover", **RUN_SETTINGS}
     with pytest.raises(ConfigError, match="expected memory=0 with a custom network, got 8"):
         TrainConfig.create(**settings, config={"memory": 8}, network=network)
     with pytest.raises(ConfigError, match=r"expected no custom network for apg, got one\. Use algorithm='ppo'"):

@@ -96,12 +96,13 @@ RESULTS = {
                  "control.normalizedForces[3], control.controlMode",
 }  # fmt: skip
 AIRFRAME = load_airframe("cf21B_500")
-FULL = 4 * float(AIRFRAME.value("rotors.thrust_max"))
+MAX_THRUST = 4 * float(AIRFRAME.value("rotors.thrust_max"))
+"""Thrust of all rotors at full speed, N."""
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Return a policy for hover of each level, the description of its actions, and the folder of its controller."""
+    """Return a function from a command level to a policy for hover, its actions, and the folder of its controller."""
     exports = {}
 
     def export(level):
@@ -128,7 +129,10 @@ def command_of(policy, actions, x):
 
 @pytest.mark.parametrize("level", RESULTS)
 def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmware(exported, level):
-    """Attitudes in degrees with the nose up, thrust over the largest, and off without a setpoint of the position."""
+    """Angles are in degrees, pitch positive with the nose up, and thrusts relative to the largest.
+
+    The motors are off if the setpoint has no position.
+    """
     policy, actions, folder = exported(level)
     (folder / "controller.h").write_text(CONTROLLER)
     (folder / "controller_pid.h").write_text(CONTROLLER_PID)
@@ -147,12 +151,12 @@ def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmwar
     command = command_of(policy, actions, x)
     if level in ("attitude", "body_rate"):
         mode = 1 if level == "attitude" else 2
-        expected = [*np.degrees(command[:3]) * [1, -1, 1], 65535 * command[3] / FULL, mode, mode, mode, 0, 0]
+        expected = [*np.degrees(command[:3]) * [1, -1, 1], 65535 * command[3] / MAX_THRUST, mode, mode, mode, 0, 0]
     elif level == "force_torque":
         expected = [*command, 1]
     else:
         thrust = np.polynomial.polynomial.polyval(command, AIRFRAME.value("rotors.thrust_curve"))
-        expected = [*4 * thrust / FULL, 2]
+        expected = [*4 * thrust / MAX_THRUST, 2]
     np.testing.assert_allclose(flying[: len(expected)], expected, rtol=3e-5, atol=1e-6)
     call(1, 41, x + np.float32(0.1), later)  # between two ticks of the policy
     call(1, 60, x + np.float32(0.1), moved)
@@ -169,8 +173,8 @@ def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):
     """In the firmware's place, at 50 Hz: the same flight within rounding of float32."""
     policy, actions, folder = exported("rotor_vel")
     library, n = folder / "policy.so", 3
-    words = ["-DCRAZYSIM", f"-I{CFirmware.include}", folder / "controller.c", "-o", library, "-lm"]
-    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *words], check=True)
+    arguments = ["-DCRAZYSIM", f"-I{CFirmware.include}", folder / "controller.c", "-o", library, "-lm"]
+    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *arguments], check=True)
     start = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 1.2], [-0.4, 0.1, 0.9]])[:, None]
     goal = np.array([0.1, 0.2, 1.1])
     in_c = Sim(n, control="state", controller=CFirmware(library, motors="rpm", freq=50))

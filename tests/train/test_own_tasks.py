@@ -158,8 +158,8 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"expected depth = 0\.3 as in .*, got 0\.1"):
         train.run(Low(seconds=0.4), tmp_path / "run", resume=True)
     state = result.env.reset(jax.random.key(0))
-    one = {name: np.asarray(x)[0, 0] for name, x in state.obs.items()}
-    np.testing.assert_allclose(result.policy(one), result.policy(state.obs)[0, 0], rtol=1e-5, atol=1e-6)
+    drone_obs = {name: np.asarray(x)[0, 0] for name, x in state.obs.items()}
+    np.testing.assert_allclose(result.policy(drone_obs), result.policy(state.obs)[0, 0], rtol=1e-5, atol=1e-6)
 
     class Local(Low):
         """Low, in a function."""

@@ -24,26 +24,26 @@ from crazysim.train.seeds import take_seed
 from crazysim.train.show import read_curve
 from crazysim.train.training import load_policy
 
-SECONDS = {"seconds": 0.2}
-PPO = [
+SHORT_EPISODES = {"seconds": 0.2}
+PPO_CONFIGS = [
     ppo.Config(iterations=3, n_steps=12, minibatches=2, epochs=2, hidden=(8,), learning_rate=rate, discount=discount)
     for rate, discount in ((1e-3, 0.98), (5e-3, 0.9))
 ]
-APG = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for rate in (1e-3, 5e-3)]
+APG_CONFIGS = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for rate in (1e-3, 5e-3)]
 
 
 def block_observations(state, i):
-    """Return the observations of a block of four worlds."""
+    """Return the observations of the i-th block of four worlds, which are the worlds of one seed."""
     return {name: np.asarray(x[4 * i : 4 * i + 4]) for name, x in state.obs.items()}
 
 
 @pytest.mark.long("compiles a training of one seed, and of two")
-@pytest.mark.parametrize(("algorithm", "hyperparameters"), [(ppo, PPO), (apg, APG)], ids=["ppo", "apg"])
+@pytest.mark.parametrize(("algorithm", "hyperparameters"), [(ppo, PPO_CONFIGS), (apg, APG_CONFIGS)], ids=["ppo", "apg"])
 def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters):
     """Initial states are equal; agents, metrics and worlds agree to rounding after three iterations, with episodes that
     end in between. Hyperparameters of the seeds differ."""
     wrap = AutoReset if algorithm is ppo else lambda env: env
-    env_of_one, env_of_both = (wrap(make("hover", n, randomize="crazyflie", **SECONDS)) for n in (4, 8))
+    env_of_one, env_of_both = (wrap(make("hover", n, randomize="crazyflie", **SHORT_EPISODES)) for n in (4, 8))
     keys = jax.random.split(jax.random.key(3), 2)
     init = jax.jit(algorithm.init, static_argnums=(0, 1))
     joint, separate = (
@@ -69,9 +69,9 @@ def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters
         for name, x in block_observations(separate[i].env, 0).items():
             np.testing.assert_allclose(block_observations(joint.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
     policies = joint.as_policy()
-    found = evaluate_blocks(make("hover", 16, **SECONDS), Policies(policies), n_blocks=2)
+    found = evaluate_blocks(make("hover", 16, **SHORT_EPISODES), Policies(policies), n_blocks=2)
     for i in range(2):
-        expected = evaluate(make("hover", 8, **SECONDS), take_seed(policies, i))
+        expected = evaluate(make("hover", 8, **SHORT_EPISODES), take_seed(policies, i))
         for name, x in expected.items():
             np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
 

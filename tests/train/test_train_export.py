@@ -62,7 +62,7 @@ def with_memory(policy, size):
 
 @pytest.fixture(scope="module")
 def episodes(policy, observations_and_actions):
-    """Return a policy with memory, observations of 25 steps of 20 drones, where memories begin anew, and actions."""
+    """Return a policy with memory, observations of 25 steps of 20 drones, resets of memories, actions, and memories."""
     policy, obs = with_memory(policy, 9), observations_and_actions[0].reshape(25, 20, -1)
     reset = np.random.default_rng(4).uniform(size=(25, 20)) < 0.1
     seen, memory, actions = jnp.asarray(obs), policy.initial_memory(20), []
@@ -71,8 +71,8 @@ def episodes(policy, observations_and_actions):
         memory = jnp.where(reset[t][:, None], 0.0, memory)
         action, memory = act({"all": seen[t]}, memory)
         actions.append(np.asarray(action))
-    lost = act({"all": seen[-1]}, policy.initial_memory(20))[0]
-    assert np.abs(lost - actions[-1]).max() > 0.05, "memories matter"
+    action_without_memory = act({"all": seen[-1]}, policy.initial_memory(20))[0]
+    assert np.abs(action_without_memory - actions[-1]).max() > 0.05, "memories matter"
     return policy, obs, reset, np.stack(actions), np.asarray(memory)
 
 
@@ -127,15 +127,15 @@ def test_c_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, ep
         code.step(pointer(states[drone]), pointer(np.ascontiguousarray(obs[t, drone])), pointer(action))
         np.testing.assert_allclose(action, actions[t, drone], atol=2e-5)
     np.testing.assert_allclose(states, memory, atol=2e-5)
-    both = tmp_path / "both.cpp"
-    both.write_text(f'#include "{path}"\nvoid fly(hover_state *s, const float *x, float *a) {{ hover(s, x, a); }}\n'
+    in_cpp = tmp_path / "both.cpp"
+    in_cpp.write_text(f'#include "{path}"\nvoid fly(hover_state *s, const float *x, float *a) {{ hover(s, x, a); }}\n'
                     "void begin(hover_state *s) { hover_reset(s); }\n")  # fmt: skip
-    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", both], check=True)
+    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", in_cpp], check=True)
 
 
 def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, episodes):
     runtime = pytest.importorskip("onnxruntime")
-    policy, obs, reset, actions, last = episodes
+    policy, obs, reset, actions, last_memory = episodes
     path = to_onnx(policy, tmp_path / "policy.onnx", meta)
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
     assert [(x.name, x.shape) for x in session.get_inputs()] == [
@@ -148,7 +148,7 @@ def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta,
         memory[reset[t]] = 0.0
         action, memory = session.run(None, {"observation": obs[t], "memory": memory})
         np.testing.assert_allclose(action, actions[t], atol=2e-5)
-    np.testing.assert_allclose(memory, last, atol=2e-5)
+    np.testing.assert_allclose(memory, last_memory, atol=2e-5)
 
 
 def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(
@@ -157,10 +157,10 @@ def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(
     obs, actions = observations_and_actions
     path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
     np.testing.assert_allclose(compile_header(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
-    both = tmp_path / "both.cpp"
-    both.write_text(f'#include "{to_c(policy, tmp_path / "policy.h", meta)}"\n#include "{path}"\n#include "{path}"\n'
+    in_cpp = tmp_path / "both.cpp"
+    in_cpp.write_text(f'#include "{to_c(policy, tmp_path / "policy.h", meta)}"\n#include "{path}"\n#include "{path}"\n'
                     "void fly(const float *x, float *a) { policy(x, a); hover_v2(x, a); }\n")  # fmt: skip
-    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", both], check=True)
+    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", in_cpp], check=True)
 
 
 def test_the_header_describes_inputs_and_outputs(tmp_path, policy, meta):

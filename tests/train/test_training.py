@@ -77,16 +77,16 @@ def checkpoint_arrays(folder):
 
 
 @contextlib.contextmanager
-def interrupted_after(iterations, monkeypatch, by=KeyboardInterrupt):
+def interrupted_after(iterations, monkeypatch, exception=KeyboardInterrupt):
     """Press Ctrl-C after some iterations, or raise another exception."""
-    n_shown = [0]
+    n_calls = [0]
 
     @contextlib.contextmanager
     def bar(*_):
         def show(*_):
-            n_shown[0] += 1
-            if n_shown[0] == iterations:
-                raise by
+            n_calls[0] += 1
+            if n_calls[0] == iterations:
+                raise exception
 
         yield show
 
@@ -112,8 +112,8 @@ def test_an_interrupted_run_resumes_bit_for_bit(uninterrupted_run, tmp_path, mon
 
 
 def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(uninterrupted_run, tmp_path, monkeypatch):
-    """A run that is killed after three of four iterations, which writes nothing any more, goes on from the second."""
-    with interrupted_after(3, monkeypatch, by=MemoryError), pytest.raises(MemoryError):
+    """A run that is killed after three of four iterations writes nothing at its end, and goes on from the second."""
+    with interrupted_after(3, monkeypatch, exception=MemoryError), pytest.raises(MemoryError):
         train_quietly(tmp_path, small_config(), checkpoint_every=1e-6)
     assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == 2
     lines = []
@@ -128,7 +128,7 @@ def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(uninterrupted_run,
 @pytest.mark.long("trains in a process of its own")
 def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
     """Sent SIGTERM twice, as ``timeout`` does, it ends with the status of that signal and continues from there."""
-    small = [
+    small_options = [
         "--worlds",
         "8",
         "--set",
@@ -139,7 +139,7 @@ def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
         "minibatches=1",
         "iterations=1000000",
     ]
-    options = ["--out", tmp_path, "--checkpoint-every", "0.01", *small]
+    options = ["--out", tmp_path, "--checkpoint-every", "0.01", *small_options]
     command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert "hover by ppo" in process.stdout.readline()
@@ -150,8 +150,8 @@ def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
         process.terminate()
         out = process.stdout.read()
     assert process.returncode == 143
-    ended = int(re.search(r"interrupted after iteration (\d+); wrote", out)[1])
-    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == ended > 0
+    last_iteration = int(re.search(r"interrupted after iteration (\d+); wrote", out)[1])
+    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == last_iteration > 0
 
 
 def test_a_later_policy_within_two_standard_errors_is_kept():
@@ -181,8 +181,8 @@ def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch
     result = train(config, tmp_path, evaluation_worlds=64, log=lines.append, progress=False)
     curve = read_curve(tmp_path)
     checks = [point["check"] for point in curve]
-    least = runs.least_kept_success(max(checks), 64)
-    best = max(i for i, check in enumerate(checks) if check >= least)
+    smallest_kept = runs.least_kept_success(max(checks), 64)
+    best = max(i for i, check in enumerate(checks) if check >= smallest_kept)
     assert best < len(checks) - 1
     assert [i for i, point in enumerate(curve) if point["kept"]][-1] == best
     assert any(f"kept the policy of iteration {best}: later ones succeeded less often on 64 " in x for x in lines)
@@ -293,7 +293,7 @@ def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path, m
     )
     np.testing.assert_allclose(over_time["proximity"].sum(), point["reward proximity"], rtol=1e-5)
     # A policy that falls is paid until it crashes, and never after that.
-    fallen = plot_episode(make("hover", 8, seconds=2.0), Always(-jnp.ones(4)), tmp_path / "fallen.png")
+    fallen = plot_episode(make("hover", 8, seconds=2.0), ConstantPolicy(-jnp.ones(4)), tmp_path / "fallen.png")
     assert fallen["proximity"][0] > 0
     assert fallen["proximity"][-1] == 0
     np.testing.assert_allclose(fallen["crash"].sum(), -10.0, rtol=1e-6)
@@ -436,7 +436,7 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
 
 
 def make_interrupt(name, count):
-    """Return a function for ``sys.settrace`` that presses Ctrl-C where a function of that name is called again."""
+    """Return a function for ``sys.settrace`` that presses Ctrl-C at the ``count``-th call of a function of a name."""
     calls = [0]
 
     def trace(frame, event, _):
@@ -503,7 +503,7 @@ def test_a_policy_is_restored_unchanged(uninterrupted_run):
         np.testing.assert_array_equal(a, b)
 
 
-class Always(PyTree):
+class ConstantPolicy(PyTree):
     """Policy with the same action for all observations."""
 
     action: jax.Array
@@ -516,7 +516,7 @@ class Always(PyTree):
 
 def test_evaluation_uses_tolerance_and_hold_of_the_task():
     """A policy of zeros hovers at its start, so it fails unless the goal is there."""
-    idle, falling = Always(jnp.zeros(4)), Always(-jnp.ones(4))
+    idle, falling = ConstantPolicy(jnp.zeros(4)), ConstantPolicy(-jnp.ones(4))
     found = evaluate(make("hover", 16, seconds=2.0, reach=1.0), idle)
     assert found["success"] == 0
     assert 0.3 < found["error"] < 3
@@ -531,7 +531,7 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
         r"crashed 100\.0%, on average after 0\.\d+ s, so there is no mean error", describe_outcome(crashed, "m")
     )
     assert re.match(r"mean error 0\.\d+ m/s, ", describe_outcome(evaluate(easy, idle), "m/s"))
-    lost = evaluate(easy, Always(jnp.full(4, jnp.nan)))
+    lost = evaluate(easy, ConstantPolicy(jnp.full(4, jnp.nan)))
     assert lost["nonfinite"] == 1
     assert "of all worlds 100.0% became non-finite" in describe_outcome(lost, "m")
 
@@ -540,18 +540,18 @@ def test_advantages_are_sums_of_discounted_errors(rng):
     """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
     rates = stack_swept_values((ppo.Config(discount=0.9, gae_lambda=0.7),))
     reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
-    last = rng.normal(size=(3, 1)).astype(np.float32)
-    over = np.zeros((6, 3, 1), bool)
-    over[2, 0], over[5, 1] = True, True
-    sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, over)
-    advantages, returns = jax.jit(ppo._estimate_advantages)(sample, last, take_seed(rates, 0))
-    after = np.concatenate([value[1:], last[None]])
-    delta = reward + 0.9 * after * ~over - value
+    last_value = rng.normal(size=(3, 1)).astype(np.float32)
+    done = np.zeros((6, 3, 1), bool)
+    done[2, 0], done[5, 1] = True, True
+    sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, done)
+    advantages, returns = jax.jit(ppo._estimate_advantages)(sample, last_value, take_seed(rates, 0))
+    next_value = np.concatenate([value[1:], last_value[None]])
+    delta = reward + 0.9 * next_value * ~done - value
     expected = np.zeros_like(delta)
     for t, world in np.ndindex(6, 3):
         for k in range(t, 6):
             expected[t, world] += (0.9 * 0.7) ** (k - t) * delta[k, world]
-            if over[k, world]:
+            if done[k, world]:
                 break
     np.testing.assert_allclose(advantages, expected, atol=1e-5)
     np.testing.assert_allclose(returns, expected + value, atol=1e-5)
@@ -598,14 +598,14 @@ def test_ppo_finds_the_action_that_pays():
     """With a reward that is largest at 0.5, thirty iterations move the action from 0 to 0.5."""
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Pays(Hover):
+    class RewardedAction(Hover):
         """Hovering with a reward for the action only."""
 
         def rewards(self, data, action, last_action):
             return {"action": -jnp.sum((action - 0.5) ** 2, axis=-1)}
 
     base = make("hover", 128, freq=500, seconds=0.1)
-    env = AutoReset(DroneEnv(base.sim, Pays(seconds=0.1), freq=500))
+    env = AutoReset(DroneEnv(base.sim, RewardedAction(seconds=0.1), freq=500))
     config = ppo.Config(iterations=30, n_steps=16, minibatches=4, hidden=(16,), init_std=0.3, discount=0.5)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     assert np.abs(Policies(learner.as_policy())(learner.env.obs)).max() < 0.1
@@ -643,7 +643,7 @@ class Sight(Hover):
     def observe(self, data):
         return {"height": data.states.pos[..., 2:]}
 """
-"""Task whose observations are others than those of hover."""
+"""Task with other observations than hover."""
 
 
 def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
