@@ -182,7 +182,7 @@ def compare_weights(weights: dict[int, tuple[np.ndarray, np.ndarray]], args: arg
 
 
 def build_case(name: str, devices: list[jax.Device], is_small: bool) -> Case:
-    """Return a case on some devices."""
+    """Return a case on some devices; if ``is_small``, with few worlds, and with 4 steps or 4 x 4 pixels."""
     (make_case, size), n = CASES[name], len(devices)
     n_worlds = size.n_small_worlds if is_small else size.n_worlds
     first_device = next(device for device in devices if device.process_index == jax.process_index())
@@ -277,12 +277,12 @@ def training_case(
     """Return the case of iterations of a training of ``hover`` with all its seeds."""
     recipe = TrainConfig.create("hover", "ppo" if algorithm is ppo else "apg", n_worlds=n_worlds).algorithm_config()
     recipe = recipe if small_size is None else dataclasses.replace(recipe, n_steps=small_size)
-    base = envs.make("hover", n_seeds * n_worlds, **device_options)
-    env, recipes = envs.AutoReset(base) if algorithm is ppo else base, (recipe,) * n_seeds
-    replicated = replicated_sharding(base.sim)
+    base_env = envs.make("hover", n_seeds * n_worlds, **device_options)
+    env, recipes = envs.AutoReset(base_env) if algorithm is ppo else base_env, (recipe,) * n_seeds
+    replicated = replicated_sharding(base_env.sim)
     keys = distribute(jax.random.split(jax.random.key(0), n_seeds), replicated)
     shapes = jax.eval_shape(partial(algorithm.init, env, recipes), keys)
-    shardings = learner_shardings(shapes, base.sim, n_seeds)
+    shardings = learner_shardings(shapes, base_env.sim, n_seeds)
     learner = jax.jit(algorithm.init, static_argnums=(0, 1), out_shardings=shardings)(env, recipes, keys)
     iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
     n_units = n_seeds * n_worlds * recipe.n_steps
@@ -290,18 +290,18 @@ def training_case(
 
 
 def gradient_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:
-    """Return the case of gradients of distances after some steps with respect to attitude commands."""
+    """Return the case of gradients of squared distances after some steps with respect to attitude commands."""
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
     start_hovering(sim, "attitude")
     step, zeros = sim.build_step_fn(), sim.step_fn.zeros(sim.data)
 
-    def distance(cmd: Any, start: Any) -> Any:
+    def squared_distance(cmd: Any, start: Any) -> Any:
         end = step(functional.attitude_control(start, cmd), n_steps, zeros)
         return jnp.sum((end.states.pos - start.states.pos) ** 2)
 
     cmd = 1.01 * sim.data.controls.attitude.staged_cmd
-    return compile_case(jax.jit(jax.grad(distance)), cmd, sim.data, n_units=n_worlds * n_steps)
+    return compile_case(jax.jit(jax.grad(squared_distance)), cmd, sim.data, n_units=n_worlds * n_steps)
 
 
 def depth_case(n_worlds: int, device_options: dict[str, Any], small_size: int | None) -> Case:

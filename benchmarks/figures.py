@@ -360,7 +360,7 @@ def _add_atoms(code: Code, node: ast.AST, counter: Iterator[int], functions: dic
     Args:
         code: Code of the source so far.
         node: The node.
-        counter: Number of the next function.
+        counter: Iterator over the numbers of functions.
         functions: Number of the function that binds each local variable of the functions around the node.
     """
     if isinstance(node, ast.Import | ast.ImportFrom):
@@ -370,12 +370,12 @@ def _add_atoms(code: Code, node: ast.AST, counter: Iterator[int], functions: dic
     if isinstance(node, FUNCTION_NODES):
         functions = functions | dict.fromkeys(_local_variables(node), next(counter))
     code.atoms.append(Atom(type(node).__name__))
-    is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+    can_have_docstring = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
     for field, value in ast.iter_fields(node):
         if field in ("returns", "type_comment", "kind", "ctx") or (field == "annotation" and isinstance(node, ast.arg)):
             continue
         values = list(value) if isinstance(value, list) else [value]
-        if field == "body" and is_documented and ast.get_docstring(node, clean=False) is not None:  # type: ignore[arg-type]
+        if field == "body" and can_have_docstring and ast.get_docstring(node, clean=False) is not None:  # type: ignore[arg-type]
             values = values[1:]
         if field == "exc" and isinstance(value, ast.Call):
             values = [value.func]

@@ -2,7 +2,8 @@
 
     python benchmarks/live.py [--seconds 20] [--drones 30] [--only max recorded pictures jitter]
 
-- max: as fast as possible, setpoints of all drones renewed at every control step; simulated seconds per second
+- max: as fast as possible, with new setpoints of all drones at every control step; ``factor`` is the simulated time
+  divided by the real time
 - recorded: like max, with 50 samples per simulated second written to a file
 - pictures: in real time, with a page in a server that one client reads, and 50 pictures a second
 - jitter: in real time without viewers; 99.9% of control steps are late by at most ``lateness_999_ms``

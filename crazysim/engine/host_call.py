@@ -99,8 +99,10 @@ class _Layout:
     """Pieces of memory that a call writes, and the places of its results in them."""
 
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
+        """Choose a place for each result, given its key, shape and type. Small results share one piece of memory."""
         self.places: list[_ArrayPlace] = []
         self.piece_sizes: list[int] = []
+        """Size of each piece, bytes."""
         rounded_sizes = [
             -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
         ]
@@ -113,7 +115,8 @@ class _Layout:
                 self.places.append(_ArrayPlace(len(self.piece_sizes), 0, shape, dtype))
                 self.piece_sizes.append(size)
         self.place_by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
-        self.offset_of_result = [(x.piece, x.offset) for x in self.places]
+        self.piece_offsets = [(x.piece, x.offset) for x in self.places]
+        """Piece of each result, and offset in that piece, bytes."""
 
 
 class CallResults:
@@ -127,7 +130,7 @@ class CallResults:
         addresses = [_address(x) for x in self._memory]
         self._paddings = [-address % ALIGNMENT_BYTES for address in addresses]
         aligned_addresses = [address + padding for address, padding in zip(addresses, self._paddings, strict=True)]
-        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.offset_of_result]
+        self.addresses = [aligned_addresses[piece] + offset for piece, offset in layout.piece_offsets]
 
     def array(self, key: Any) -> NDArray:
         """Return the array of a key: a copy if arrays share memory, so that it does not keep the other arrays alive."""

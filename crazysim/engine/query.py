@@ -29,8 +29,9 @@ returns a tree of arrays with a leading axis for the drones."""
 class QueryResults(PyTree):
     """Results of all queries, flattened to one axis for each drone."""
 
-    rows: dict[str, Array] = leaf("drone", 1)
-    """Results by name, the number of the query and of its array. (n_worlds, n_drones, k) each"""
+    arrays: dict[str, Array] = leaf("drone", 1)
+    """Results by name: the number of the query, and the number of the array in its result. (n_worlds, n_drones, k)
+    each"""
 
 
 def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
@@ -47,7 +48,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     """
     n_worlds, n_drones = data.states.pos.shape[:2]
     leaves, axes = jax.tree.leaves(data), Axes(data)
-    rows: dict[str, Array] = {}
+    arrays: dict[str, Array] = {}
     shapes, treedefs, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
         template = axes.treedef.unflatten(axes.unbatched_shapes(leaves, scope))
@@ -55,11 +56,11 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         names = [f"{number} {k}" for k in range(len(results))]
         drone_shapes = [x.shape[1:] if scope == "world" else x.shape for x in results]
         for name, x, shape in zip(names, results, drone_shapes, strict=True):
-            rows[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
+            arrays[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
         shapes.append(dict(zip(names, drone_shapes, strict=True)))
         treedefs.append(treedef)
         stages.append(Stage(_make_writer(fn, names, scope), scope, name=f"query {number}", phase="after"))
-    extended_data = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
+    extended_data = data.replace(plugins={RECORD_NAME: QueryResults(arrays)})
     extended_leaves, treedef = jax.tree.flatten(extended_data)
     program = optimise(lower_stages(stages, extended_data))
     if program.unfused_stages:
@@ -67,10 +68,10 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     packed = [jnp.concatenate([extended_leaves[i].ravel() for i in program.packed])] if program.packed else []
     written, _ = adapt_to_data_leaves(program, fused.build(program, Location(platform)))([*extended_leaves, *packed], 0)
     data_after = treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written))
-    rows = data_after.plugins[RECORD_NAME].rows
+    arrays = data_after.plugins[RECORD_NAME].arrays
     return [
         query_treedef.unflatten(
-            [rows[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()]
+            [arrays[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()]
         )
         for query_treedef, query_shapes in zip(treedefs, shapes, strict=True)
     ]
@@ -80,10 +81,10 @@ def _make_writer(fn: Callable[[SimData], Any], names: list[str], scope: str) -> 
     """Return the function of a stage that writes the results of ``fn`` to the data."""
 
     def write(data: SimData) -> SimData:
-        rows = data.plugins[RECORD_NAME].rows
+        arrays = data.plugins[RECORD_NAME].arrays
         results = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
         new_arrays = {name: x.reshape(shape) for name, x in zip(names, results, strict=True)}
-        return data.replace(plugins={RECORD_NAME: QueryResults(rows | new_arrays)})
+        return data.replace(plugins={RECORD_NAME: QueryResults(arrays | new_arrays)})
 
     return write

@@ -40,7 +40,7 @@ def rollout(
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:
-    """Return the data after some control steps, and the records of these steps.
+    """Return the data after some control steps, and the arrays that were recorded after these steps.
 
     A control step evaluates the policy, stages its command, and takes ``n_substeps`` physics steps. The function is
     pure and can be used inside jit, vmap and grad. Leaves that no step writes, mainly parameters, are constants of the
@@ -53,12 +53,12 @@ def rollout(
         params: Parameters of the policy.
         n_control_steps: Number of control steps; a multiple of ``every``.
         n_substeps: Physics steps of a control step.
-        keep: ``keep(data)`` returns what to record after a control step.
-        every: Number of control steps from one record to the next.
+        keep: ``keep(data)`` returns the arrays to record after a control step.
+        every: Number of control steps from one recording to the next.
         zeros: Result of ``step.zeros(data)`` from before ``data`` was traced.
 
     Returns:
-        The data, and the records with a leading time axis. (n_control_steps // every, ...)
+        The data, and the recorded arrays with a leading time axis. (n_control_steps // every, ...)
     """
     n_control_steps = positive_integer("n_control_steps", n_control_steps)
     n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)
@@ -75,12 +75,14 @@ def rollout(
         flat_after = step.advance(flat_before.stage_command(data, command), n_substeps)
         return [flat_after.leaves[i] for i in carried]
 
-    def advance_to_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
+    def advance_and_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
         return carry, keep(flat.replace(carried, carry).data())
 
-    carry, records = jax.lax.scan(advance_to_record, [flat.leaves[i] for i in carried], length=n_control_steps // every)
-    return flat.replace(carried, carry).data(), records
+    carry, recordings = jax.lax.scan(
+        advance_and_record, [flat.leaves[i] for i in carried], length=n_control_steps // every
+    )
+    return flat.replace(carried, carry).data(), recordings
 
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
@@ -108,11 +110,11 @@ def run_rollout(
         return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
     steps_per_piece = max(n_control_steps // every // 100, 1) * every
     n_pieces, remainder = divmod(n_control_steps, steps_per_piece)
-    records_by_piece = []
+    recordings_by_piece = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
         for n in [steps_per_piece] * n_pieces + [remainder] * (remainder > 0):
-            data, records = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
-            jax.block_until_ready(records)
-            records_by_piece.append(records)
+            data, recordings = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
+            jax.block_until_ready(recordings)
+            recordings_by_piece.append(recordings)
             bar.update(n)
-    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *records_by_piece)
+    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *recordings_by_piece)

@@ -55,7 +55,7 @@ class FlatData:
 
     def replace(self, indices: Sequence[int], values: Sequence[Any]) -> FlatData:
         """Return the data with other values of some leaves."""
-        if any(i in rows.members for rows in self.plan.rows for i in indices):
+        if any(i in rows.source_leaves for rows in self.plan.rows for i in indices):
             raise ValueError(
                 "expected leaves that are not in rows, got one that is. Name it in separate= of Step.flatten."
             )
@@ -86,7 +86,7 @@ def _read_leaf(leaves: Any, plan: Plan, i: int) -> Any:
     x = leaves[i]
     if x is not None or not plan.rows:
         return x
-    rows = next(rows for rows in plan.rows if i in rows.members)
+    rows = next(rows for rows in plan.rows if i in rows.source_leaves)
     x = rows.unpack(leaves[rows.leaf], i)
     return x.reshape(x.shape[0], *x.shape[2:]) if i in rows.program.views else x
 
@@ -266,7 +266,7 @@ class Step:
         """Return the leaves of the data, followed by the leaves that the plan adds."""
         packed = [self._pack_cache([leaves[i] for i in plan.packed])] if plan.packed else []
         rows = [rows.pack(view_leaves(rows.program.views, leaves)) for rows in plan.rows]
-        in_rows = [i for rows in plan.rows for i in rows.members]
+        in_rows = [i for rows in plan.rows for i in rows.source_leaves]
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _make_false_flag(self, old_flag: Any) -> Any:

@@ -54,8 +54,8 @@ class DerivativeKernels:
     def tangent_kernel(self, perturbed: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
         """Return the kernel that computes the steps and the tangents of some leaves; None if there is no such kernel.
 
-        It takes all leaves, tangents by leaf, the number of steps, the number of batches, and the shapes and types of
-        the tangents after the steps. It returns the tangents after the steps.
+        It takes all leaves, tangents by leaf, the number of steps, the number of batches (see
+        ``DerivativeSpec``), and the shapes and types of the tangents after the steps. It returns these tangents.
         """
         compiled = self._compile("jvp", add_tangents, kernel.write_kernel, perturbed, platform)
         return None if compiled is None else partial(_launch_tangents, self, *compiled)

@@ -93,9 +93,9 @@ class DerivativeSpec(NamedTuple):
     n_steps: int
     """Number of steps."""
     array_leaves: tuple[int, ...]
-    """Leaves that are arrays; the others are None."""
+    """Indices of the leaves that are arrays; the other leaves are None."""
     perturbed: tuple[int, ...]
-    """Leaves whose tangents are operands, or whose cotangents are results."""
+    """Indices of the leaves whose tangents are operands, or whose cotangents are results."""
     n_leaves: int
     """Number of all leaves."""
     n_batches: int = 1

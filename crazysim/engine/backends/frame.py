@@ -109,9 +109,9 @@ def make_kernel(
         lane_lines: Lines that compute the numbers of a lane.
         blocks: Blocks of a step, whose operations are counted.
         declarations: Lines before the kernel.
-        inputs: Leaves that it reads.
-        outputs: Leaves that it writes.
-        in_place: Leaves that it updates in place.
+        inputs: Indices of the leaves that it reads.
+        outputs: Indices of the leaves that it writes.
+        in_place: Indices of the leaves that it updates in place.
         group_size: Drones of a world that read each other's numbers.
         in_memory: True if the numbers of a world are in memory, which is possible only on the host.
         n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.

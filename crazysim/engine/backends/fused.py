@@ -209,7 +209,7 @@ def _run_without_rows(program: Program, unpacked_program: Program, location: Loc
         built_runs[:] = built_runs or [build(unpacked_program, location)]
         packed, unpacked_leaves = packed_rows(program), list(leaves)
         for rows in packed:
-            for i in rows.members:
+            for i in rows.source_leaves:
                 unpacked_leaves[i] = rows.unpack(leaves[rows.leaf], i)
         results, flagged = built_runs[0](unpacked_leaves[: len(unpacked_program.leaves)], n_steps)
         leaves_after = replace_leaves(unpacked_leaves, unpacked_program.written_leaves, results)

@@ -52,12 +52,14 @@ class KernelBody:
         self.writer = Writer(self.exchange)
         self.step_segments = [s for s in program.fused_segments if s.phase == "each"]
         self.stored_slots = _written_slots(program)
+        """Slots whose numbers are stored at the end."""
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
         """Expression of each number in the source."""
         self.initial_values: dict[Slot, str] = {}
         """Expression of the initial value of each number that stages write."""
-        self._n_shared = 0
+        self._n_shared_lines = 0
+        """Number of lines before the loop over lanes."""
 
     def write_loads(self, registers: int | None = None) -> list[list[str]]:
         """Write loads and the stages before the steps, and return the names of hoisted values by segment of the loop.
@@ -82,7 +84,7 @@ class KernelBody:
                 names[slot] = (
                     f"SHARED(p{rank[slot[0]]}, {slot[1]})" if is_read_at_use else _load_expression(program, slot)
                 )
-        self._n_shared = len(writer.lines)
+        self._n_shared_lines = len(writer.lines)
         exchange.open_loop(writer, 1)
         lane_slots = [slot for slot in slots if slot not in shared_slots and (slot not in written or slot in loaded)]
         for i in dict.fromkeys(i for i, _ in lane_slots if i not in program.rows):
@@ -147,13 +149,13 @@ class KernelBody:
 
         Args:
             pointers: Declarations of inputs and outputs.
-            inputs: Leaves that it reads.
-            outputs: Leaves that it writes.
-            in_place: Leaves that it updates in place.
+            inputs: Indices of the leaves that it reads.
+            outputs: Indices of the leaves that it writes.
+            in_place: Indices of the leaves that it updates in place.
             blocks: Blocks of a step, whose operations are counted.
             n_stored: Numbers that each lane stores for each step; None for a kernel without backward pass.
         """
-        shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
+        shared, code = self.writer.lines[: self._n_shared_lines], self.writer.lines[self._n_shared_lines :]
         return make_kernel(
             self.target, pointers, shared, code, blocks, [*self.writer.tables, *self.exchange.declarations],
             inputs=inputs, outputs=outputs, in_place=in_place, group_size=self.program.group_size,
@@ -196,7 +198,7 @@ def require_source(program: Program) -> None:
 
 
 def needed_leaves(program: Program) -> tuple[int, ...]:
-    """Return the leaves that a kernel reads."""
+    """Return the indices of the leaves that a kernel reads."""
     return tuple(sorted({leaf for leaf, _ in _loaded_slots(program)}))
 
 
@@ -271,7 +273,7 @@ def write_segment(
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
-    """Return the numbers that no stage uses at each step, but either slower stages or the check after the loop.
+    """Return the slots that are used either by stages at ticks or by the check after the loop, but not at each step.
 
     Unless a stage writes them, they are loaded where they are used, and take no register in between.
     """

@@ -49,11 +49,11 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     if segment.scope == "world" and leaf.scope == "drone":
         number, k = divmod(k, leaf.size)
         drone = f" of drone {number}"
-    members = program.packed if leaf.name == PACKED_LEAF_NAME else leaf.row_leaves
-    for member in members:  # the number is an element of one of the leaves that are packed in this leaf
-        if k < program.leaves[member].size:
-            return f"{program.leaves[member].name}[{k}]{drone}"
-        k -= program.leaves[member].size
+    source_leaves = program.packed if leaf.name == PACKED_LEAF_NAME else leaf.row_leaves
+    for source in source_leaves:  # the number is an element of one of the leaves that are packed in this leaf
+        if k < program.leaves[source].size:
+            return f"{program.leaves[source].name}[{k}]{drone}"
+        k -= program.leaves[source].size
     return f"{program.leaves[i].name}[{k}]{drone}"
 
 

@@ -228,18 +228,22 @@ def _lax() -> Any:
 TABLE: Mapping[str, OperationForm] = {row.name: row for row in _rows()}
 """All operations by name.
 
-``barrier`` separates stages: values that are used after it are computed once, before it. ``when(mask, *old)`` returns
-the outputs of its block where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block
-``length`` times; ``while(*carry)`` runs its second block as long as its first block returns true. ``custom_jvp(*args,
-derivative=)`` runs its block, and has a custom derivative. ``over_others(*published, reduce=, n_members=)`` runs its
-block for each drone of the world: the inputs of the block are the numbers that this drone published, and whether it is
-the reading drone itself; ``reduce`` names the operation that combines each output. ``over_others`` never occurs in an
-inner block. ``threefry2x32`` is the cipher of JAX's random numbers. ``opaque_copy(x, part=)`` is x as a new value in
-each part, so that the numbers that depend on it are recomputed; compilers on the host may still merge these values.
-``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is the entry of a table at the
-sum of an int32 index (a multiple of four if ``aligned``) and a constant offset; the sum must be in bounds.
-``any_lane`` is true where its operand is true; a target may also return true in all lanes of a vector if it is true in
-any of them.
+- ``barrier`` separates stages: values that are used after it are computed once, before it.
+- ``when(mask, *old)`` returns the outputs of its block where the mask is true, and the old numbers elsewhere.
+- ``loop(*carry, length=)`` runs its block ``length`` times.
+- ``while(*carry)`` runs its second block as long as its first block returns true.
+- ``custom_jvp(*args, derivative=)`` runs its block, and has a custom derivative.
+- ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the world. The inputs of the block
+  are the numbers that this drone published, and whether it is the reading drone itself. ``reduce`` names the operation
+  that combines each output. ``over_others`` never occurs in an inner block.
+- ``threefry2x32`` is the cipher of JAX's random numbers.
+- ``opaque_copy(x, part=)`` is x as a new value in each part, so that the numbers that depend on it are recomputed.
+  Compilers on the host may still merge these values.
+- ``table(numbers=)`` is a table of constants.
+- ``lookup(table, index, offset=, aligned=)`` is the entry of a table at the sum of an int32 index (a multiple of four
+  if ``aligned``) and a constant offset. The sum must be in bounds.
+- ``any_lane`` is true where its operand is true. A target may also return true in all lanes of a vector if the operand
+  is true in any of them.
 
 Comparisons and changes of sign cost nothing: comparisons are counted with the selections that use them, and a change of
 sign is part of another operation. The cost of a function is the cost of a hardware approximation and a step that

@@ -20,11 +20,11 @@ class Group(NamedTuple):
     stages: tuple[Stage, ...]
     """The stages, in order."""
     owned_leaves: frozenset[int] | None
-    """Leaves whose new values are taken from this group; None for all leaves that it writes."""
+    """Indices of the leaves whose new values are taken from this group; None for all leaves that it writes."""
 
 
 class _Access(NamedTuple):
-    """Leaves that a stage reads and writes, and the populations that it acts on."""
+    """Indices of the leaves that a stage reads and writes, and the populations that it acts on."""
 
     read_leaves: frozenset[int]
     written_leaves: frozenset[int]

@@ -29,7 +29,7 @@ class RelativeAxes(Axes):
         self.original = Axes(data)
         """Batch axes as declared."""
         self.views = frozenset(i for i, scope in enumerate(self.scopes) if has_members(scope) and scope != population)
-        """Leaves of other populations."""
+        """Indices of the leaves of other populations."""
         self.scopes = [
             "world" if i in self.views else "drone" if scope == population else scope
             for i, scope in enumerate(self.scopes)

@@ -76,8 +76,8 @@ def lower_stages(
     core = axes.leaf_indices.core
     if watched is None or core.nonfinite in program.written_leaves:
         return program
-    members = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked = sorted((members | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
+    lane_leaves = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
+    checked = sorted((lane_leaves | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
     return dataclasses.replace(
         program, check_segment=_make_finite_check(axes, leaves, core.nonfinite, core.steps, checked)
     )

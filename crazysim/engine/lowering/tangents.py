@@ -63,8 +63,8 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
 
 
 def _tangent_leaf(leaf: Leaf) -> Leaf:
-    is_batched = leaf.scope in ("drone", "world")
-    scope, shape = (leaf.scope, leaf.shape) if is_batched else ("world", (1, 1, *leaf.shape))
+    has_world_axis = leaf.scope in ("drone", "world")
+    scope, shape = (leaf.scope, leaf.shape) if has_world_axis else ("world", (1, 1, *leaf.shape))
     return Leaf(f"tangent of {leaf.name}", scope, shape, leaf.dtype)
 
 

@@ -26,7 +26,7 @@ class TracedStage:
         self.avals = axes.unbatched_shapes(list(leaves), stage.scope)
         """Shapes and types of all leaves, as the stage receives them."""
         self.written_leaves: list[int] = []
-        """Leaves that it writes: the outputs of ``fn``."""
+        """Indices of the leaves that it writes: the outputs of ``fn``."""
 
         def apply(values: list[Any]) -> list[Any]:
             data_after = stage.fn(axes.treedef.unflatten(values))
@@ -44,9 +44,11 @@ class TracedStage:
             when = None
         used = _used_inputs(fn) | (_used_inputs(when) if when is not None else set())
         self.input_leaves = sorted(used)
-        """Leaves that it reads: the inputs of ``fn`` and ``when``."""
+        """Indices of the leaves that it reads: the inputs of ``fn`` and ``when``."""
         self.fn = jaxcompat.select_inputs(fn, self.input_leaves)
+        """Jaxpr of the function, from ``input_leaves`` to ``written_leaves``."""
         self.when = jaxcompat.select_inputs(when, self.input_leaves) if when is not None else None
+        """Jaxpr of the condition, a function of ``input_leaves``; None if the stage acts at every step."""
         self.segments: dict[Any, Any] = {}
         """Segments that the stage was lowered to. The keys hold everything else that lowering depends on."""
 

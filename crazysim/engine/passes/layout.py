@@ -55,14 +55,14 @@ def pack_rows(program: Program, select_rows: Callable[[list[int]], list[int]]) -
     row_types = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in row_leaves}
     positions: dict[int, tuple[int, int, int]] = {}
     for row_type in dict.fromkeys(row_types.values()):
-        members = tuple([i for i in row_leaves if row_types[i] == row_type])
-        n_rows = sum(leaves[i].size for i in members)
+        source_leaves = tuple([i for i in row_leaves if row_types[i] == row_type])
+        n_rows = sum(leaves[i].size for i in source_leaves)
         first_row = 0
-        for i in members:
+        for i in source_leaves:
             positions[i] = (len(leaves), first_row, n_rows)
             first_row += leaves[i].size
-        n_lanes = leaves[members[0]].shape[0] * program.n_drones
-        leaves.append(Leaf("rows", row_type[0], (n_rows, n_lanes), row_type[1], members))
+        n_lanes = leaves[source_leaves[0]].shape[0] * program.n_drones
+        leaves.append(Leaf("rows", row_type[0], (n_rows, n_lanes), row_type[1], source_leaves))
 
     def move_slot(slot: Slot) -> Slot:
         leaf, k = slot
@@ -76,7 +76,7 @@ def pack_rows(program: Program, select_rows: Callable[[list[int]], list[int]]) -
 
 
 class PackedRows(NamedTuple):
-    """A leaf of rows. Its rows are the numbers of other leaves. Arrays have the shapes of the program's leaves."""
+    """A leaf of rows, which are the numbers of other leaves. Arrays have the shapes of the program's leaves."""
 
     program: Program
     """The program, after ``pack_rows``."""
@@ -84,8 +84,8 @@ class PackedRows(NamedTuple):
     """Index of the leaf of rows."""
 
     @property
-    def members(self) -> tuple[int, ...]:
-        """Leaves whose numbers are the rows, in order."""
+    def source_leaves(self) -> tuple[int, ...]:
+        """Indices of the leaves whose numbers are the rows, in order."""
         return self.program.leaves[self.leaf].row_leaves
 
     def pack(self, leaves: Sequence[Any]) -> Array:
@@ -96,14 +96,15 @@ class PackedRows(NamedTuple):
             x = jnp.broadcast_to(x, (x.shape[0], n_drones, *x.shape[2:]))
             return x.reshape(x.shape[0] * n_drones, -1).T
 
-        return jnp.concatenate([rows_of_leaf(leaves[i]) for i in self.members])
+        return jnp.concatenate([rows_of_leaf(leaves[i]) for i in self.source_leaves])
 
     def unpack(self, rows: Array, leaf: int) -> Array:
-        """Return the array of one of ``members``."""
-        sizes = {i: self.program.leaves[i].size for i in self.members}
-        first_row, member = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
-        x = rows[first_row : first_row + member.size].T.reshape(-1, self.program.n_drones, *member.shape[2:])
-        return x[:, :1] if member.scope == "world" else x
+        """Return the array of one of ``source_leaves``, from the rows."""
+        sizes = {i: self.program.leaves[i].size for i in self.source_leaves}
+        source, n_before = self.program.leaves[leaf], self.source_leaves.index(leaf)
+        first_row = sum(sizes[i] for i in self.source_leaves[:n_before])
+        x = rows[first_row : first_row + source.size].T.reshape(-1, self.program.n_drones, *source.shape[2:])
+        return x[:, :1] if source.scope == "world" else x
 
 
 def packed_rows(program: Program) -> list[PackedRows]:

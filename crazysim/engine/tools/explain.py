@@ -21,7 +21,7 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
         data: Data to step.
         measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
             and takes 256 steps.
-        zeros: As for ``Step``; with it, ``data`` may be shapes and types.
+        zeros: As in ``Step.__call__``; with it, ``data`` may be shapes and types.
     """
     plan = step.plan(data, zeros)
     lines = [f"engine: {plan.engine}" + (f" ({plan.engine_reason})" if plan.engine_reason else "")]
