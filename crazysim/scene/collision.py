@@ -114,7 +114,7 @@ def collision_model(
 
     Args:
         model: Compiled scene.
-        handles: Bodies with handles, in the order of ``data.objects``.
+        handles: Names of bodies with handles, in the order of ``data.objects``.
         drone_groups: Drones of each airframe.
     """
 
@@ -132,7 +132,7 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: Dr
 
     Args:
         model: Compiled scene.
-        handles: Bodies with handles, in the order of ``data.objects``.
+        handles: Names of bodies with handles, in the order of ``data.objects``.
         drone_groups: Drones of each airframe.
     """
 
@@ -151,7 +151,15 @@ def _build_model(
     is_included: Callable[[int], bool],
     is_drone_geom: Callable[[int], bool],
 ) -> CollisionModel:
-    """Return geoms of the scene if ``is_included``; of the first drone of each airframe if ``is_drone_geom``."""
+    """Return the geoms of floor and objects that are included, and the included geoms of a drone of each airframe.
+
+    Args:
+        model: Compiled scene.
+        handles: Names of bodies with handles, in the order of ``data.objects``.
+        drone_groups: Drones of each airframe.
+        is_included: Function from the id of a geom of floor or an object to True if it is included.
+        is_drone_geom: Function from the id of a geom of a drone to True if it is included.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     floor = []

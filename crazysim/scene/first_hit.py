@@ -72,7 +72,7 @@ class Target:
 
 
 class Hierarchy(NamedTuple):
-    """Hierarchy of the geoms that do not move, as tables in memory."""
+    """Hierarchy of the geoms that do not move, as tables in memory. Nodes are in the orders of ``build_hierarchy``."""
 
     codes: Array
     """Index of the surface of each geom, and index of its drone or ``NOT_A_DRONE``. (n, 2)"""
@@ -104,7 +104,7 @@ class Tables(NamedTuple):
     movable_geoms: Array
     """Movable geoms, world frame. (n_worlds * n_movable, 16)"""
     camera_poses: Array
-    """Position, and axes by rows, of the cameras. (n_worlds * n_cameras, 12)"""
+    """Position of each camera, m, and the matrix with its axes as columns, row by row. (n_worlds * n_cameras, 12)"""
     pixels: Array
     """Direction of each ray in the frame of its camera, and ``Ray.ignored_drone``. (n_cameras * n_pixels, 4)"""
 
@@ -205,9 +205,10 @@ class Targets:
             geom_pos = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3], dtype))
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
             local_middle, half = (jnp.asarray(x, dtype)[:, None] for x in (local_middle, half))
-            middle, reach = geom_pos + jnp.sum(axes * local_middle, axis=-1), jnp.sum(jnp.abs(axes) * half, axis=-1)
-            reach = reach + hierarchy.BOX_PADDING + 4 * jnp.finfo(dtype).eps * jnp.abs(middle)
-            boxes.append(jnp.concatenate([middle - reach, middle + reach], axis=-1))
+            middle = geom_pos + jnp.sum(axes * local_middle, axis=-1)
+            aligned_half = jnp.sum(jnp.abs(axes) * half, axis=-1)
+            aligned_half = aligned_half + hierarchy.BOX_PADDING + 4 * jnp.finfo(dtype).eps * jnp.abs(middle)
+            boxes.append(jnp.concatenate([middle - aligned_half, middle + aligned_half], axis=-1))
             size = jnp.broadcast_to(jnp.asarray(rows[:, 13:], dtype), (*geom_pos.shape[:2], 3))
             zero = jnp.zeros_like(geom_pos[..., :1])
             geoms.append(jnp.concatenate([geom_pos, zero, axes.reshape(*geom_pos.shape[:2], 9), size], axis=-1))
@@ -220,7 +221,7 @@ class Targets:
             boxes: Boxes of the nodes of the movable geoms in every world. (n_worlds, n_nodes, 6)
             links: From ``movable_nodes``.
             geoms: From ``movable_rows``.
-            camera_poses: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
+            camera_poses: As in ``Tables``. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
         fixed_hierarchy = self.build_fixed_hierarchy(camera_poses.dtype)
@@ -472,7 +473,7 @@ def _meets_box(
     high: Sequence[Array],
     scaled_origin: Sequence[Array],
     inverse_direction: Sequence[Array],
-    best: Array,
+    best_distance: Array,
 ) -> Array:
     """Return True where a ray meets a box before its best hit.
 
@@ -481,14 +482,14 @@ def _meets_box(
         high: Upper corner, m.
         scaled_origin: Origin of the ray times ``inverse_direction``.
         inverse_direction: Inverses of the components of the ray's direction.
-        best: Distance to the best hit so far, m.
+        best_distance: Distance to the best hit so far, m.
     """
     ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled_origin, inverse_direction, strict=True)]
     x, y, z = (_minimum(*pair) for pair in ends)
     near = _maximum(_maximum(x, y), z)
     x, y, z = (_maximum(*pair) for pair in ends)
     far = _minimum(_minimum(x, y), z)
-    return (near <= far) & (far >= 0) & (near <= best)
+    return (near <= far) & (far >= 0) & (near <= best_distance)
 
 
 def _nearer_hit(

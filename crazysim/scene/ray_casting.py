@@ -254,7 +254,7 @@ def _hit_rows(
     """Return the distance along each ray to its geom, and a function from distances to unit normals, world frame.
 
     Args:
-        surfaces: ``Targets.surfaces``, at least those of the geoms.
+        surfaces: ``Targets.surfaces``, at least the surfaces of the geoms.
         codes: Index of the surface of each geom in the first column. (n, 2)
         geom_index: Index of the geom of each ray, -1 for none. (...)
         rows: Rows of these geoms; see ``Target.table_row``. (..., 16)
@@ -390,7 +390,7 @@ class RayKernels:
     def node_boxes(self, targets: Targets, leaf_boxes: Array) -> tuple[Array, np.ndarray]:
         """Return the boxes of the nodes of the movable geoms in every world, (n_worlds, n_nodes, 6), and their links.
 
-        The nodes and links are those of ``Targets.movable_nodes``.
+        ``Targets.movable_nodes`` defines nodes and links.
 
         Args:
             targets: The geoms.

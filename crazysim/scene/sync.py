@@ -23,8 +23,8 @@ cameras."""
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
     """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data.
 
-    Writes the poses of drones and of objects with handles; then computes the poses of all bodies, cameras and lights,
-    and the contacts. Other mocap bodies keep their poses in ``mjx_data``.
+    Writes the poses of drones and of objects with handles (``Handle``). Then computes the poses of all bodies, cameras
+    and lights, and the contacts. Other mocap bodies keep their poses in ``mjx_data``.
 
     Args:
         data: Simulation. Quaternions are xyzw here and wxyz in MuJoCo.

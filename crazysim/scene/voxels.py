@@ -108,7 +108,7 @@ def _merge_along(boxes: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
     is_next = (boxes[1:, other_columns] == boxes[:-1, other_columns]).all(axis=1) & (
         boxes[1:, axis] == boxes[:-1, axis + 3] + 1
     )
-    first = np.concatenate([[True], ~is_next])
-    merged = boxes[first]
-    merged[:, axis + 3] = boxes[np.concatenate([first[1:], [True]]), axis + 3]
+    is_first = np.concatenate([[True], ~is_next])
+    merged = boxes[is_first]
+    merged[:, axis + 3] = boxes[np.concatenate([is_first[1:], [True]]), axis + 3]
     return merged

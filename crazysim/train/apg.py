@@ -103,7 +103,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
 def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and one update, and the metrics of the iteration. (n_seeds,) each
 
-    The metric ``finite`` is True if weights, optimiser state, statistics and loss are finite. The rollout starts where
+    The metric ``gradient`` is the norm of the gradient before it is limited; ``finite`` is True if weights, optimiser
+    state, statistics and loss are finite. The rollout starts where
     the previous rollout ended; worlds in which the episode is over start a new episode. A seed with a non-finite
     gradient keeps its weights and optimiser state. The scan stores its intermediates instead of recomputing them under
     ``jax.checkpoint``: tens of steps fit in memory.

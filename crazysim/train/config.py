@@ -226,7 +226,7 @@ class TrainConfig:
             resumed: Configuration of the run to continue, from which omitted values are taken; None for a new run.
             network: Custom network; None for the built-in one.
             devices: Devices over which the worlds are distributed: ``"all"``, their number, or their indices. Their
-                platform is that of ``options["device"]``, by default JAX's default platform. None for one device.
+                platform is the platform of ``options["device"]``, or JAX's default platform. None for one device.
         """
         entry = entry_of(task)
         stored_options = {} if resumed is None else resumed.options

@@ -312,8 +312,8 @@ class DistributedMlp(NamedTuple):
     def __call__(self, layers: Layers, x: Array) -> Array:
         """Return the outputs, (..., n_out), for inputs (n_steps, n_groups, k, n_drones, n_in) or (n_worlds, ..., n_in).
 
-        The second axis of a minibatch, groups of worlds, or the first axis of other inputs is distributed; if the
-        devices do not divide it, XLA computes the outputs.
+        A minibatch of PPO has the five axes, with k worlds of each group. The groups of a minibatch, or the
+        worlds of other inputs, are distributed; if the devices do not divide them, XLA computes the outputs.
         """
         axis = 1 if x.ndim == 5 else 0
         if x.shape[axis] % self.mesh.size:
@@ -386,7 +386,7 @@ _apply.defvjp(_forward, _backward)
 
 
 def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
-    """Return the arguments with a first axis of seeds; those with True in the tree ``batched`` already have it."""
+    """Return the arguments with a first axis of seeds; arguments that are True in ``batched`` already have it."""
 
     def stack(x: Array, is_stacked: bool = False) -> Array:
         return x if is_stacked else jnp.broadcast_to(x, (n_seeds, *x.shape))

@@ -282,7 +282,7 @@ def forward(
         network: The network.
         weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (..., n_obs)
-        memory: Memory before the step. (..., ...) each
+        memory: Memory before the step: arrays of ``initial_memory`` with the leading axes of ``obs``.
         apply_layers: Function of layers and features that returns the outputs.
     """
     features, memory = _batch_apply(network, weights, obs.ndim - 1)(obs, memory)
@@ -298,7 +298,7 @@ def unroll(
         network: The network.
         weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (n_steps, ..., n_obs)
-        memory: Memory before the first step. (..., ...) each
+        memory: Memory before the first step: arrays of ``initial_memory`` with the leading axes of ``obs[0]``.
         done: True where an episode ended with the step; the next step begins with the initial memory. (n_steps, ...)
         apply_layers: Function of layers and features that returns the outputs.
     """
@@ -367,7 +367,7 @@ class Policy(PyTree):
 
         Args:
             obs: Observations by name. (..., k) each
-            memory: Memory before the step, (..., ...) each; ``()`` for a policy without memory.
+            memory: Memory before the step, with the leading axes of ``obs``; ``()`` for a policy without memory.
         """
         output, memory = forward(
             self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory

@@ -142,7 +142,7 @@ class Sample(PyTree):
     """Transitions of a rollout; leading axes (n_steps, n_worlds, n_drones)."""
 
     obs: Array
-    """Normalised observations; those of the policy come first."""
+    """Normalised observations; the policy's observations come first."""
     action: Array
     """Actions before clipping."""
     log_prob: Array
@@ -201,7 +201,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite; ``ratio_off`` is the
-    mean distance of the probability ratio from 1.
+    mean distance of the probability ratio from 1; ``value_error`` is the mean value loss.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, swept_values = learner.agents.replace(key=key), stack_swept_values(configs)
@@ -348,7 +348,11 @@ def _estimate_advantages(samples: Sample, last_value: Array, swept_values: Swept
 def _run_epochs(
     agent: Agent, parameters: Any, data: Any, memory: Any, swept_values: SweptValues, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
-    """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
+    """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed.
+
+    ``data`` is samples, advantages and value targets, (n_steps, n_worlds, n_drones, ...) each; ``memory`` is as for
+    ``_update_agent``.
+    """
     n_worlds, network, n_obs, apply_layers = data[1].shape[1], agent.network, agent.n_obs, agent.apply_layers
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
     transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
@@ -357,7 +361,7 @@ def _run_epochs(
         """Return the samples of the worlds of a minibatch, and their memories before the rollout.
 
         Args:
-            worlds: Indices of worlds in each group. (n_groups, k)
+            worlds: Indices of the k worlds of each group that are in the minibatch. (n_groups, k)
 
         Returns:
             Samples (n_steps, n_groups, k, n_drones, ...) and memories (n_groups, k, n_drones, ...).

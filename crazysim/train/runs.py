@@ -63,7 +63,7 @@ def run(
         task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task`` such as
             ``TwoHoops(radius=0.4)``.
         folder: Folder of the run; None for ``out/NAME``.
-        resume: True to continue from the checkpoint in the folder; omitted settings are those of the checkpoint.
+        resume: True to continue from the checkpoint in the folder; omitted settings come from the checkpoint.
         film: True to write a film.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.

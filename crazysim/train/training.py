@@ -67,7 +67,7 @@ class TrainResult:
     folder: Path
     """Folder of the files of the run."""
     metrics: dict[str, float]
-    """Metrics of the kept policy: those of ``evaluate`` on held-out initial states; ``iteration``, the number of
+    """Metrics of the kept policy: the metrics of ``evaluate`` on held-out initial states; ``iteration``, the number of
     iterations that trained it; ``check``, its success on the check set. Metrics of the whole run: ``seconds``,
     duration, s; ``compile_seconds``, the part for compilation, s; ``env_steps``, environment steps of all drones."""
     policy: Policy
@@ -144,8 +144,8 @@ def train_many(
     if checkpoint_every is not None:
         checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
     metadata = {name: _run_metadata(config) for name, config in configs.items()}
-    code = next(iter(metadata.values()))["code"]
-    stored_arrays, runs, stored_code, seconds_before = _read_run(path, configs) if resume else ({}, {}, code, 0.0)
+    code_hash = next(iter(metadata.values()))["code"]  # of the task
+    stored_arrays, runs, stored_hash, seconds_before = _read_run(path, configs) if resume else ({}, {}, code_hash, 0.0)
     trainings = [_Training(name, config, folder / name, metadata[name]) for name, config in configs.items()]
     for training in trainings if resume else ():
         training.curve, training.divergence_iteration = (
@@ -233,7 +233,7 @@ def train_many(
         f"{_describe_devices(base_env.sim, iterate)}"
         f"{base_env.sim.control.value} commands, {engine}" + (f"; continues after iteration {n_done}" if n_done else "")
     )
-    if stored_code != code:
+    if stored_hash != code_hash:
         log("the file of the task has changed since the checkpoint was written; it is used as it is now")
     if n_done >= n_iterations:
         log(
@@ -248,7 +248,7 @@ def train_many(
         """Write the checkpoint."""
         nonlocal saved_iteration, save_time
         runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
-        meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": elapsed_seconds()}
+        meta = {"crazysim": crazysim.__version__, "code": code_hash, "runs": runs, "seconds": elapsed_seconds()}
         files = fetch_arrays({"learner": learner, "kept": [training.kept_policy for training in trainings]})
         if is_first_host():
             checkpoint.save(path, files, meta)
@@ -657,7 +657,7 @@ def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **other_setti
 
 @contextmanager
 def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows metrics on a progress bar, or that does nothing without ``enabled`` or tqdm."""
+    """Yield a function that shows metrics on a progress bar; it does nothing if not ``enabled``, or without tqdm."""
     bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None

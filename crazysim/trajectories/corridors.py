@@ -1,4 +1,7 @@
-"""Minimum-derivative polynomials inside corridors around the lines between waypoints, and between two heights."""
+"""Minimum-derivative polynomials inside corridors around the lines between waypoints, and between two heights.
+
+The cost that is minimised is the integral of a squared derivative, as in ``interpolation``.
+"""
 
 from __future__ import annotations
 
@@ -57,10 +60,10 @@ def fill_in_corridors(
     program = _QuadraticProgram(scaled_nodes, filled_nodes, lengths)
     inner_radii, max_radii = radii * (1 - RADIUS_MARGIN), radii * (1 - RADIUS_MARGIN / 2)
     for _ in range(MAX_ITERATIONS):
-        paths = interpolation.unit_coefficients(filled_nodes, lengths)
+        coefficients = interpolation.unit_coefficients(filled_nodes, lengths)
 
-        def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Deviations:
-            return _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
+        def deviation(piece: np.ndarray, u: Floats, coefficients: Floats = coefficients) -> Deviations:
+            return _deviation(coefficients[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
 
         piece, u = _find_maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
         offset, nearest, distance = deviation(piece, u)
@@ -70,7 +73,7 @@ def fill_in_corridors(
             (piece, u[is_outside], normal, np.sum(normal * nearest[is_outside], axis=-1) + inner_radii[piece])
         ]
         half_spaces += [
-            _height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)
+            _height_half_spaces(coefficients[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)
         ]
         piece, u, normal, bound = (np.concatenate(parts) for parts in zip(*half_spaces, strict=True))
         if not len(piece):
@@ -106,11 +109,11 @@ def _height_half_spaces(coefficients: Floats, limit: float, sign: int) -> tuple[
     return piece[is_beyond], u[is_beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
 
-def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviations:
+def _deviation(coefficients: Floats, start: Floats, end: Floats, u: Floats) -> Deviations:
     """Return the vectors from line segments to curves, the nearest points on the segments, and the vectors' lengths.
 
     Args:
-        paths: Coefficients. (n, 3, degree + 1)
+        coefficients: Coefficients of x, y and z. (n, 3, degree + 1)
         start: First points of the segments, m. (n, 3)
         end: Last points, m. (n, 3)
         u: Time within each piece over its length. (n,) or (n, n_times)
@@ -121,7 +124,7 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Deviatio
     u, segment = np.asarray(u), end - start
     shape = (len(u), *[1] * (u.ndim - 1), 3)
     start, segment = start.reshape(shape), segment.reshape(shape)
-    pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(paths.shape[-1]), paths)
+    pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(coefficients.shape[-1]), coefficients)
     square = np.sum(segment**2, axis=-1)
     segment_fraction = np.sum((pos - start) * segment, axis=-1) / np.where(square > 0, square, 1.0)
     nearest_point = start + np.clip(segment_fraction, 0.0, 1.0)[..., None] * segment
@@ -160,6 +163,7 @@ class _QuadraticProgram:
             matrix[part, part] += block
         free_masks = [self.is_free[..., axis].ravel() for axis in range(3)]
         self.factors = [np.linalg.cholesky(matrix[np.ix_(mask, mask)]) for mask in free_masks]
+        # Half-spaces ``row . x <= slack``; a step x from the minimum adds |x|^2 to the cost.
         self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_masks)))), np.zeros(0)
 
     def add_half_spaces(self, piece: np.ndarray, u: Floats, normal: Floats, bound: Floats) -> None:

@@ -40,10 +40,12 @@ class Quantity:
 
 
 def _specific_thrust(acc: Floats) -> Floats:
+    """Return the thrust divided by the mass, world frame, m/s^2. (..., 3)"""
     return acc[..., :3] + np.array([0.0, 0.0, GRAVITY_MAGNITUDE])
 
 
 def _thrust(acc: Floats) -> Floats:
+    """Return the thrust divided by the weight. (...)"""
     return np.linalg.norm(_specific_thrust(acc), axis=-1) / GRAVITY_MAGNITUDE
 
 
@@ -52,11 +54,12 @@ def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
     small_batch, large_batch = BATCH_SIZES
-    chunk = small_batch if len(rows) <= small_batch else large_batch
-    padded_rows = np.zeros((-(-len(rows) // chunk) * chunk, 8))
+    batch_size = small_batch if len(rows) <= small_batch else large_batch
+    padded_rows = np.zeros((-(-len(rows) // batch_size) * batch_size, 8))
     padded_rows[: len(rows)] = rows
     with jax.enable_x64(True):
-        rates = [np.asarray(_compiled_body_rate(padded_rows[k : k + chunk])) for k in range(0, len(padded_rows), chunk)]
+        batches = [padded_rows[k : k + batch_size] for k in range(0, len(padded_rows), batch_size)]
+        rates = [np.asarray(_compiled_body_rate(batch)) for batch in batches]
     return np.concatenate(rates)[: len(rows)].reshape(acc.shape[:-1])
 
 

@@ -336,7 +336,8 @@ def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Tra
     """Return trajectories as a list of single ones.
 
     Args:
-        trajectories: One trajectory, a sequence of single trajectories, or a record with one leading axis.
+        trajectories: One trajectory, a sequence of single trajectories, or a ``Trajectory`` with one
+            leading axis.
     """
     is_stack = isinstance(trajectories, Trajectory)
     items = trajectories.unstacked() if is_stack else list(trajectories) if isinstance(trajectories, Iterable) else []
@@ -373,11 +374,11 @@ def _inverse_length(xp: Any, length: Array) -> Array:
 
 
 def _scale_derivatives(derivatives: list[Array], rate: Array) -> list[Array]:
-    """Convert derivatives with respect to the scaled time of a piece to derivatives with respect to time in seconds.
+    """Return derivatives with respect to time in seconds, computed from derivatives with respect to ``u``.
 
     Args:
         derivatives: Value, first derivative, and so on. (4,) each
-        rate: Change of the scaled time per second, 1/s. ()
+        rate: Change of ``u`` per second, 1/s. ()
     """
     factors = itertools.accumulate([rate] * (len(derivatives) - 1), lambda a, b: a * b)
     return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
@@ -393,7 +394,13 @@ def _build_setpoint(derivatives: list[Array]) -> Setpoint:
 
 
 def _find_piece(ends: Array, index: Array | int, t: Array) -> Array:
-    """Return the index of the piece at a time: the number of ends at or before it, at most the last index. ()"""
+    """Return the index of the piece at a time: the number of ends at or before it, at most the last index. ()
+
+    Args:
+        ends: Ends of the pieces of all trajectories, s. (n, n_pieces)
+        index: Index of the trajectory. ()
+        t: Time within the duration of the trajectory, s. ()
+    """
     n = ends.shape[1]
     if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
         return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)

@@ -44,8 +44,8 @@ def minimum_snap(
         waypoints: Positions, world frame, m. (n, 3)
         durations: Time from each waypoint to the next, s. None for the shortest durations that meet the limits, in
             ratios that minimise the snap. (n - 1,)
-        limits: Limits; required if ``durations`` is None. The path stays between floor and height. The trajectory of
-            given durations is checked against the other limits. The separation is not checked; use ``check`` for it.
+        limits: Limits; required if ``durations`` is None. The path stays between floor and height. A trajectory
+            with ``durations`` is checked against the other limits. The separation is not checked; use ``check`` for it.
         yaw: Yaw at the waypoints, rad: one value for all, or one per waypoint. Between waypoints the drone turns the
             shorter way, with the smallest integral of the squared angular acceleration. () or (n,)
         corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one value for
@@ -94,7 +94,7 @@ def minimum_jerk(
 def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Trajectory, Array]:
     """Return the trajectory through waypoints with the smallest integral of a squared derivative, and this integral.
 
-    Order 4 gives the trajectory of ``minimum_snap``, and order 3 of ``minimum_jerk``: at rest at both ends,
+    Order 4 gives the trajectory of ``minimum_snap``, order 3 the trajectory of ``minimum_jerk``: at rest at both ends,
     without limits or corridors, and with zero yaw. It has gradients with respect to waypoints and durations, and works
     in ``jax.jit`` and ``jax.vmap``. Nothing is checked. In float32, up to about ten pieces whose durations vary by less
     than a factor of five are accurate to 1e-3 of the distances; use float64 for more.
@@ -125,19 +125,21 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
 
     position_indices, inner_indices = np.arange(0, size, k), np.setdiff1d(np.arange(k, size - k), np.arange(0, size, k))
     values = jnp.zeros((size, 3), dtype).at[position_indices].set(waypoints)
-    block = matrix[inner_indices[:, None], inner_indices]
-    row_scale = 1 / jnp.sqrt(jnp.diagonal(block))[:, None]  # gives the scaled matrix a diagonal of ones
+    inner_matrix = matrix[inner_indices[:, None], inner_indices]
+    row_scale = 1 / jnp.sqrt(jnp.diagonal(inner_matrix))[:, None]  # gives the scaled matrix a diagonal of ones
     rhs = -matrix[inner_indices[:, None], position_indices] @ waypoints
     values = values.at[inner_indices].set(
-        row_scale * jnp.linalg.solve(row_scale * block * row_scale.T, row_scale * rhs)
+        row_scale * jnp.linalg.solve(row_scale * inner_matrix * row_scale.T, row_scale * rhs)
     )
 
     end_derivatives = values[entries]  # (n_pieces, 2k, 3)
     cost = jnp.sum(end_derivatives * jnp.einsum("pij,pja->pia", cost_blocks, end_derivatives)) * time_unit ** (
         1 - 2 * k
     )
-    paths = jnp.einsum("cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, end_derivatives)
-    coefficients = jnp.concatenate([paths, jnp.zeros_like(paths[:, :1])], axis=1)
+    pos_coefficients = jnp.einsum(
+        "cj,pj,pja->pac", jnp.asarray(interpolation.hermite_basis(k), dtype), powers, end_derivatives
+    )
+    coefficients = jnp.concatenate([pos_coefficients, jnp.zeros_like(pos_coefficients[:, :1])], axis=1)
     return Trajectory(jnp.cumsum(durations), coefficients, jnp.zeros((), bool)), cost
 
 
@@ -149,6 +151,7 @@ def _plan_trajectory(
     yaw: ArrayLike,
     corridors: ArrayLike | None,
 ) -> Trajectory:
+    """Return the trajectory of ``minimum_snap`` or ``minimum_jerk``, which pass 3 or 2 ``fixed_derivatives``."""
     nodes = _waypoint_nodes(waypoints, fixed_derivatives)
     if limits is not None:
         require_limits(limits)
@@ -167,9 +170,11 @@ def _plan_trajectory(
                 f"expected a unique trajectory, got {n_pieces + 1} waypoints with too few fixed derivatives. Add "
                 f"waypoints, or fix the derivatives at the ends."
             ) from error
-        paths = interpolation.unit_coefficients(filled_nodes, lengths)
-        yaw_paths = interpolation.unit_coefficients(interpolation.fill_derivatives(yaw_nodes, lengths), lengths)
-        return np.concatenate([paths, interpolation.pad_degree(yaw_paths, paths.shape[-1] - 1)], axis=1)
+        pos_coefficients = interpolation.unit_coefficients(filled_nodes, lengths)
+        yaw_coefficients = interpolation.unit_coefficients(interpolation.fill_derivatives(yaw_nodes, lengths), lengths)
+        return np.concatenate(
+            [pos_coefficients, interpolation.pad_degree(yaw_coefficients, pos_coefficients.shape[-1] - 1)], axis=1
+        )
 
     if durations is not None:
         lengths = _check_durations(durations, n_pieces)

@@ -22,9 +22,10 @@ POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y",
 def load_csv(path: str | Path) -> Trajectory:
     """Return the trajectory in a CSV file. The number of columns determines the format.
 
-    - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, in the time since
-      the start of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
-    - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. The trajectory
+    - 33 or 25: Crazyswarm's polynomials. A row is a piece: its duration, s, and eight coefficients for each of x, y and
+      z, m. With 33 columns, eight coefficients of the yaw, rad, follow. The coefficients, constant term first, are for
+      the time since the start of the piece, s.
+    - 4 or 5: samples. A row is a time, s, and x, y and z, m. With 5 columns, the yaw, rad, follows. The trajectory
       starts at the first row. It is cubic between the samples, with velocities from central differences, and at rest at
       both ends.
 
@@ -74,10 +75,10 @@ def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     values = np.zeros((len(rows), 4))
     values[:, : rows.shape[1] - 1] = rows[:, 1:]
     values[:, 3] = np.unwrap(values[:, 3])
-    rates = np.zeros_like(values)
-    rates[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
+    derivatives = np.zeros_like(values)
+    derivatives[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
     lengths = np.diff(times)[:, None]
-    start, end, start_slope, end_slope = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
+    start, end, start_slope, end_slope = values[:-1], values[1:], derivatives[:-1] * lengths, derivatives[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
     c = [
         start,
