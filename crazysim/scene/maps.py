@@ -45,7 +45,7 @@ def map_spec(
     if not np.isfinite(points).all():
         n = int((~np.isfinite(points)).any(axis=1).sum())
         raise ConfigError(
-            f"expected finite coordinates, got others in {n} of {len(points)} points of the map. Drop them."
+            f"expected finite coordinates, got {n} of {len(points)} points that are not finite. Drop them."
         )
     points = to_world_frame(points, pos, quat, scale)
     if triangles is None:

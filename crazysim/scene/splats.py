@@ -150,8 +150,8 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
     is_invalid |= ~values["quat"].any(axis=1)
     if is_invalid.any():
         raise ConfigError(
-            f"expected finite Gaussians with non-zero quaternions, got others in {int(is_invalid.sum())} of {n} in "
-            f"{str(path)!r}. Drop them."
+            f"expected Gaussians with finite numbers and non-zero quaternions, got {int(is_invalid.sum())} of {n} "
+            f"without in {str(path)!r}. Drop these Gaussians."
         )
     return values
 
