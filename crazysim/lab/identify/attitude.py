@@ -77,8 +77,8 @@ class FittedModel(PyTree):
     def derivative(self, state: State, inputs: Array) -> State:
         """Return the time derivatives of a state under a command."""
         pos, quat, vel, ang_vel, thrust = state
-        _, acc, ang_acc, rate = fitted.dynamics(pos, quat, vel, ang_vel, inputs, thrust, params=self.params)
-        return vel, ang_vel, acc, ang_acc, rate
+        _, acc, ang_acc, thrust_rate = fitted.dynamics(pos, quat, vel, ang_vel, inputs, thrust, params=self.params)
+        return vel, ang_vel, acc, ang_acc, thrust_rate
 
 
 def _to_crazyflow_columns(log: Log) -> dict[str, NDArray]:

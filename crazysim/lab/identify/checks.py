@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from crazysim.lab.identify.logs import Log
 
 PLAUSIBLE_RATIOS = (0.5, 2.0)
-"""Ratios of measured to expected motion that count as agreement, on each axis that moves. In the logs of two
-public benchmarks, delays between streams, drag and noise give 0.6 to 1.3."""
+"""Ratios of measured to expected motion that count as agreement, on each axis that moves. In the logs of
+IDSIA's benchmark and NanoBench, delays between streams, drag and noise give 0.6 to 1.3."""
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
 """Units of positions, in m. Velocities have these units per second."""
 DIVERGED_ERROR = 10.0
-"""Ratio of error to motion above which a rate counts as diverged. In the logs of those benchmarks the ratio is below 4
-or above 30."""
+"""Ratio of error to motion above which a measured velocity or angular velocity counts as diverged. In the logs of those
+benchmarks the ratio is below 4 or above 30."""
 MIN_TURN_RATE = 0.01
 """Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
 (BMI088, 0.014 degrees/s/sqrt(Hz)) gives 0.003 rad/s at 250 Hz."""
@@ -221,7 +221,7 @@ def _window_changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int,
 
 
 def _diverged_windows(pair: Pair, size: int) -> NDArray:
-    """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
+    """Return True for the windows of pieces, ``size`` windows each, whose error exceeds ten times the motion. (n,)"""
     motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
     typical_motion, is_diverged = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
     for k in range(0, len(motion), size):
@@ -299,7 +299,7 @@ def _propose_remedies(
         "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz",
         scale_columns(pos=(1, 1, -1), vel=(1, 1, -1)),
     )
-    for key, noun, unit, factor in (
+    for key, noun, factor, factor_advice in (
         ("vel", "velocity", 1.0, ""),
         ("ang_vel", "angular velocity", 1.0, ""),
         ("ang_vel", "angular velocity", degrees, f" and rad_per_unit={degrees:.6g}"),
@@ -311,6 +311,6 @@ def _propose_remedies(
             fields = getattr(Columns(), key)
             names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
             yield (
-                f"The {noun} fits as {key}={names}{factor}, with names of your columns",
-                {**data, key: data[key][:, order] * signs * unit},
+                f"The {noun} fits as {key}={names}{factor_advice}, with names of your columns",
+                {**data, key: data[key][:, order] * signs * factor},
             )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 
 NAME_COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
-"""Allowed numbers of column names of a field; the last number is required if the field is present."""
+"""Allowed numbers of column names of a field; 0 where the field may be absent."""
 NAME_ORDERS = {
     "quat": "x, y, z, w, in this order",
     "rpy": "roll, pitch and yaw",

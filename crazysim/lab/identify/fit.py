@@ -37,18 +37,19 @@ from crazysim.rotation import rotate, rotate_inverse
 WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
 SLOW_TORQUE_DELAY_STD = 0.2
-"""Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
-samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would cause, for an unknown reason."""
+"""Standard deviation of delays for slow torques, the third regression of ``identify``, samples. In simulated flights
+at 100 Hz whose commands change at samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would
+cause, for an unknown reason."""
 MAX_FACTOR = 10.0
-"""Largest factor of the airframe's curves and moments; a fit with a larger factor is an error. Rotor speeds are checked
-to be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
+"""Largest factor of the airframe's curves and moments of inertia; a fit with a larger factor is an error. Rotor
+speeds are checked to be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
 MIN_FACTORS = {"rotor inertia": 0.0}
 """Least values of factors that may be below ``1 / MAX_FACTOR``: flights that hardly yaw do not show the inertia of the
 rotors."""
 
 
 FACTOR_NAMES = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
-"""Factors of the airframe's curves and moments."""
+"""Names of the factors by which the airframe's curves and moments of inertia are multiplied."""
 FORCE_TERMS = (
     "thrust factor", "drag x", "drag y", "drag z", "quadratic drag x", "quadratic drag y", "quadratic drag z",
 )  # fmt: skip
@@ -163,8 +164,8 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     check_turning(logs)
     if base.n_rotors <= 4:
         _check_rotor_order(logs, base)
-    weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
-    params = Model.create(base, weight).params
+    flight_mass = float(base.value("rigid_body.mass")) if mass is None else float(mass)
+    params = Model.create(base, flight_mass).params
     rotation_fit = fast_rotation(logs, params, float(_fit_forces(logs, params)[0][0]))
     logs = [aligned(log, delay) for log, delay in zip(logs, rotation_fit.delays, strict=True)]
     force, force_spread = _fit_forces(logs, params)
@@ -197,11 +198,11 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
             f"that flies like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb "
             "more, or start from an airframe file nearer to the drone (--airframe)."
         )
-    changes = _airframe_changes(base, weight, values)
-    rates = motor_lag(logs)
-    if 2 * np.sum(np.isfinite(rates)) > rates.size:
-        rates = rates[np.isfinite(rates)]
-        values["motor lag"], deviations["motor lag"] = weighted_median(rates, np.ones(len(rates)))
+    changes = _airframe_changes(base, flight_mass, values)
+    lag_rates = motor_lag(logs)
+    if 2 * np.sum(np.isfinite(lag_rates)) > lag_rates.size:
+        lag_rates = lag_rates[np.isfinite(lag_rates)]
+        values["motor lag"], deviations["motor lag"] = weighted_median(lag_rates, np.ones(len(lag_rates)))
         changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
         new_airframe = load_airframe(_nest_tables(str(airframe), base.name, changes))
@@ -276,16 +277,16 @@ def _fit_regression(
         terms: Function that returns the rate of momentum per coefficient in a log, (n, 3, k), and the momentum, (n, 3).
         is_nonpositive: True for coefficients that are at most zero. (k,)
     """
-    rates, changes, blocks = [], [], []
+    regressors, momentum_changes, blocks = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
         total, size = integrate(x, log.t), round(WINDOW_DURATION / log.dt)
         starts = np.arange(0, len(log.t) - size, max(1, size // 5))
         starts = starts[[not np.any((log.gaps > start) & (log.gaps <= start + size)) for start in starts]]
-        rates.append(total[starts + size] - total[starts])
-        changes.append(momentum[starts + size] - momentum[starts])
+        regressors.append(total[starts + size] - total[starts])
+        momentum_changes.append(momentum[starts + size] - momentum[starts])
         blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK_DURATION)
-    x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
+    x, y, block = (np.concatenate(parts) for parts in (regressors, momentum_changes, blocks))
     k = x.shape[-1]
     weights = np.ones(y.shape)
     coefficients, is_free = np.zeros(k), np.ones(k, bool)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.identify import motion as capture
+from crazysim.lab.identify import motion as motion_module
 from crazysim.lab.identify.checks import check_motion
 from crazysim.lab.identify.columns import (
     KNOWN_COLUMNS,
@@ -104,7 +104,9 @@ def read_log(
     name, table = read_table(path, repairs, columns)
     if motion is not None:
         _, motion_table = read_table(motion, repairs, columns)
-        table = capture.join_motion_capture(name, table, motion_table, columns or KNOWN_COLUMNS["crazysim"], repairs)
+        table = motion_module.join_motion_capture(
+            name, table, motion_table, columns or KNOWN_COLUMNS["crazysim"], repairs
+        )
     if columns is None:
         columns = next(
             (c for c in reversed(KNOWN_COLUMNS.values()) if not missing_columns(table, c)), KNOWN_COLUMNS["crazysim"]
@@ -154,10 +156,10 @@ def read_log(
         data["rotor_vel"] = np.zeros((len(t), 0))
     derived_keys = tuple(key for key in ("vel", "ang_vel") if key not in data)
     if "vel" in derived_keys:
-        data["vel"] = capture.fit_velocity(t, data["pos"])
+        data["vel"] = motion_module.fit_velocity(t, data["pos"])
         repairs.append("differentiated the position, since the log has no velocity")
     if "ang_vel" in derived_keys:
-        data["ang_vel"] = capture.fit_ang_vel(t, data["quat"])
+        data["ang_vel"] = motion_module.fit_ang_vel(t, data["quat"])
         repairs.append("differentiated the attitude, since the log has no angular velocity")
     is_kept = check_motion(name, t, data, (*derived_keys, *(["quat"] if columns.rpy else [])), repairs)
     t, data = t[is_kept], {key: x[is_kept] for key, x in data.items()}

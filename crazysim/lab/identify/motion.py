@@ -64,7 +64,7 @@ def join_motion_capture(
         grid = np.arange(times[is_valid].min(), times[is_valid].max(), LAG_STEP)
         speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(n_smoothing) / n_smoothing, "same")))
-    (first, a), (second, b) = series
+    (log_start, a), (motion_start, b) = series
     lag, agreement = _find_lag(a, b)
     if agreement < 0.7:
         raise ConfigError(
@@ -72,7 +72,7 @@ def join_motion_capture(
             f"{agreement:.2f} of 1 at best. Check that both files are of one flight, that the drone rotates in it, and "
             "that quat= names the attitude."
         )
-    shift = first - second + lag * LAG_STEP
+    shift = log_start - motion_start + lag * LAG_STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
     streams = {
         "the log": Stream(t, _number_columns(table, len(t), (time,))),

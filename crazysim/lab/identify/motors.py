@@ -118,7 +118,7 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
 
 
 def _fit_rate(command: NDArray, speed: NDArray, dt: float) -> float:
-    """Return the rate of one rotor: a grid over rates and delays that is refined about its best point."""
+    """Return the rate of one rotor, 1/s, from a grid of rates and delays that is refined about its best point."""
     terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
     rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), np.linspace(-MAX_DELAY, MAX_DELAY, 9)
     index, inner_samples = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)

@@ -45,7 +45,7 @@ def fit_residual(
     residual with the least loss.
 
     Args:
-        logs: Logs of the same sample time, aligned.
+        logs: Logs of the same sample time, whose delays were removed with ``aligned``.
         model: Model from ``identify``.
         n_hidden: Number of units of the hidden layer; 0 for linear terms alone.
         iterations: Number of steps of Adam.

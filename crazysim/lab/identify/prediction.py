@@ -39,8 +39,9 @@ class Windows(PyTree):
     ang_vel: Array
     """Angular velocity, body frame, rad/s. (n_windows, n, 3)"""
     rotor_vel: Array
-    """Rotor speeds, rpm, with ``PADDING`` samples before and after; for fitted models the collective thrust, N.
-    (n_windows, n + 2 PADDING, n_rotors)"""
+    """Rotor speeds, rpm, with ``PADDING`` samples before and after. (n_windows, n + 2 PADDING, n_rotors)
+
+    A ``FittedModel`` of ``crazysim.lab.identify.attitude`` stores its collective thrust, N, here."""
     attitude_command: Array | None = None
     """Commanded roll, pitch, yaw, rad, and collective thrust, N; None if a log has none. (n_windows, n, 4)"""
 
@@ -50,7 +51,7 @@ PADDING = 1
 
 
 State = tuple[Array, Array, Array, Array, Array]
-"""Position, attitude, velocity and angular velocity as in ``Windows``, and further states of a model."""
+"""Position, attitude, velocity and angular velocity as in ``Windows``, and the further states of a model."""
 
 
 class Predictor(Protocol):
@@ -69,7 +70,7 @@ class Predictor(Protocol):
         ...
 
     def derivative(self, state: State, inputs: Array) -> State:
-        """Return the time derivatives of a state under inputs; the angular velocity in place of the attitude's."""
+        """Return the time derivatives of a state under inputs; in place of the attitude's, its angular velocity."""
         ...
 
 
@@ -151,7 +152,7 @@ def cut_windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
                 values.append(getattr(log, key)[start - padding : start + n + padding])
     if not pieces["pos"]:
         raise ConfigError(
-            f"expected a log without gaps for longer than {duration:g} s and {2 * PADDING + 1} samples, got none. "
+            f"expected a log longer than {duration:g} s plus {2 * PADDING + 1} samples without a gap, got none. "
             "Use longer logs."
         )
     return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
@@ -172,17 +173,17 @@ def predict(
     """
 
     def derivative(state: State, inputs: Array) -> State:
-        vel, ang_vel, acc, ang_acc, more_rates = model.derivative(state, inputs)
-        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more_rates
+        vel, ang_vel, acc, ang_acc, more_derivatives = model.derivative(state, inputs)
+        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more_derivatives
 
-    def advance_state(state: State, rates: State, duration: float) -> State:
+    def advance_state(state: State, derivatives: State, duration: float) -> State:
         pos, quat, vel, ang_vel, more_states = state
         return (
-            pos + duration * rates[0],
-            rotation.integrate_attitude(quat, rates[1], duration, normalize=True),
-            vel + duration * rates[2],
-            ang_vel + duration * rates[3],
-            more_states + duration * rates[4],
+            pos + duration * derivatives[0],
+            rotation.integrate_attitude(quat, derivatives[1], duration, normalize=True),
+            vel + duration * derivatives[2],
+            ang_vel + duration * derivatives[3],
+            more_states + duration * derivatives[4],
         )
 
     def step(state: State, inputs: Array) -> tuple[State, State]:
@@ -226,10 +227,14 @@ def prediction_errors(
         horizons: Horizons, s.
 
     Returns:
-        RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
-        name: ``position`` and ``attitude``; the same with `` at constant body rates`` appended (only forces are
-        modelled); ``position at constant velocity``; ``attitude unchanged``. These names with `` (mean)`` appended have
-        the mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
+        Errors at each horizon, by name. (len(horizons),) each
+
+        - ``position`` and ``attitude``: predicted by the model.
+        - ``position at constant body rates`` and ``attitude at constant body rates``: only the forces are modelled.
+        - ``position at constant velocity`` and ``attitude unchanged``: without a model.
+
+        These names have the RMSE: of the position, m, and of ``2 sin(angle / 2)`` of the attitude error, degrees. The
+        names with `` (mean)`` appended have the mean distance, m, or the mean angle, degrees.
     """
     batch, dt = cut_windows([model.prepare_log(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat = _predict_all(model, batch, dt)
@@ -262,9 +267,9 @@ def prediction_errors(
 def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
     """Return errors from ``prediction_errors`` as a table of text."""
     head = f"{'RMSE, or mean error, after':48}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
-    unit = {"p": "m", "a": "degrees"}
+    unit_by_letter = {"p": "m", "a": "degrees"}  # position, attitude
     return "\n".join(
-        [head, *(f"{f'{k}, {unit[k[0]]}':48}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]
+        [head, *(f"{f'{k}, {unit_by_letter[k[0]]}':48}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]
     )
 
 
@@ -272,7 +277,7 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
     """Write a picture of the errors of position and attitude over the horizon.
 
     Args:
-        logs: Logs of the same sample time, aligned.
+        logs: Logs of the same sample time, whose delays were removed with ``aligned``.
         models: Models by name.
         path: File to write, such as ``errors.png``.
 

@@ -70,10 +70,10 @@ def resample(
         values = {c: without_huge_numbers(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIOD_RANGE[1] and not set(values) <= slow_columns:
-            interval = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
+            requirement = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
             if required_columns & set(values):
-                raise ConfigError(f"{name}: expected {interval}. Log it faster.")
-            repairs.append(f"left out a slow stream: expected {interval}")
+                raise ConfigError(f"{name}: expected {requirement}. Log it faster.")
+            repairs.append(f"left out a slow stream: expected {requirement}")
             continue
         if quat and all(c in values for c in quat):
             continuous_quat = align_signs(np.stack([values[c] for c in quat], axis=-1))

@@ -243,7 +243,7 @@ def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
 
 
 def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
-    """Return unit quaternions; a constant that was added to each component is found by fitting a unit sphere."""
+    """Return unit quaternions. An offset of each component is found by fitting a unit sphere, and subtracted."""
     norm = np.linalg.norm(quat, axis=-1)
     if np.all(np.abs(norm - 1) < NORM_TOLERANCE):
         return quat / norm[:, None]

@@ -91,10 +91,12 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
         z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
         values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
-    delayed_columns = np.concatenate(
+    delayed_estimates = np.concatenate(
         [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
     )
-    yaw_changes = [weighted_median(delayed_columns[:, k], delayed_columns[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
+    yaw_changes = [
+        weighted_median(delayed_estimates[:, k], delayed_estimates[:, k + 5])[0] - medians[k][0] for k in (2, 3)
+    ]
     inertia = moments * values[:3]
     relative_deviations = np.array(deviations[:2]) / [roll, pitch]
     mean_tilt_deviation = np.hypot(*(relative_deviations * inertia[:2])) / np.sum(inertia[:2])
@@ -124,16 +126,17 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     center = float(np.interp(0.5, cumulative_weight, x[order]))
     if len(x) < MIN_BLOCKS:
         return center, math.nan
-    count = np.sum(weight) ** 2 / np.sum(weight**2)
-    deviation = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
+    effective_count = np.sum(weight) ** 2 / np.sum(weight**2)
+    deviation = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (effective_count - 1))
     return center, 1.2533 * deviation_factor(len(x)) * deviation  # ratio of deviations of median and mean (Gauss)
 
 
 def deviation_factor(n: int) -> float:
     """Return the factor by which a standard deviation from n numbers must be larger for the same confidence.
 
-    The ratio of the quantiles of Student's t distribution with n - 1 degrees of freedom and the normal distribution, by
-    the expansion of Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5, at three standard deviations.
+    It is the ratio of the quantiles of Student's t distribution with n - 1 degrees of freedom and the normal
+    distribution, by the expansion of Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5, at three
+    standard deviations.
     """
     v = n - 1
     return (3 + 30 / (4 * v) + 1656 / (96 * v**2) + 11592 / (384 * v**3)) / 3
@@ -143,7 +146,9 @@ class _LogTerms(NamedTuple):
     """Terms of the regression for one log, over the two intervals around each sample."""
 
     dt: float
+    """Interval between samples, s."""
     gaps: NDArray
+    """Indices of samples that follow a gap. (n_gaps,)"""
     ang_vel_change: NDArray
     """Change of the angular velocity, plus the change by gyroscopic torques, rad/s. (n, 3)"""
     angle: NDArray
@@ -195,11 +200,11 @@ class _Rotors(NamedTuple):
 
     impulse: NDArray
     """Integral of the torque of the thrusts about x and y, and of the drag about z, N m s. (n, 3)"""
-    swing: NDArray
+    torque_change: NDArray
     """Change of the torques whose integral is ``impulse``, N m. (n, 3)"""
     reaction: NDArray
     """Integral of the torque about z of the rotors' acceleration, N m s. (n,)"""
-    lift: NDArray
+    thrust_impulse: NDArray
     """Integral of the collective thrust, N s. (n,)"""
 
 
@@ -243,8 +248,7 @@ def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
     """Return the solution of each block, about z with a delay that is longer by ``extra_delay`` samples.
 
     The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
-    variances of the four coefficients.
-    (n_blocks, 9)
+    variances of the four coefficients. (n_blocks, 9)
     """
     n, margin = len(data.ang_vel_change), round(YAW_SLOW_WIDTH / data.dt / 2)
     is_kept = np.ones(n, bool)
@@ -280,7 +284,7 @@ def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -
         if axis == 2:
             columns = rotors.impulse[:, 2], rotors.reaction
         else:
-            columns = rotors.impulse[:, axis], rotors.swing[:, axis], rotors.lift
+            columns = rotors.impulse[:, axis], rotors.torque_change[:, axis], rotors.thrust_impulse
         return np.c_[shift_series(np.stack(columns, axis=-1), delay / data.dt), data.angle[:, axis]]
 
     slow_width = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH

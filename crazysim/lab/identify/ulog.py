@@ -44,6 +44,7 @@ MAX_MESSAGE_BYTES = 2**16 - 1
 MAX_DEPTH = 8
 """Largest depth of nested formats; PX4 has two."""
 FIELD_PATTERN = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
+"""Type, number of elements and name of a field, such as ``float[4] q``."""
 
 
 def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:

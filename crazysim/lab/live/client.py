@@ -1,4 +1,4 @@
-"""Clients that command drones over TCP, through this package's server or the lab's."""
+"""Clients that command drones over TCP, through ``CommandServer`` or AIMotionLab's server."""
 
 from __future__ import annotations
 

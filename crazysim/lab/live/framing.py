@@ -1,6 +1,6 @@
 """Framing of a stream of bytes: where each message begins and ends, however the stream is split.
 
-The stream has the lab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
+The stream has AIMotionLab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
 whose argument may be a JSON object with any characters; ``REQ_<ID>``; ``START``; and shows, each a zip archive followed
 by ``SKYC``. JSON and archives end where their own structure says, so end markers inside them are ignored.
 """
@@ -24,6 +24,7 @@ ZIP_END_SIZE = 22
 """Length of the record at the end of a zip archive without its comment, bytes."""
 MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP_START)
 HEAD_PATTERN = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
+"""Start of a command. The ID of the drone may be before or after ``CMDSTART``, or missing."""
 TOKEN_PATTERN = re.compile(rb'["\\{}]')
 SPACE_BYTES = b" \r\n\t\0"
 
@@ -37,7 +38,7 @@ class Message:
     """A command in text."""
 
     drone: int | None
-    """ID of the drone, or None."""
+    """ID of the drone; None if the message does not state it."""
     command: str
     """Name of the command."""
     argument: str

@@ -73,7 +73,7 @@ class LiveReport:
 
     @property
     def factor(self) -> float:
-        """Simulated seconds per second."""
+        """Achieved number of simulated seconds per second."""
         return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
 
     def __str__(self) -> str:

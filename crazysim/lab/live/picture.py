@@ -145,8 +145,8 @@ def _air_velocity(data: SimData) -> jax.Array:
 def list_quantities(sim: Sim) -> list[str]:
     """Return the paths of all quantities that can be plotted.
 
-    These are leaves of drones and worlds, such as ``states.vel``, and leaves of each member of another population, such
-    as ``plugins.cars.pos[1]``.
+    These are leaves with the scope drone or world, such as ``states.vel``, and leaves of each member of another
+    population, such as ``plugins.cars.pos[1]``.
     """
     names = []
     for path, scope, x in _numeric_leaves(sim.data):

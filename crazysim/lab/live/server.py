@@ -20,7 +20,7 @@ from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Requ
 from crazysim.storage import Closeable
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
-"""Ports of the lab's test server, for commands to single drones and for the stream to all drones."""
+"""Ports of AIMotionLab's test server, for commands to single drones and for the stream to all drones."""
 MAX_QUEUE = 10_000
 """Largest number of commands that wait for the simulation."""
 MAX_PEERS = 64
@@ -57,7 +57,7 @@ class CommandQueue(Closeable):
 
 
 class CommandServer(CommandQueue):
-    """Server for the lab's protocol, which runs in other threads.
+    """Server for the protocol of AIMotionLab's Skybrush server, which runs in other threads.
 
     At ``drone_port`` a client takes control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
     does not exist or another client has it, ``ACK_00``. Its commands, ``CMDSTART_takeoff_0.5_EOF`` for example, are
@@ -124,19 +124,19 @@ class CommandServer(CommandQueue):
             listener.shutdown()
             listener.server_close()
 
-    def _serve_drone(self, peer: socket.socket, name: str) -> None:
+    def _serve_drone(self, peer: socket.socket, peer_name: str) -> None:
         drone = None
         try:
             for message in _read_messages(peer, self._stop_event, self.timeout):
                 if drone is None:
                     if not isinstance(message, Request) or not self._claim_drone(message.drone):
-                        log.warning("%s refused: drone %s is not free", name, getattr(message, "drone", None))
+                        log.warning("%s refused: drone %s is not free", peer_name, getattr(message, "drone", None))
                         peer.sendall(b"ACK_00")
                         return
                     drone = message.drone
                     peer.sendall(f"ACK_{drone:02d}".encode())
                 elif isinstance(message, Message):
-                    self._answer_message(peer, name, message, drone)
+                    self._answer_message(peer, peer_name, message, drone)
                 else:
                     raise FramingError("expected commands after the request, got another request or a show")
         finally:
@@ -150,27 +150,29 @@ class CommandServer(CommandQueue):
             self._claimed_drones.add(drone)
             return True
 
-    def _serve_stream(self, peer: socket.socket, name: str) -> None:
+    def _serve_stream(self, peer: socket.socket, peer_name: str) -> None:
         for message in _read_messages(peer, self._stop_event, self.timeout):
             if isinstance(message, Request):
                 raise FramingError("expected messages with the ID of a drone, got a request")
-            self._answer_message(peer, name, message, None)
+            self._answer_message(peer, peer_name, message, None)
 
-    def _answer_message(self, peer: socket.socket, name: str, message: Message | ShowFile, drone: int | None) -> None:
+    def _answer_message(
+        self, peer: socket.socket, peer_name: str, message: Message | ShowFile, drone: int | None
+    ) -> None:
         """Queue the command of a message and answer it."""
         try:
             if drone is not None and isinstance(message, Message) and message.drone not in (None, drone):
                 raise ConfigError(f"expected commands to drone {drone}, got one to drone {message.drone}")
             self._enqueue(parse_command(message, drone))
         except ConfigError as error:
-            log.warning("%s: command refused: %s", name, error)
+            log.warning("%s: command refused: %s", peer_name, error)
             peer.sendall(b"ERR")
             return
         peer.sendall(b"ACK")
 
 
 class StreamListener(CommandQueue):
-    """Client of a server's stream of commands, such as port 7002 of the lab's test server, in another thread.
+    """Client of a server's stream of commands, such as port 7002 of AIMotionLab's test server, in another thread.
 
     The simulation may be one of many receivers. Every valid command is answered by ``ACK``; others are logged. When
     the server disconnects or sends bytes that are not a message, the listener stops and ``is_connected`` becomes
@@ -205,8 +207,8 @@ class StreamListener(CommandQueue):
         self._thread.join(5 * POLL_INTERVAL)
         self._peer.close()
 
-    def _listen(self, name: str) -> None:
-        with _log_errors(name), contextlib.closing(self._peer):
+    def _listen(self, peer_name: str) -> None:
+        with _log_errors(peer_name), contextlib.closing(self._peer):
             for message in _read_messages(self._peer, self._stop_event, self._timeout):
                 if isinstance(message, Request):
                     raise FramingError("expected commands, got a request")
@@ -214,7 +216,7 @@ class StreamListener(CommandQueue):
                     self._enqueue(parse_command(message))
                     self._peer.sendall(b"ACK")
                 except ConfigError as error:
-                    log.warning("%s: command refused: %s", name, error)
+                    log.warning("%s: command refused: %s", peer_name, error)
 
 
 def connect(host: str, port: int, timeout: float) -> socket.socket:
@@ -239,27 +241,27 @@ class _Listener(socketserver.ThreadingTCPServer):
         super().__init__(address, socketserver.BaseRequestHandler)
 
     def finish_request(self, request: socket.socket, client_address: tuple[str, int]) -> None:
-        name = f"{client_address[0]}:{client_address[1]}"
+        peer_name = f"{client_address[0]}:{client_address[1]}"
         if not self._free_connections.acquire(blocking=False):
-            log.warning("%s refused: %d clients are connected already", name, MAX_PEERS)
+            log.warning("%s refused: %d clients are connected already", peer_name, MAX_PEERS)
             return
         try:
-            with _log_errors(name):
-                self._serve(request, name)
+            with _log_errors(peer_name):
+                self._serve(request, peer_name)
         finally:
             self._free_connections.release()
 
 
 @contextlib.contextmanager
-def _log_errors(name: str) -> Iterator[None]:
+def _log_errors(peer_name: str) -> Iterator[None]:
     """Log the reason why a connection ends instead of raising an error."""
     try:
         yield
-        log.info("%s disconnected", name)
+        log.info("%s disconnected", peer_name)
     except (FramingError, TimeoutError) as error:
-        log.warning("%s refused: %s", name, error)
+        log.warning("%s refused: %s", peer_name, error)
     except OSError as error:
-        log.warning("%s lost: %s", name, error)
+        log.warning("%s lost: %s", peer_name, error)
 
 
 def _read_messages(

@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 from crazysim.lab.live.viewer import Viewer
 
 L = TypeVar("L")
+"""Class of the live loop: ``crazysim.lab.live.Live``, which cannot be imported here."""
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +26,7 @@ class Viewers(Generic[L]):
     failures: int
     """Number of viewers that failed."""
     next_picture_time: float
-    """Time at which the next picture is due, s, by ``time.perf_counter``."""
+    """Time of the next picture in the sequence of ``period``, s, by ``time.perf_counter``."""
 
     def __init__(self, fps: float, on_last_closed: Callable[[], object]):
         """Create a set without viewers.
@@ -57,8 +58,8 @@ class Viewers(Generic[L]):
         """Send a picture to every viewer if ``due_time`` has come; return True if a picture was sent.
 
         Args:
-            live: Loop.
-            due_time: Time from which on a picture is sent, s, by ``time.perf_counter``.
+            live: Live loop.
+            due_time: Earliest time of this picture, s, by ``time.perf_counter``.
         """
         now = time.perf_counter()
         if not self._open_viewers or now < due_time:

@@ -1,4 +1,7 @@
-"""Program of a window: it draws pictures from its standard input, and writes the user's actions to its output."""
+"""Program of a window: it draws each ``Picture``, the state of a simulation, that arrives on its standard input.
+
+It writes the user's actions to its output.
+"""
 
 from __future__ import annotations
 

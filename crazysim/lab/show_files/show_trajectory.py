@@ -100,7 +100,10 @@ def _make_trajectory(ends: NDArray, curves: list, yaw_control: object, location:
 
 
 def _with_yaw(ends: NDArray, coefficients: NDArray, yaw_control: object, location: str) -> tuple[NDArray, NDArray]:
-    """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
+    """Return the pieces with the yaw replaced by setpoints that are connected linearly.
+
+    The times of the setpoints count from the start of the show, unlike those of the points.
+    """
     value = checks.require_object(yaw_control, location)
     checks.require_version_one(value, location)
     setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, location)

@@ -83,7 +83,7 @@ def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
 
 
 def collision_radius(flight: ShowFlight) -> float:
-    """Return the radius of the sphere with which a drone collides, m."""
+    """Return the radius of a drone's collision sphere, m."""
     model = flight.sim.mj_model
     return float(model.geom_size[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "col_sphere:0"), 0])
 

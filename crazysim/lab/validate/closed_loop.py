@@ -22,9 +22,9 @@ COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrl
 """Columns of a log of NanoBench (arXiv 2603.09908): time, s; position from motion capture, m; setpoint of the
 position, m, and of the yaw, degrees."""
 AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
-"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint first rises above ``AIRBORNE_SHARE`` of its
-median height, until ``LANDING_TIME`` seconds before its setpoint last drops below that height. The median is over the
-samples above half of the largest height."""
+"""Samples of a flight that are compared. A drone counts as airborne while its setpoint is above ``AIRBORNE_SHARE`` of
+the median height. This median is over the setpoints above half of the largest height. The comparison starts
+``SETTLING_TIME`` seconds after the drone is first airborne, and ends ``LANDING_TIME`` seconds before it is last."""
 MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
 MAX_LAG = 1.2

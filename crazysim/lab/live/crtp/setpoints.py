@@ -20,7 +20,7 @@ N_CONTROL_POINTS = (0, 1, 3, 7)
 
 
 def handle_generic(commander: Commander, data: bytes) -> None:
-    """Carry out the data of a packet to the generic commander: a type, then numbers (crtp_commander_generic.c).
+    """Carry out the command in a packet to the generic commander: a type, then numbers (crtp_commander_generic.c).
 
     Raises:
         ConfigError: If the commander refuses the command, or the type is not supported.
@@ -59,7 +59,9 @@ def unpack_quat(packed: int) -> NDArray:
 
 
 def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
-    """Carry out the data of a packet to the high-level commander: a type, then numbers (crtp_commander_high_level.c).
+    """Carry out the command in a packet to the high-level commander: a type, then numbers.
+
+    The layout is defined in crtp_commander_high_level.c.
 
     Raises:
         ConfigError: If the commander refuses the command, or the type is not supported.

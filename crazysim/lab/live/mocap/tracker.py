@@ -96,7 +96,7 @@ class Tracker:
         self.seen = np.zeros(n, bool)
         self.n_frames = 0
         self._row_by_name = {name: k for k, name in enumerate(names)}
-        self._mappings: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
+        self._rows_by_names: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
         self._unknown_names: set[str] = set()
         self._stamps = np.full(n, -np.inf)
         self._is_lost = np.zeros(n, bool)
@@ -197,15 +197,15 @@ class Tracker:
 
     def _find_rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
         """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
-        mapping = self._mappings.get(names)
+        mapping = self._rows_by_names.get(names)
         if mapping is None:
             duplicates = sorted({name for name in names if names.count(name) > 1} & set(self._row_by_name))
             entries = [i for i, name in enumerate(names) if name in self._row_by_name and name not in duplicates]
             rows = np.array([self._row_by_name[names[i]] for i in entries], int)
             mapping = np.array(entries, int), rows, duplicates
-            if len(self._mappings) > 1000:
-                self._mappings.clear()
-            self._mappings[names] = mapping
+            if len(self._rows_by_names) > 1000:
+                self._rows_by_names.clear()
+            self._rows_by_names[names] = mapping
             for name in set(names) - set(self._row_by_name) - self._unknown_names:
                 if len(self._unknown_names) < 1000:
                     self._unknown_names.add(name)

@@ -63,8 +63,8 @@ class Twin:
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_settings(self)
-        is_row = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
-        angles = [0.0 if x is None else x for x in self.fixed] if is_row else self.fixed
+        is_sequence = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
+        angles = [0.0 if x is None else x for x in self.fixed] if is_sequence else self.fixed
         read_numbers("fixed of Twin", angles, shapes=((3,),), remedy="Use None for angles that are measured.")
 
     @staticmethod
@@ -289,8 +289,8 @@ def _order_parents_first(twins: Mapping[str, Twin]) -> list[int]:
                 )
             chain.append(parent)
             parent = twins[parent].parent
-        for member in reversed(chain):
-            k = names.index(member)
-            if twins[member].parent is not None and k not in order:
+        for part in reversed(chain):
+            k = names.index(part)
+            if twins[part].parent is not None and k not in order:
                 order.append(k)
     return order

@@ -83,7 +83,7 @@ class Px4(FirmwareLink):
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self._mav.robust_parsing = True  # bytes that are not a message are skipped
-        self._start_times: tuple[float, float] | None = None
+        self._start_times: tuple[float, float] | None = None  # wall-clock and simulated time of the first exchange, s
         self._time = 0.0
         self._expects_answer = self._has_answered = False
         self._motors = np.zeros(4)

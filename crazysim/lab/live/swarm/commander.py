@@ -3,7 +3,7 @@
 High-level commands plan smooth motions. Streamed setpoints take precedence until they stop: after 0.5 s without a
 setpoint the drone holds its position, and after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and
 ``_SHUTDOWN`` in commander.h of crazyflie-firmware). Each streamed setpoint discards the planned motion. A motion that
-is planned while setpoints are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
+is planned while setpoints are streamed begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
 ``crtpCommanderHighLevelGetSetpoint`` in crtp_commander_high_level.c). Until the first command, and after landing, the
 motors are off.
 """
@@ -35,7 +35,7 @@ below this limit, m/s, later than this time after its planned end, s."""
 MIN_DURATION, MAX_DURATION = 1e-3, 1e4
 """Limits of durations, s, and of factors of durations."""
 N_TRAJECTORIES = 256
-"""Number of trajectories that a drone holds; their IDs are one byte."""
+"""Largest number of trajectories that a drone holds; their IDs are one byte."""
 
 
 class Commander:
@@ -50,7 +50,7 @@ class Commander:
         """
         self.control = control
         self._report = report
-        self.group = 0
+        self.group = 0  # bit mask of the groups to which the drone belongs
         self.trajectories: dict[int, HostTrajectory] = {}
         self._compressed_ids: set[int] = set()
         self.reset()
@@ -106,9 +106,8 @@ class Commander:
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
         """Descend to a height, m, and stop the motors there, or where the drone comes to rest.
 
-        A yaw of None keeps the present yaw.
-
-        A drone that is still higher at the end, because its controller lags or has an offset, descends further.
+        A yaw of None keeps the present yaw. A drone that is still higher at the end, because its controller lags or has
+        an offset, descends further.
         """
         self._move_vertically(height, duration, yaw, is_landing=True)
 
@@ -369,7 +368,7 @@ class Commander:
         return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
 
     def _motion_start(self, command: str) -> NDArray:
-        """Return the start of a high-level command: the setpoint in force, or the drone while setpoints stream. (3, 4)
+        """Return the start of a motion: the active setpoint, or the drone's state while setpoints are streamed. (3, 4)
 
         A command that has no effect because of the stream is reported.
         """

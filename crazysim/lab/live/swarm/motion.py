@@ -54,8 +54,8 @@ def plan_move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool =
     """Return the trajectory of a move that ends at rest at a goal.
 
     It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
-    end, and without jerk at both ends (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``); or the straight line
-    at constant speed.
+    end, and without jerk at both ends (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``). If ``linear``, it is
+    the straight line at constant speed.
 
     Args:
         start: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)
@@ -68,9 +68,9 @@ def plan_move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool =
     if linear:
         coefficients = np.stack([p, goal - p], axis=-1)
     else:
-        boundary = np.stack([p, v, a, np.zeros(4)])
-        ends = np.stack([goal - p - v - a, -v - 2 * a, -2 * a, np.zeros(4)])
-        coefficients = np.concatenate([boundary, NO_JERK_INVERSE @ ends]).T
+        low_coefficients = np.stack([p, v, a, np.zeros(4)])
+        end_conditions = np.stack([goal - p - v - a, -v - 2 * a, -2 * a, np.zeros(4)])
+        coefficients = np.concatenate([low_coefficients, NO_JERK_INVERSE @ end_conditions]).T
     return HostTrajectory(np.array([duration]), coefficients[None], False)
 
 
