@@ -1,8 +1,13 @@
 """Framing of a stream of bytes: where each message begins and ends, however the stream is split.
 
-The stream has AIMotionLab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
-whose argument may be a JSON object with any characters; ``REQ_<ID>``; ``START``; and shows, each a zip archive followed
-by ``SKYC``. JSON and archives end where their own structure says, so end markers inside them are ignored.
+The stream has the messages of AIMotionLab's Skybrush server:
+
+- ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``, whose argument may be a JSON
+  object with any characters;
+- ``REQ_<ID>`` and ``START``;
+- shows, each a zip archive followed by ``SKYC``.
+
+JSON and archives end where their own structure says, so end markers inside them are ignored.
 """
 
 from __future__ import annotations

@@ -31,8 +31,10 @@ FADE_TO_COLOR, FADE_TO_GRAY, FADE_TO_BLACK, FADE_TO_WHITE = 0x08, 0x09, 0x0A, 0x
 LOOP_BEGIN, LOOP_END, RESET_CLOCK = 0x0C, 0x0D, 0x0E
 SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS = 0x10, 0x11
 JUMP, TRIGGERED_JUMP, SET_PYRO, SET_PYRO_ALL = 0x12, 0x13, 0x14, 0x15
+"""Byte codes of the commands."""
 
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+"""Colours, red, green and blue, 0 to 255."""
 
 
 def decode_lights(
@@ -43,8 +45,8 @@ def decode_lights(
 ) -> Lights:
     """Return the lights of a light program.
 
-    A simulated drone has no remote control and no pyrotechnics: colours from channels are black, as libskybrush
-    shows them without channels, triggers never fire, and pyro commands do nothing.
+    A simulated drone has no remote control and no pyrotechnics. Colours from channels of a remote control are therefore
+    black, as in libskybrush without channels. Triggers never fire, and pyro commands do nothing.
 
     Args:
         program: Byte code, or its base64 form as in ``lights.json``.
@@ -73,10 +75,10 @@ class _Machine:
 
     def __init__(self, code: bytes, location: str):
         self.code, self.location, self.address = code, location, 0
-        self.now = self.origin = 0  # in units of TIME_UNIT
+        self.now = self.origin = 0  # time, and time of the last RESET_CLOCK, in units of TIME_UNIT
         self.color = BLACK
         self.loops: list[tuple[int, int]] = []  # address of the body, iterations left; 0 for endless
-        self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]
+        self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]  # start, colours at the start and at the end
 
     def raise_error(self, expected: str, got: str) -> None:
         raise ConfigError(f"expected {expected}, got {got} in {self.location}, byte {self.address}")

@@ -38,8 +38,8 @@ log = logging.getLogger(__name__)
 def load_show(path: str | Path) -> Show:
     """Return the show in a ``.skyc`` file.
 
-    Lights come from the byte code in ``data``, or else from the lab's ``colors``; a drone without either is white, as
-    in Skybrush. A drone without a name is named after its index.
+    Lights come from the byte code in ``data``, or else from AIMotionLab's ``colors``; a drone without either is white,
+    as in Skybrush. A drone without a name is named after its index.
 
     Raises:
         ConfigError: If the file is not a valid show; the message names the location.
@@ -193,7 +193,7 @@ def _decode_lights(
 
 
 def parse_colors(value: object, location: str) -> Lights:
-    """Return the lights of the lab's ``colors``, in either form.
+    """Return the lights of AIMotionLab's ``colors``, in either form.
 
     The newer form is ``[[time, [red, green, blue]], ...]``, with the start time of each colour. The older form is
     ``[["red, green, blue", duration], ...]``. Colours are 0 to 255, times are in s.

@@ -118,6 +118,7 @@ def precession() -> Iterable[Row]:
 
     The exact attitude is a product of two rotations at constant rates.
     """
+    # moments of inertia across and along the axis of symmetry, angular velocity, duration
     a, c, w, t = 2e-5, 5e-5, np.array([4.0, 3.0, 8.0]), 0.5
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, w, np.diag([a, a, c]))
@@ -194,9 +195,9 @@ def pendulum() -> Iterable[Row]:
             sim.step()
             offsets.append(np.asarray(load.read(sim.data).pos - sim.data.states.pos)[:, 0, 0])
     for k, angle in enumerate(angles):
-        swing = np.stack(offsets)[:, k]
-        crossings = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))[:2]
-        times = (crossings + 1 + swing[crossings] / (swing[crossings] - swing[crossings + 1])) / sim.freq
+        offset = np.stack(offsets)[:, k]
+        crossings = np.flatnonzero((offset[:-1] > 0) & (offset[1:] <= 0))[:2]
+        times = (crossings + 1 + offset[crossings] / (offset[crossings] - offset[crossings + 1])) / sim.freq
         mean, geometric_mean = 1.0, math.cos(angle / 2)
         for _ in range(6):
             mean, geometric_mean = (mean + geometric_mean) / 2, math.sqrt(mean * geometric_mean)
@@ -211,7 +212,8 @@ def pendulum() -> Iterable[Row]:
 def dzhanibekov() -> Iterable[Row]:
     """Yield the relative error of the growth rate of a wobble during rotation about the intermediate axis.
 
-    The exact rate is ``w sqrt((J2 - J1) (J3 - J2) / (J1 J3))``.
+    The exact rate is ``w sqrt((J2 - J1) (J3 - J2) / (J1 J3))``, with moments of inertia J1 < J2 < J3, and the angular
+    velocity w about the second axis.
     """
     j1, j2, j3 = INERTIA
     w, wobble, t = 10.0, 1e-7, 1.0

@@ -43,7 +43,10 @@ def commonroad_params(car: Any) -> CommonRoadParams:
 
 
 def commonroad_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
-    """Return the rates of states and commands in CommonRoad's order. (..., 7)"""
+    """Return the rates of states under commands, by CommonRoad's model. (..., 7)
+
+    The order is CommonRoad's: x, y, steering angle, speed, yaw, yaw rate, slip angle.
+    """
     x = jnp.asarray(state)
     car_state = CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
     return jnp.concatenate(commonroad_single_track(car_state, jnp.asarray(command), params), axis=-1)
@@ -73,7 +76,12 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
 
 
 def lane_change(t: float, rate: float) -> list[float]:
-    """Return rate of the steering angle, rad/s, and acceleration, m/s^2, of a lane change and braking."""
+    """Return the command of a lane change and braking: rate of the steering angle, rad/s, and acceleration, m/s^2.
+
+    Args:
+        t: Time, s.
+        rate: Size of the rate of the steering angle, rad/s.
+    """
     steps = ((0.0, 0.0), (1.0, rate), (1.5, -rate), (2.0, 0.0), (2.5, -rate), (3.0, rate), (3.5, 0.0))
     return [next(r for start, r in reversed(steps) if t >= start), 1.0 if t < 4 else -1.0]
 
@@ -84,7 +92,7 @@ def simulate_drive(rates: Callable[[NDArray, list[float]], ArrayLike], initial_s
     Args:
         rates: Function that returns the rates of a state under a command.
         initial_state: State at the start.
-        rate: Rate of the steering angle, rad/s.
+        rate: Size of the rate of the steering angle, rad/s.
     """
     x = initial_state
     for k in range(round(DURATION / INTEGRATION_STEP)):
@@ -116,15 +124,15 @@ def compare_with_commonroad() -> Iterable[Row]:
         initial_state = np.array([0.0, 0, 0, INITIAL_SPEED, 0, 0, 0])
         for rate in (0.03, 0.12):
             reference = simulate_drive(lambda x, u: model(list(x), list(u), car), initial_state, rate)
-            ported_state, shipped_state = (simulate_drive(law, initial_state, rate) for law in rate_laws)
+            commonroad_state, single_track_state = (simulate_drive(law, initial_state, rate) for law in rate_laws)
             manoeuvre = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
-            difference = float(np.linalg.norm((ported_state - reference)[:2]))
+            difference = float(np.linalg.norm((commonroad_state - reference)[:2]))
             yield Row(f"{manoeuvre}: `commonroad_single_track`, position", REFERENCE, difference, "m", (0, 1e-9))
             for k, direction in enumerate(("along", "across")):
                 yield Row(
                     f"{manoeuvre}: `single_track`, position {direction}",
                     REFERENCE,
-                    float(abs(shipped_state - reference)[k]),
+                    float(abs(single_track_state - reference)[k]),
                     "m",
                     remark=f"of {reference[k]:.3g} m",
                 )

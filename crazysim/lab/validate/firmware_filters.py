@@ -16,8 +16,7 @@ from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.lab.validate.firmware_controllers import RECORDINGS
 from crazysim.lab.validate.rows import Row
-from crazysim.plugins.estimators import complementary as law
-from crazysim.plugins.estimators import error_state, updates
+from crazysim.plugins.estimators import complementary, error_state, updates
 
 FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
 """Folder with the recorded outputs of filters."""
@@ -67,11 +66,11 @@ def update_with_measurements(
     if kind == "sweep":
         estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, measurement[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
-        for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
+        for loop_offset, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
             updated_estimate = updates.update_sweep(
                 estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, measurement[0], 0.001
             )
-            estimate = error_state.select_estimate(k % 8 == first, updated_estimate, estimate)
+            estimate = error_state.select_estimate(k % 8 == loop_offset, updated_estimate, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
     if kind == "distance":
@@ -134,13 +133,13 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
         (quat, integral, climb, height, climb_rate, over_surface), (k, row) = carry, x
         gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
-        attitude_update = law.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
-        attitude_update = *attitude_update, law.inertial_climb(climb, attitude_update[0], accel, 0.004)
+        attitude_update = complementary.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        attitude_update = *attitude_update, complementary.inertial_climb(climb, attitude_update[0], accel, 0.004)
         quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(attitude_update, carry[:3], strict=True))
         shift = 0.01 * climb
-        pressure_height = law.filtered_height(height, row[6:7], shift)
-        is_useful = row[8:] <= 1000 * law.MAX_RANGE_AGE
-        new_height, new_over_surface = law.height_over_surface(
+        pressure_height = complementary.filtered_height(height, row[6:7], shift)
+        is_useful = row[8:] <= 1000 * complementary.MAX_RANGE_AGE
+        new_height, new_over_surface = complementary.height_over_surface(
             height, pressure_height, row[7:8], is_useful, over_surface, shift
         )
         is_height_tick = k % 10 == 0

@@ -23,8 +23,8 @@ Each section names the command that measures it again and writes it to `validati
 installed are left out, and so are rows of simulators that are not installed. In Python
 `crazysim.lab.validate.validate(only=["mujoco"])` returns the rows.
 
-FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim, and keeps the policies of *Sim to
-sim*:
+FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim, and the policies that the section
+*Sim to sim* trains:
 
 - `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. These commands
   write it in a clone of [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and
@@ -37,7 +37,7 @@ sim*:
     log[250:6750].to_csv('melon_20251017_run1.csv', index=False)"
     ```
 
-    The figures of this page are of the same samples rounded to float32, and differ by up to 2%.
+    This page was made with these samples rounded to float32, which changes its figures by up to 2%.
 - `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
   [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
 - `policies/` holds or receives the trainings; without FOLDER, they are not kept.
@@ -64,11 +64,12 @@ def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: st
         provenance: Sentence with the date, commit, machine and versions with which the rows were measured.
         pictures: Paths of pictures, relative to the page, by the name of their section.
     """
-    bounded_rows = [row for row in rows if row.bound is not None or row.problem]
-    failed_rows = [row for row in bounded_rows if row.failed]
+    # A comparison that failed to run counts as outside of its range.
+    counted_rows = [row for row in rows if row.bound is not None or row.problem]
+    failed_rows = [row for row in counted_rows if row.failed]
     summary = (
-        f" {len(bounded_rows) - len(failed_rows)} of {len(bounded_rows)} figures with a range are within it."
-        if bounded_rows
+        f" {len(counted_rows) - len(failed_rows)} of {len(counted_rows)} figures with a range are within it."
+        if counted_rows
         else ""
     )
     if failed_rows:

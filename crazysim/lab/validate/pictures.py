@@ -33,7 +33,7 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
 
     rows = [row for row in rows if row.series and not row.problem]
     units = list(dict.fromkeys(row.unit for row in rows))
-    colours = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
+    colors = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
     has_names = isinstance(rows[0].x, str)
     figure = Figure(figsize=(9, 4 if has_names else 4.8), layout="constrained")
     for axis, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
@@ -45,7 +45,7 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
             ]
             line = "" if has_names else "--" if series.startswith("published") else "-"
             style = {"marker": "o", "linestyle": line, "markersize": 4, "linewidth": 1.2}
-            axis.plot(*zip(*points, strict=True), label=series, color=colours[series], **style)
+            axis.plot(*zip(*points, strict=True), label=series, color=colors[series], **style)
         if has_names:
             axis.set_xticks(range(len(x_values)), x_values, rotation=90 if len(x_values) > 12 else 20, fontsize=7)
             low, high = next(row.bound for row in unit_rows if row.bound is not None)

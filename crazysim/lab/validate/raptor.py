@@ -56,7 +56,7 @@ class RaptorPolicy:
         self._policy.reset()
         self._memory = next(layer for layer in self._policy.layers if hasattr(layer, "state"))
         self._calls_per_advance, self._n_calls = 10 // period, 0
-        self._mean = self._action = action
+        self._mean_action = self._action = action
 
     def action(self, state: np.ndarray) -> np.ndarray:
         """Return the commanded speeds from -1, the least, to 1, the largest. (n, 4)
@@ -66,9 +66,9 @@ class RaptorPolicy:
                 frame, rad/s. (n, 18)
         """
         weight = (self._n_calls - 1) % self._calls_per_advance
-        self._mean = (weight * self._mean + self._action) / (weight + 1)
+        self._mean_action = (weight * self._mean_action + self._action) / (weight + 1)
         memory = self._memory.state
-        self._action = self._policy.evaluate_step(np.concatenate([state, self._mean], axis=-1))
+        self._action = self._policy.evaluate_step(np.concatenate([state, self._mean_action], axis=-1))
         if self._n_calls % self._calls_per_advance:
             self._memory.state = memory
         self._n_calls += 1
@@ -215,7 +215,7 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
     """Return True for quadrotors that RAPTOR holds at their goal in l2f, the simulator of its training. (n,)
 
     Args:
-        quadrotors: As many quadrotors as one of l2f's batches has.
+        quadrotors: Quadrotors, as many as a batch of l2f can have, such as 256.
         delay: Delay of the commands, steps.
         period: Time between two calls of the policy, ms.
     """

@@ -48,18 +48,18 @@ def create_simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = Tr
         n_worlds: Number of worlds.
         drag: True for a linear drag as large as the drag of the rotors in hover, False for none.
     """
-    hub_positions, rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
-    linear = -len(hub_positions) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
+    hub_positions, lag_rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
+    linear_drag = -len(hub_positions) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
     rotors = {
         "position": hub_positions,
         "yaw_torque_sign": params["rotor_directions"],
         "thrust_curve": [0.0, 0.0, params["k_eta"] * RPM_TO_RAD_S**2],
         "torque_curve": [0.0, 0.0, params["k_m"] * RPM_TO_RAD_S**2],
-        "lag": [rate, 0.0, rate, 0.0],
+        "lag": [lag_rate, 0.0, lag_rate, 0.0],
         "thrust_max": params["k_eta"] * params["rotor_speed_max"] ** 2,
     }
     tables: dict[str, Any] = {"base": "cf2x_L250", "rigid_body": {"mass": params["mass"]}, "rotors": rotors}
-    tables["drag"] = {"coefficients": linear * drag}
+    tables["drag"] = {"coefficients": linear_drag * drag}
     sim = Sim(n_worlds, drone=tables, control="rotor_vel", integrator="rk4", freq=FREQ)
     p, inertia = sim.data.params, np.diag([params["Ixx"], params["Iyy"], params["Izz"]])
     # Set as parameters, as an airframe would cause a warning: the largest moment exceeds the sum of the others.

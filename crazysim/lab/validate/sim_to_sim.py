@@ -180,18 +180,18 @@ def fly_task(
     env = make(task, n_worlds=n_starts, freq=round(1 / COMMAND_PERIOD))
     data = env.reset(jax.random.key(EVALUATION_SEED)).data
 
-    def assess(world: SimData) -> tuple[Array, Array, Array]:
-        return flatten(env.task.observe(world)), env.task.error(world), env.task.terminated(world)
+    def assess(world_data: SimData) -> tuple[Array, Array, Array]:
+        return flatten(env.task.observe(world_data)), env.task.error(world_data), env.task.terminated(world_data)
 
     assess_all = jax.jit(vectorize_over_worlds(assess, False))
     states: States = {
         name: np.asarray(getattr(data.states, name), np.float64)[:, 0] for name in ("pos", "quat", "vel", "ang_vel")
     }
-    flights = simulator(states)
+    drones = simulator(states)
     is_done, errors, observations = np.zeros(n_starts, bool), [], []
     for _ in range(env.max_steps):
         obs = np.asarray(assess_all(data)[0])[:, 0]
-        states = flights.fly_period(command(obs))
+        states = drones.fly_period(command(obs))
         fields = {name: x[:, None].astype(np.float32) for name, x in states.items()}
         core = data.core.replace(steps=data.core.steps + env.n_substeps)
         data = data.replace(states=data.states.replace(**fields), core=core)
@@ -203,8 +203,8 @@ def fly_task(
             break
     last_errors = np.stack(errors[-round(env.task.hold / COMMAND_PERIOD) :])
     is_settled, completed_errors = np.all(last_errors < env.task.tolerance, axis=0) & ~is_done, last_errors[:, ~is_done]
-    mean = float(completed_errors.mean()) if completed_errors.size else float("nan")
-    return FlightResult(float(is_settled.mean()), float(is_done.mean()), mean, np.stack(observations))
+    mean_error = float(completed_errors.mean()) if completed_errors.size else float("nan")
+    return FlightResult(float(is_settled.mean()), float(is_done.mean()), mean_error, np.stack(observations))
 
 
 def checks(data: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:

@@ -95,10 +95,10 @@ class AttitudeController:
         self._data, self.dt = self._sim.data, 1 / self._sim.freq
         params = self._data.params
         self._curve, speed = params.rpm2thrust, float(_hover_speed(self._sim)[0])
-        up, up2, down, down2 = np.asarray(params.rotor_dyn_coef, np.float64)[0]
+        rise, rise_per_speed, fall, fall_per_speed = np.asarray(params.rotor_dyn_coef, np.float64)[0]
         self.hover_thrust = float(np.asarray(quadratic_curve(jnp.asarray([speed]), self._curve))[0])
         """Thrust of a rotor in hover, N."""
-        self.lag = 1 / ((up + down) / 2 + (up2 + down2) * speed)
+        self.lag = 1 / ((rise + fall) / 2 + (rise_per_speed + fall_per_speed) * speed)
         """Time constant of small changes of the rotor speeds about hover, the mean of both directions, s."""
         pipeline = self._sim.step_pipeline
         n_stages = list(pipeline).index("clip_rotor_vel_cmd") + 1
@@ -171,9 +171,9 @@ class RotorPy(Simulator):
         self._torch.set_num_threads(1)  # synchronising threads would take longer than the work on arrays of this size
         n, device = len(start["pos"]), self._torch.device("cpu")
         params = rotorpy_params(load_airframe(AIRFRAME))
-        hover = np.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (4 * params["k_eta"]))
+        hover_speed = np.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (4 * params["k_eta"]))
         state = {"x": start["pos"], "v": start["vel"], "q": start["quat"], "w": start["ang_vel"],
-                 "wind": np.zeros((n, 3)), "rotor_speeds": np.full((n, 4), hover)}  # fmt: skip
+                 "wind": np.zeros((n, 3)), "rotor_speeds": np.full((n, 4), hover_speed)}  # fmt: skip
         self._state = {name: self._tensor(x) for name, x in state.items()}
         batch_params = module.BatchedMultirotorParams([params] * n, n, device)
         self._drones = module.BatchedMultirotor(batch_params, n, self._state, device, self.level, integrator="rk4")
@@ -311,11 +311,11 @@ def _mjcf(airframe: Airframe, lag: float, timestep: float) -> str:
     """Return MuJoCo's model of an airframe; ``lag`` is the time constant of the thrusts, s."""
     inertia = " ".join(f"{x:.9g}" for x in airframe.value("rigid_body.inertia", (3,)))
     hubs, signs = airframe.value("rotors.position", (4, 3)), airframe.value("rotors.yaw_torque_sign", (4,))
-    max_thrust, arm = _thrust_max(airframe), _torque_per_thrust(airframe)
+    max_thrust, torque_per_thrust = _thrust_max(airframe), _torque_per_thrust(airframe)
     sites = "".join(f'<site name="{k}" pos="{x:.9g} {y:.9g} {z:.9g}"/>' for k, (x, y, z) in enumerate(hubs))
     motors = "".join(
-        f'<general site="{k}" gear="0 0 1 0 0 {sign * arm:.9g}" ctrllimited="true" ctrlrange="0 {max_thrust:.9g}" '
-        f'dyntype="filter" dynprm="{lag:.9g}"/>'
+        f'<general site="{k}" gear="0 0 1 0 0 {sign * torque_per_thrust:.9g}" ctrllimited="true" '
+        f'ctrlrange="0 {max_thrust:.9g}" dyntype="filter" dynprm="{lag:.9g}"/>'
         for k, sign in enumerate(signs)
     )
     return f"""<mujoco><option timestep="{timestep:.9g}" gravity="0 0 -9.81"/>
