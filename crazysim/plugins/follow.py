@@ -23,7 +23,8 @@ from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 MIN_SLOT_DEGREE = 7
-"""Smallest degree of slots if later trajectories are expected: the degree of minimum snap and of drone shows."""
+"""Degree for which slots have room at least, if trajectories can be uploaded later: the degree of minimum snap and of
+drone shows."""
 DRAWN_TIME = 2.0
 """Duration of the path ahead that is drawn, s."""
 N_DRAWN_LINES = 40
@@ -147,7 +148,7 @@ class Follow(Plugin):
         Args:
             data: The data of the simulation.
             slot: The slot.
-            trajectory: The trajectory, for one vehicle.
+            trajectory: The trajectory, for one drone.
         """
         record = self.read(data)
         n_slots, n_pieces, _, n_coefficients = record.coefficients.shape

@@ -171,7 +171,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @property
     def reset_stages(self) -> tuple[str, ...]:
-        """Names of the stages that call ``reset_episode`` in the first step, as the reset pipeline did before."""
+        """Names of the stages that repeat in the first step what ``reset_episode`` did in the reset pipeline."""
         resets = self._sim.reset_pipeline
         return tuple([_reset_stage_name(p) for p in self.values() if _is_in_reset_pipeline(p) and p.name in resets])
 

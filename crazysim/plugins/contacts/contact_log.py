@@ -67,7 +67,7 @@ class ContactLog(Plugin):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return a stage of one drone, and a stage of one world for loads and other objects that plugins move.
 
-        A stage of one world computes everything for all of its drones, so it checks nothing else.
+        A stage of one world computes everything for all of its drones, so it checks only these objects.
         """
         names, placements = self._object_names(sim), []
         moved_names = moving_plugins(sim.scene.plugins(), names)

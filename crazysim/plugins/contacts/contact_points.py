@@ -56,7 +56,7 @@ class Surface(NamedTuple):
 
 
 def find_carriers(sim: Simulation, objects: ObjectSelection, excluded: Collection[str] = ()) -> list[Carrier]:
-    """Return the static scene, the chosen objects, and the chosen members of populations with an angular velocity.
+    """Return the static scene, the chosen objects, and the chosen members of populations that have an angular velocity.
 
     Objects that other plugins move, such as loads, are left out.
 
@@ -102,7 +102,7 @@ class ContactPoints(NamedTuple):
     """Points that are or may come into contact, in the body frame of a drone, or for loads in the world frame."""
 
     gap: Array
-    """Distance to the surface, m. (..., n)"""
+    """Distance to the surface, m, negative below it. (..., n)"""
     normal: Array
     """Outward normal of the surface. (..., n, 3)"""
     point: Array | None
@@ -248,9 +248,11 @@ def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> 
 
 
 def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
-    """Return functions from points and directions to a geom's frame, from directions back to the world, and a velocity.
+    """Return three functions for a geom that move with its carrier.
 
-    The velocity of the surface is a function of points in the world frame; None for a fixed surface.
+    The first transforms points or directions from the world frame to the geom's frame, the second directions back to
+    the world frame. The third returns the velocity of the surface at points in the world frame; None for a fixed
+    surface.
     """
     geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype

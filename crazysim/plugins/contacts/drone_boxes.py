@@ -30,7 +30,7 @@ def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) 
 
     Args:
         results: For each airframe: its drones, with a result that was computed as if all drones had this airframe. A
-            result is a tree of arrays, of one drone or (..., n_drones, k).
+            result is a tree of arrays, (k,) for one drone, else (..., n_drones, k).
         drone_id: Index of the drone, or indices of all drones. () or (n_drones,)
     """
     (_, result), *others = results

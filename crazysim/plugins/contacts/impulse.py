@@ -74,6 +74,7 @@ def velocity_after_contact(
         normal_speed, slip_speed = point_speeds(u)
         is_pressed = is_active & (normal_speed < target_speed)
         normal_impulse = jnp.where(is_pressed, stiffness * (target_speed - normal_speed), 0.0)
+        # Weights of the squares of the normal speed and of the slip speed.
         w_n = jnp.where(is_pressed, stiffness, 0.0)
         # In the first iteration every normal impulse is as large as if its point stopped the body alone. So friction,
         # which depends on the normal impulses, begins in the second iteration.

@@ -1,8 +1,9 @@
 """Contact response: normal forces, friction and bounces of drones at floor and objects.
 
-Without contact response the floor only stops drones. Time stepping on velocities (Moreau 1988; the convex form of
-Todorov 2014): after a step, impulses at the contact points change the velocity so that the drone no longer approaches
-the surface. An overlap is pushed out with a time constant, so that the ground is soft and no drone is thrown out of it.
+Without contact response the floor only stops drones. The method is time stepping on velocities (Moreau 1988; the
+convex form of Todorov 2014): after a step, impulses at the contact points change the velocity so that the drone no
+longer approaches the surface. An overlap is pushed out with a time constant, so that the ground is soft and no drone is
+thrown out of it.
 """
 
 from __future__ import annotations

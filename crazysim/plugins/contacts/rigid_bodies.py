@@ -1,4 +1,7 @@
-"""Contacts of free bodies: the solids that can touch, and the states after their impulses."""
+"""Contacts of free bodies: the solids that can touch, and the states after their impulses.
+
+A carrier is anything that geoms belong to: the static scene, an object or a member (``contact_points.Carrier``).
+"""
 
 from __future__ import annotations
 
@@ -82,9 +85,9 @@ class BodyContacts:
             groups += self._contacts_on_carrier(data, solids, free_solids, carrier, first_carrier + k)
         if not groups:
             return data
-        n_fixed = bodies.pos.shape[0] - n_free
+        n_others = bodies.pos.shape[0] - n_free
         friction, restitution = (
-            jnp.concatenate([x[:, 0], jnp.zeros(n_fixed, x.dtype)]) for x in (record.friction, record.restitution)
+            jnp.concatenate([x[:, 0], jnp.zeros(n_others, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = join_contacts(groups, friction, restitution)
         old_impulses = Impulses(record.normal_impulse, record.friction_impulse)
@@ -236,6 +239,6 @@ def _geom_pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.
 
 
 def _rotate_diagonal(quat: Array, diagonal: Array) -> Array:
-    """Return the matrices ``R diag(d) R^T``. (n, 3, 3)"""
+    """Return the matrices ``R diag(d) R^T`` of attitudes R, (n, 4), and diagonals d, (n, 3). (n, 3, 3)"""
     rot = rotation.matrix(quat)
     return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

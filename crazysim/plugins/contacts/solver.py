@@ -126,7 +126,10 @@ def solve_contacts(
         return relative_vel[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
 
     def velocity_change(impulse: Array) -> tuple[Array, Array]:
-        """Return the changes by impulses on the first bodies, and their opposites on the second bodies. (n, 3) each"""
+        """Return the changes of the bodies' velocities and angular velocities. (n, 3) each
+
+        The impulses act on the first bodies, and their opposites on the second bodies.
+        """
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         second_torque = torque + rotation.cross(offset, force)
         force, torque = (
@@ -195,26 +198,30 @@ def solve_contacts(
     initial = Impulses(normal_start, friction_start)
     impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
     total = impulses.normal[:, None] * normal + impulses.friction
-    vel, ang_vel = velocity_change(total)
-    energy_factor = _energy_factor(total, initial_vel, contact_velocity(vel, ang_vel))
-    impulses, total, vel, ang_vel = jax.tree.map(lambda x: energy_factor * x, (impulses, total, vel, ang_vel))
+    vel_change, ang_vel_change = velocity_change(total)
+    energy_factor = _energy_factor(total, initial_vel, contact_velocity(vel_change, ang_vel_change))
+    impulses, total, vel_change, ang_vel_change = jax.tree.map(
+        lambda x: energy_factor * x, (impulses, total, vel_change, ang_vel_change)
+    )
 
     # One gradient step with exact line search reduces the overlaps; the next time step continues.
-    separation_rate = separation_speed + rotation.dot(contact_velocity(vel, ang_vel), normal)[:, 0]
+    separation_rate = separation_speed + rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
     push_speed = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(
         separation_rate, 0.0
     )
     push_speed = jnp.maximum(push_speed, 0.0)
-    vel_change, ang_vel_change = velocity_change((push_speed / normal_response)[:, None] * normal)
+    push_vel, push_ang_vel = velocity_change((push_speed / normal_response)[:, None] * normal)
     gap_rate = jnp.sum(
-        push_speed / normal_response * rotation.dot(contact_velocity(vel_change, ang_vel_change), normal)[:, 0]
+        push_speed / normal_response * rotation.dot(contact_velocity(push_vel, push_ang_vel), normal)[:, 0]
     )
     step_size = dt * jnp.sum(push_speed / normal_response * push_speed) / jnp.where(gap_rate > 0, gap_rate, 1.0)
     moved_bodies = bodies._replace(
-        pos=bodies.pos + step_size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel
+        pos=bodies.pos + step_size * push_vel,
+        vel=bodies.vel + vel_change,
+        ang_vel=bodies.ang_vel + ang_vel_change,
     )
     impulse = _sum_for_bodies(sum_matrices[0] - sum_matrices[1], contacts.sum_pairs(total))
-    return SolvedBodies(moved_bodies, step_size * ang_vel_change, impulses, impulse)
+    return SolvedBodies(moved_bodies, step_size * push_ang_vel, impulses, impulse)
 
 
 def _shared_response(
@@ -226,7 +233,7 @@ def _shared_response(
     normal_weight: Array,
     slip_weight: Array,
 ) -> Array:
-    """Return for each body the ratio of its contacts' response to all impulses to that to their own impulse. (n,)
+    """Return for each body how many times more its contacts respond to all impulses than to their own. (n,)
 
     The ratio is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter.
     ``M`` is the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` contains the

@@ -50,8 +50,8 @@ class Terrain(Plugin):
     pos: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
-    """True to keep the flat floor around the terrain. False to remove the floor, which depressions below z = 0 need;
-    the heights of the border then extend outwards without end."""
+    """True to keep the flat floor around the terrain. False to remove it, as depressions below z = 0 require; the
+    heights of the border then extend outwards without end."""
     rgba: ArrayLike | None = color()
     """Colour; None for the colour of the floor. (4,)"""
     name: str = "terrain"

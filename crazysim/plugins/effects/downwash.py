@@ -82,14 +82,14 @@ class Downwash(Plugin):
         axis = rotation.z_axis(s.quat)
         sources = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
-        def jet_velocities(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
+        def opposite_jet_velocities(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
             return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in positions.items()}
 
-        air_velocity = reduce_over_others(jet_velocities, (s.pos, axis, sources))
-        bodies_in_jets = {name: x.replace(air_vel=-air_velocity[name]) for name, x in bodies.items()}
+        opposite_velocity = reduce_over_others(opposite_jet_velocities, (s.pos, axis, sources))
+        bodies_in_jets = {name: x.replace(air_vel=-opposite_velocity[name]) for name, x in bodies.items()}
         data = data.replace(plugins=data.plugins | bodies_in_jets)
-        return self.write(data, record.replace(air_vel=-air_velocity[self.name]))
+        return self.write(data, record.replace(air_vel=-opposite_velocity[self.name]))
 
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:

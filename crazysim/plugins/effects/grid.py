@@ -36,7 +36,7 @@ class Grid(NamedTuple):
     origin: ArrayLike = (0.0, 0.0, 0.0)
     """Position of the node with the smallest x, y and z, m. (3,)"""
     spacing: ArrayLike = 1.0
-    """Distance between neighbouring nodes, m: () or (3,)."""
+    """Distance between neighbouring nodes, m. () or (3,)"""
 
     def checked(self, name: str, k: int | None = None) -> Grid:
         """Return the grid as checked NumPy arrays, with one spacing per axis.
@@ -76,15 +76,15 @@ def interpolate(values: Array, position: Array) -> Array:
         position: Position in units of cells, 0 to n - 1 along each axis. (..., d)
 
     Returns:
-        (..., *core)
+        Interpolated values. (..., *core)
     """
     n_axes = position.shape[-1]
     axis_weights, nodes = [], []
     for k in range(n_axes):
         last_node = values.shape[k] - 1
-        cells = clip(position[..., k], 0.0, float(last_node))
-        lower_node = jnp.clip(jnp.floor(cells), 0, max(last_node - 1, 0))
-        fraction, lower_node = cells - lower_node, lower_node.astype(jnp.int32)
+        coordinate = clip(position[..., k], 0.0, float(last_node))
+        lower_node = jnp.clip(jnp.floor(coordinate), 0, max(last_node - 1, 0))
+        fraction, lower_node = coordinate - lower_node, lower_node.astype(jnp.int32)
         nodes.append((lower_node, jnp.minimum(lower_node + 1, last_node)))
         axis_weights.append((1 - fraction, fraction))
     core = (1,) * (values.ndim - n_axes)
@@ -100,14 +100,11 @@ def interpolate(values: Array, position: Array) -> Array:
 
 
 def is_inside(shape: tuple[int, ...], position: Array) -> Array:
-    """Return True for positions within a grid.
+    """Return True for positions within a grid. (...)
 
     Args:
         shape: Numbers of nodes along the axes. (d,)
         position: Position in units of cells. (..., d)
-
-    Returns:
-        (...)
     """
     last_node = jnp.asarray(np.array(shape) - 1, position.dtype)
     return jnp.all((position >= 0) & (position <= last_node), axis=-1)

@@ -66,7 +66,7 @@ class MotorFailure(Plugin):
         return data.replace(params=params, controls=controls.replace(rotor_vel=rotor_vel))
 
     def fail_in_flight(self, data: SimData) -> SimData:
-        """Make rotors of one drone fail, in their step or at random with probability ``1 - exp(-rate dt)`` a step."""
+        """Make rotors of one drone fail, in their step or at random with probability ``1 - exp(-rate dt)`` per step."""
         motors = self.read(data)
         effectiveness = motors.effectiveness
         if motors.fail_step is not None:

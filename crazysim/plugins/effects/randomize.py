@@ -238,26 +238,27 @@ class Randomize(Plugin):
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
         u = uniform(drone_key(data, self.name), (len(FACTOR_SETTINGS) + 5 + n_rotors,), dtype)
 
-        def draw_factor(limits: Array | None, random_number: Array) -> Array:
+        def draw_in_range(limits: Array | None, random_number: Array) -> Array:
             return (
                 jnp.ones_like(random_number) if limits is None else limits[0] + random_number * (limits[1] - limits[0])
             )
 
-        single_factors = [draw_factor(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
+        single_factors = [draw_in_range(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
+        # Thrust, speed and direction of the wind, charge, delay, then the thrust of each rotor.
         other_draws = u[len(FACTOR_SETTINGS) :]
-        thrust = draw_factor(record.thrust, other_draws[:1]) * draw_factor(record.rotor_thrust, other_draws[5:])
+        thrust = draw_in_range(record.thrust, other_draws[:1]) * draw_in_range(record.rotor_thrust, other_draws[5:])
         changes = {"factors": jnp.concatenate(single_factors), "thrust_factors": thrust}
         if record.wind is not None:
-            speed, angle = draw_factor(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
+            speed, angle = draw_in_range(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
         data = self.write(data, record.replace(**changes))
 
         records = dict(data.plugins)
         for name, other in data.plugins.items():
             if isinstance(other, BatteryData) and record.charge is not None:
-                charge = draw_factor(record.charge, other_draws[3:4])
+                charge = draw_in_range(record.charge, other_draws[3:4])
                 records[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:
-                steps = jnp.floor(draw_factor(record.delay, other_draws[4:5])).astype(other.delay.dtype)
+                steps = jnp.floor(draw_in_range(record.delay, other_draws[4:5])).astype(other.delay.dtype)
                 records[name] = other.replace(delay=steps)
         return data.replace(plugins=records)

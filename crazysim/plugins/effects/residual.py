@@ -153,12 +153,17 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
 
 
 def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
-    """Return the coefficients of the airframes; an error if their networks differ in size, or only some have one."""
-    drone = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
-    if drone is not None:
+    """Return the coefficients of the airframes.
+
+    Raises:
+        ConfigError: If an airframe has none, or the networks of the airframes differ in size.
+    """
+    unfitted_airframe = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
+    if unfitted_airframe is not None:
         raise ConfigError(
-            f"expected a table [residual] of drone {drone.name!r}, got none. {drone.missing_reason('residual.linear')}"
-            f"Use 'crazysim identify LOG --airframe {drone.name} --out mine.toml' on flights of it, or "
+            f"expected a table [residual] of drone {unfitted_airframe.name!r}, got none. "
+            f"{unfitted_airframe.missing_reason('residual.linear')}"
+            f"Use 'crazysim identify LOG --airframe {unfitted_airframe.name} --out mine.toml' on flights of it, or "
             f"drone='cf21B_500_idsia'."
         )
     sizes = {len(airframe.values.get("residual.hidden", ())) for airframe in sim.airframes}

@@ -34,13 +34,13 @@ class WindData(MovingAir):
     """Parameters of the wind, and the gust at every drone."""
 
     velocity: Array = leaf("parameter", 1, (3,))
-    """Mean wind, at the reference height if it depends on the height, world frame, m/s. (3,)"""
+    """Mean wind (with a profile, its value at the reference height), world frame, m/s. (3,)"""
     roughness: Array | None = leaf("parameter", 1, (1,))
     """Roughness length of the logarithmic profile, m; None for other profiles. (1,)"""
     exponent: Array | None = leaf("parameter", 1, (1,))
     """Exponent of the power-law profile, 1; None for other profiles. (1,)"""
     reference_height: Array | None = leaf("parameter", 1, (1,))
-    """Height of the mean wind, m; None for the same wind at all heights. (1,)"""
+    """Height at which the mean wind is ``velocity``, m; None for the same wind at all heights. (1,)"""
     speed_20ft: Array | None = leaf("parameter", 1, (1,))
     """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
     filters: Array | None = leaf("drone", 1, (5,))
@@ -75,13 +75,14 @@ class Wind(Plugin):
     """Wind that acts through the drag of the velocity relative to the air; needs a model with drag.
 
     The gusts have the Dryden spectra of MIL-F-8785C (3.7.1.2): white noise through filters, ``1 / (1 + t s)`` along the
-    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, ``t = L / V``. MIL-HDBK-1797 writes 2 L for L
-    across and vertically and halves these lengths, which is equivalent at low altitude. An episode begins with gusts
-    at full strength, not with calm air.
+    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, with ``t = L / V``, the scale length by the
+    airspeed. MIL-HDBK-1797 writes 2 L for L across and vertically and halves these lengths, which is equivalent at low
+    altitude. An episode begins with gusts at full strength, not with calm air.
     """
 
     velocity: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Mean wind, at the reference height with a profile, world frame, m/s. (3,) or (n_worlds, n_drones, 3)"""
+    """Mean wind (with a profile, its value at ``reference_height``), world frame, m/s.
+    (3,) or (n_worlds, n_drones, 3)"""
     speed_20ft: ArrayLike | None = parameter(default=None, low=0.0)
     """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
     moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""

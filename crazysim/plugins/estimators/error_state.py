@@ -30,8 +30,8 @@ POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
 N, N_BIASED = 9, 15
 """Number of error states without biases, and with the biases of accelerometer and gyroscope, in this order."""
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
-"""Upper bound of covariances, and lower bounds of variances by the number of errors (kalman_core.c; an assumption with
-biases, whose variances are smaller)."""
+"""Upper bound of covariances, and lower bound of variances by the number of errors. They are from kalman_core.c, except
+for the lower bound with biases, whose variances are smaller: it is an assumption."""
 NORM_EPSILON = 1e-6
 """Number that is added to a norm before a division by it (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0

@@ -190,8 +190,8 @@ class ESKF(ErrorStateFilter):
                 .reverse()
                 .to_row()
             )
-            first, last = self._path_rows(sensor, data)
-            paths = [record.paths[:first], path_back[None], record.paths[first : last - 1], record.paths[last:]]
+            first, end = self._path_rows(sensor, data)
+            paths = [record.paths[:first], path_back[None], record.paths[first : end - 1], record.paths[end:]]
             return self.write(data, record.replace(paths=jnp.concatenate(paths)))
 
         return start_path
@@ -209,16 +209,16 @@ class ESKF(ErrorStateFilter):
         """
         steps, taken_step, gravity = data.core.steps, sensor.read(data).samples.taken_step[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
-        # Negative before the last prediction.
+        # Time from the last prediction to the measurement, s; negative if the measurement was taken before.
         since_prediction = (taken_step - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq
         if not sensor.is_late:
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
-        interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
+        interval, (first, end) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
-        row, age = paths[first], (steps - taken_step) // interval  # in measurements
-        for k in range(first + 1, last):
+        row, age = paths[first], (steps - taken_step) // interval  # age in measurements of the sensor
+        for k in range(first + 1, end):
             row = jnp.where(age == k - first, paths[k], row)
         path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
         path_back = path.without_biases(estimate).reverse()
@@ -240,7 +240,7 @@ def _n_rows_in_transit(sensor: Sensor, data: SimData) -> int:
 
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
-    """Return a function that returns True in the steps in which a sensor measures, or None if it always does."""
+    """Return the condition of a stage that runs in the steps in which a sensor measures; it is None for every step."""
     return lambda data: is_tick(data, sensor.freq or data.core.freq)
 
 

@@ -31,18 +31,15 @@ FIRMWARE_RATE = 1000
 INITIAL_STD = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad (kalman_core_params_defaults.h)."""
 MEASUREMENT_STD = {
-    "pos": 0.01,
-    "quat": 4.5e-3,
-    "flow": 0.2,
-    "range": FAR_NOISE[2],
-    "distance": 0.25,
-    "difference": 0.15,
-    "sweep": 0.001,
+    "pos": 0.01,  # position by motion capture, m (crtp_localization_service.c)
+    "quat": 4.5e-3,  # attitude by motion capture, rad (crtp_localization_service.c)
+    "flow": 0.2,  # optical flow, pixels (flowdeck_v1v2.c)
+    "range": FAR_NOISE[2],  # scale of the deviation of a ``TimeOfFlight``, m (zranger2.c)
+    "distance": 0.25,  # distance to an anchor, m (lpsTwrTag.c)
+    "difference": 0.15,  # difference of two distances, m (tdoaEngine.h)
+    "sweep": 0.001,  # sweep angle of a second-generation lighthouse, rad (lighthouse_position_est.c, sweepStdLh2)
 }
-"""Standard deviations that the firmware assumes: position, m, and attitude, rad, of motion capture
-(crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of the standard deviation of a time of flight, m
-(zranger2.c), distance to an anchor, m (lpsTwrTag.c), difference of two distances, m (tdoaEngine.h), angle of a light
-plane of a station of the second generation, rad (lighthouse_position_est.c, sweepStdLh2)."""
+"""Standard deviations that the firmware assumes for measurements."""
 Std = Mapping[str, Array]
 """Standard deviations by the names of ``MEASUREMENT_STD``."""
 
@@ -75,8 +72,8 @@ class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
     The filter begins at the true state after a world's first step, with the uncertainty of the firmware after switching
-    on. Predictions run at ``freq`` and use the mean of the inertial measurements since the last prediction; a
-    measurement of another sensor is used in the step in which it arrives. In addition to an ``IMU``, the filter takes
+    on. Predictions run at ``freq`` and use the mean of the inertial measurements since the last prediction.
+    Measurements of other sensors are used in the step in which they arrive. In addition to an ``IMU``, the filter takes
     any of ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.
     """
 
@@ -85,9 +82,11 @@ class Kalman(ErrorStateFilter):
     """True to use the accelerometer along all axes, for any airframe and in wind; False for the firmware's method,
     which assumes that the force of the rotors is the only one."""
     accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
-    """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
+    """Standard deviation of accelerations in a loop of the firmware, body frame, m/s^2.
+    (3,) or (n_worlds, n_drones, 3)"""
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
-    """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
+    """Standard deviation of angular velocities in a loop of the firmware, body frame, rad/s.
+    (3,) or (n_worlds, n_drones, 3)"""
     deviations: Mapping[str, float] = setting(default_factory=dict, positive=True)
     """Standard deviations that differ from ``MEASUREMENT_STD``, by the names in it."""
     name: str = "kalman"

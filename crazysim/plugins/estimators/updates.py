@@ -1,6 +1,6 @@
 """Measurement updates of the error-state Kalman filters, for one drone.
 
-The models of the Crazyflie's firmware use the attitude ``rot`` at the end of the previous loop (the mm_*.c of
+The models of the Crazyflie's firmware use the attitude ``rot`` at the end of the previous step (the mm_*.c of
 bitcraze/crazyflie-firmware, commit 2a18fc29).
 """
 
@@ -84,7 +84,7 @@ def update_flow(
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
+        rot: Attitude at the end of the previous step, as a matrix. (3, 3)
         flow: Motion of the image along x and y of the body, pixels. (2,)
         gyro: Angular velocity as measured, body frame, rad/s. (3,)
         scale: Pixels by which the image moves at 1 rad/s. ()
@@ -110,7 +110,7 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
+        rot: Attitude at the end of the previous step, as a matrix. (3, 3)
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
     """
@@ -208,8 +208,8 @@ def update_sweep(
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
-        sensor: Position of the sensor, body frame, m. (3,)
+        rot: Attitude at the end of the previous step, as a matrix. (3, 3)
+        sensor: Position of the photodiode, body frame, m. (3,)
         station: Position of the station, world frame, m, (3,) and its attitude, station to world, as a matrix. (3, 3)
         tilt: Tilt of the plane, rad.
         angle: The angle of the sweep, rad. ()
@@ -223,7 +223,7 @@ def update_sweep(
     r_squared, radicand = jnp.where(is_visible, r_squared, 1.0), jnp.where(is_visible, radicand, 1.0)
     ratio = jnp.where(is_visible, z * tangent, 0.0) / jnp.sqrt(r_squared)
     predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt((1 - ratio) * (1 + ratio)))
-    q = tangent / jnp.sqrt(radicand)
+    q = tangent / jnp.sqrt(radicand)  # derivative of the angle with respect to z
     h = station_rot @ jnp.stack([(-y - x * z * q) / r_squared, (x - y * z * q) / r_squared, q])
     return select_estimate(is_visible, update(estimate, POS, h, angle - predicted, deviation), estimate)
 

@@ -55,7 +55,7 @@ class CollidingPlugin:
     name: Any
     """Name of the plugin, and of its loads in the scene: ``name:0``, ..."""
     size: Any
-    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    """Radius of a ball, or full lengths of a box, m. () or (3,)"""
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:

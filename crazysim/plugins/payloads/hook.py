@@ -81,7 +81,7 @@ class Hook(CollidingPlugin, Plugin):
     friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
     size: ArrayLike = setting(default=(0.14, 0.14, 0.08), positive=True, shapes=((), (3,)))
-    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    """Radius of a ball, or full lengths of a box, m. () or (3,)"""
     ring: float = setting(default=0.1275, low=0.0)
     """Height of the ring above the middle of the load, m."""
     load_at: ArrayLike | None = None
@@ -196,7 +196,7 @@ class Hook(CollidingPlugin, Plugin):
         """Return the data with another command to the hooks.
 
         Args:
-            data: Simulation.
+            data: Data of all worlds.
             grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or a shape
                 that broadcasts to it
         """
@@ -217,7 +217,7 @@ class Hook(CollidingPlugin, Plugin):
         Use it after moving drones.
 
         Args:
-            data: Simulation.
+            data: Data of all worlds.
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
@@ -266,7 +266,7 @@ class Hook(CollidingPlugin, Plugin):
         return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
 
     def head(self, data: SimData) -> LoadBody:
-        """Return the hooks, which collide while they carry nothing, of one drone or one world."""
+        """Return the heads of the hooks, balls that collide while a hook carries nothing, of one drone or one world."""
         load = self.read(data)
         up = -self._rod_directions(data, load)
         mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))

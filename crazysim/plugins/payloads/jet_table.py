@@ -22,7 +22,7 @@ class JetTable(NamedTuple):
     """Air around a hovering drone for several rotor speeds, on a regular grid that moves and turns with the drone."""
 
     speeds: ArrayLike
-    """Mean rotor speeds of the tables, rad/s, ascending. (k,)"""
+    """Means of the rotors' speeds, rad/s, ascending. (k,)"""
     pressure: Any = None
     """Pressures, Pa; None without pressures. (k, n_x, n_y, n_z)"""
     velocity: Any = None
@@ -30,11 +30,11 @@ class JetTable(NamedTuple):
     origin: ArrayLike = (0.0, 0.0, 0.0)
     """Position of the first node, relative to the drone's centre of mass, body frame, m. (3,)"""
     spacing: ArrayLike = VOXEL_EDGE
-    """Distance between neighbouring nodes, m: () or (3,)."""
+    """Distance between neighbouring nodes, m. () or (3,)"""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Numbers of tables and of nodes along x, y and z. (4,)"""
+        """Numbers of rotor speeds and of nodes along x, y and z. (4,)"""
         return np.shape(self.velocity if self.pressure is None else self.pressure)[:4]
 
     def checked(self) -> JetTable:
@@ -99,6 +99,7 @@ def load_jet_table(
             f"expected files named NAME_SPEED.txt with the rotor speed in rad/s, such as pressure_1500.txt, in "
             f"{str(folder)!r}, got {', '.join(path.name for path in files) or 'none'}"
         )
+    # By the number of columns: 1 for pressures, 3 for velocities.
     rows_by_speed: dict[int, dict[int, np.ndarray]] = {1: {}, 3: {}}
     for path, speed in path_speeds:
         try:

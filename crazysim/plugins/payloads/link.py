@@ -78,7 +78,7 @@ class LinkGeometry(NamedTuple):
 
 
 def link_geometry(state: SimState, pos: Array, vel: Array, attach: Array | None) -> LinkGeometry:
-    """Return the geometry of the link from a body to a tip."""
+    """Return the geometry of the link from a body to a tip at ``pos`` with the velocity ``vel``, world frame."""
     rot, arm = rotation.matrix(state.quat), None
     offset, rel_vel = pos - state.pos, vel - state.vel
     if attach is not None:
@@ -157,9 +157,9 @@ def couple_bodies(
 
     link_pull = UnitPull.create(geometry.direction, geometry.rot, J_inv, link.attach)
     # This is ``m * link_pull.response(link_pull, mass)``, where the product of the equal directions is 1.
-    mass_ratio = m / mass
+    link_ratio = m / mass
     if link_pull.lever is not None and link_pull.ang_acc is not None:
-        mass_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
+        link_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
     swing_square = dot(geometry.vel, geometry.vel) - radial_speed * radial_speed
     rhs = dot(geometry.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * swing_square
     rhs = rhs + _radial_term(geometry, radial_speed, rhs, link, dt, freq)
@@ -168,12 +168,12 @@ def couple_bodies(
         hinge_pull, hinge_rhs = _hinge_pull(state, deriv, geometry, rel_acc, J_inv, link, dt, freq)
         cross_ratio = dot(link_pull.direction, hinge_pull.direction) + m * link_pull.response(hinge_pull, mass)
         hinge_ratio = m * hinge_pull.response(hinge_pull, mass)
-        inverse_determinant = 1 / ((1 + mass_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
+        inverse_determinant = 1 / ((1 + link_ratio) * (1 + hinge_ratio) - cross_ratio * cross_ratio)
         tension = ((1 + hinge_ratio) * rhs - cross_ratio * hinge_rhs) * inverse_determinant
-        hinge_tension = ((1 + mass_ratio) * hinge_rhs - cross_ratio * rhs) * inverse_determinant
+        hinge_tension = ((1 + link_ratio) * hinge_rhs - cross_ratio * rhs) * inverse_determinant
         tensions, pulls = [tension, hinge_tension], [link_pull, hinge_pull]
     else:
-        tension = rhs * (1 / (1 + mass_ratio))
+        tension = rhs * (1 / (1 + link_ratio))
         tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
     if link.is_attached is not None:
         tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]

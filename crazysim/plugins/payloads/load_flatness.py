@@ -70,11 +70,11 @@ def load_flat_state(
     """
     gravity_derivatives = [gravity_vec, 0.0, 0.0, 0.0, 0.0]
     pull = [load_mass * (path[..., 2 + k, :] - g) for k, g in enumerate(gravity_derivatives)]
-    tension, rod_axis = _norm_and_direction(pull)
+    tension, rod_axis = _norm_and_direction(pull)  # axis from load to drone
     pos = [path[..., k, :] + length * rod_axis[k] for k in range(MAX_ORDER - 1)]
     force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(gravity_derivatives[:3])]
-    thrust, thrust_rate, thrust_acc = (f / mass for f in force)
-    attitude = attitude_of_thrust(thrust, thrust_rate, thrust_acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
+    specific_thrusts = [f / mass for f in force]  # with its first two derivatives
+    attitude = attitude_of_thrust(*specific_thrusts, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
     momentum = rotation.matvec(inertia, attitude.ang_vel)
     return LoadedState(
         pos=pos[0],

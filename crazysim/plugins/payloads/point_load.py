@@ -85,7 +85,7 @@ class PointLoad(CollidingPlugin):
         """Return the data with the links of some loads cut.
 
         Args:
-            data: Simulation.
+            data: Data of all worlds.
             mask: True for drones that let go of their loads, or for worlds in which all drones do; None for all.
                 (n_worlds, n_drones) or (n_worlds,)
         """
@@ -103,12 +103,12 @@ def find_integrator(sim: Simulation) -> Callable[..., SimData] | None:
 
 
 def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
-    """Return the acceleration of one drone's free load under gravity, drag and jets of rotors, m/s^2. (3,)
+    """Return the acceleration of one drone's load by gravity, drag and jets, without its link, m/s^2. (3,)
 
     Drag cannot reverse a motion (``drag_rate``), and a load without mass moves with the air.
 
     Args:
-        data: Simulation.
+        data: Data of one drone.
         load: Record of the load.
         name: Name of the load's plugin.
         dt: Duration of the step, s; None for the derivative at an instant.
@@ -175,7 +175,7 @@ def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """Return the unit vector from attachment to load, world frame, and its rate, 1/s, for one drone or all. (..., 3)
 
     Args:
-        data: Simulation with a ``SlungLoad`` or a ``Hook``.
+        data: Data of a simulation with a ``SlungLoad`` or a ``Hook``.
         name: Name of the plugin.
     """
     load: Any = data.plugins[name]

@@ -102,10 +102,10 @@ class RotorJet(Plugin):
             record, body, s = self.read(data), loads.body(data), data.states
             arm = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.pos, s.pos.dtype))
             normal = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.normal, s.pos.dtype))
-            total: Any = 0.0
+            pressure: Any = 0.0
             for k in range(s.pos.shape[-2]) if self.all_drones else (None,):
-                total = total + jet_pressure(data, record, k, body.pos[..., None, :] + arm, normal, body.vel)
-            force = total * jnp.asarray(panels.area, s.pos.dtype)
+                pressure = pressure + jet_pressure(data, record, k, body.pos[..., None, :] + arm, normal, body.vel)
+            force = pressure * jnp.asarray(panels.area, s.pos.dtype)
             torque = jnp.sum(rotation.cross(arm, force), axis=-2)
             return self.write(data, record.replace(force=jnp.sum(force, axis=-2), torque=torque))
 

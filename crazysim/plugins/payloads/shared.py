@@ -101,7 +101,7 @@ class SharedLoad(PointLoad, Plugin):
     friction: float = parameter(default=0.6, low=0.0, shapes=((),))
     """Coulomb's coefficient between load and floor."""
     size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)))
-    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    """Radius of a ball, or full lengths of a box, m. () or (3,)"""
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
@@ -145,6 +145,7 @@ class SharedLoad(PointLoad, Plugin):
         return [StagePlacement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        # The equations of ``link.couple_bodies``, for all links of a world at once.
         load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
         m, n = load.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
@@ -197,13 +198,13 @@ class SharedLoad(PointLoad, Plugin):
         top = data.states.pos if link.arm is None else data.states.pos + link.arm
         links = link_pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
         z_axis = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
-        rows = {self.name: (load.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
-        return data.objects.with_poses(rows)  # type: ignore[union-attr]
+        poses = {self.name: (load.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
+        return data.objects.with_poses(poses)  # type: ignore[union-attr]
 
     def body(self, data: SimData) -> LoadBody:
         load = self.read(data)
-        upright = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], load.pos.dtype)
-        return LoadBody(load.pos[None], upright, load.vel[None], load.mass[None])
+        identity = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], load.pos.dtype)
+        return LoadBody(load.pos[None], identity, load.vel[None], load.mass[None])
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
         return self.write(data, self.read(data).replace(vel=vel[0]))

@@ -61,7 +61,7 @@ class SlungLoad(PointLoad, Plugin):
     friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
     size: ArrayLike = setting(default=0.03, positive=True, shapes=((), (3,)))
-    """Radius of a ball, or full lengths of a box, m: () or (3,). For contacts, the floor and images."""
+    """Radius of a ball, or full lengths of a box, m, for contacts, the floor and images. () or (3,)"""
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
@@ -109,7 +109,7 @@ class SlungLoad(PointLoad, Plugin):
         Use it after moving drones.
 
         Args:
-            data: Simulation.
+            data: Data of all worlds.
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
@@ -213,8 +213,8 @@ def move_loads(
     load_axis = shape_axis(data, load, tip)
     top = data.states.pos if link.arm is None else data.states.pos + link.arm
     links = link_pieces(top if show_free_links else top - hidden_offset, offset, load.length, n_pieces)
-    rows = {name: (load.pos - hidden_offset - ring * load_axis, rotation_from_z(load_axis)), f"{name}_link": links}
-    return data.objects.with_poses(rows)  # type: ignore[union-attr]
+    poses = {name: (load.pos - hidden_offset - ring * load_axis, rotation_from_z(load_axis)), f"{name}_link": links}
+    return data.objects.with_poses(poses)  # type: ignore[union-attr]
 
 
 def shape_axis(data: SimData, load: LoadData, tip: Array) -> Array:

@@ -33,7 +33,7 @@ class CellObstacles(NamedTuple):
     """Position of the vertical axis along x, m. (...)"""
     y: Array
     """Position of the vertical axis along y, m. (...)"""
-    half_turn: Array
+    half_yaw: Array
     """Half the angle of rotation about the axis, rad. (...)"""
     size: Array
     """Size, m. (...)"""
@@ -44,7 +44,7 @@ class CellObstacles(NamedTuple):
 class StandingObstacles(Scenery):
     """Base class of upright obstacles, one in each square cell of area ``1 / density``.
 
-    Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
+    Columns of cells, which extend along y, are shifted along y by random lengths, so that no straight aisle leads along
     x. An obstacle keeps a distance of ``gap / 2`` from the edges of its cell: from every point outside the obstacles
     there is a path of width ``gap`` to every other point. The sizes of the obstacles, 8 different ones, are the same in
     all worlds.
@@ -61,7 +61,7 @@ class StandingObstacles(Scenery):
     height: float = setting(default=5.0, positive=True)
     """Height of the obstacles, m."""
     gap: float = setting(default=0.6, low=0.0)
-    """Smallest distance between two obstacles of a row of cells, and between rows, m."""
+    """Smallest distance between two obstacles of a column of cells, and between columns, m."""
 
     @property
     def sizes(self) -> tuple[float, float]:
@@ -128,7 +128,7 @@ class StandingObstacles(Scenery):
         obstacles = self.obstacles_in_cells(data, *np.divmod(self.cells_by_size, self.n_cells[1]))
         z = jnp.where(obstacles.is_standing, 0.0, -HIDDEN_DEPTH)
         pos, zero = jnp.stack([obstacles.x, obstacles.y, z], axis=-1), jnp.zeros_like(z)
-        quat = jnp.stack([zero, zero, jnp.sin(obstacles.half_turn), jnp.cos(obstacles.half_turn)], axis=-1)
+        quat = jnp.stack([zero, zero, jnp.sin(obstacles.half_yaw), jnp.cos(obstacles.half_yaw)], axis=-1)
         return pos, quat
 
     def obstacles_in_cells(self, data: SimData, column: Any, row: Any) -> CellObstacles:
@@ -175,7 +175,7 @@ class StandingObstacles(Scenery):
         return jnp.min(jnp.where(obstacles.is_standing & (distance < self.cell), distance, self.cell), axis=(0, 1))
 
     def _middle(self, column: Any, row: Any) -> tuple[Any, Any]:
-        """Return x and y of the middles of cells, before the shifts of their rows, m. (...) each"""
+        """Return x and y of the middles of cells, before the shifts of their columns, m. (...) each"""
         x, y = (
             middle + self.cell * (index - (n - 1) / 2)
             for middle, index, n in zip(np.asarray(self.center).tolist(), (column, row), self.n_cells, strict=True)
@@ -183,7 +183,7 @@ class StandingObstacles(Scenery):
         return x, y
 
     def _shift(self, data: SimData, column: Any) -> Array:
-        """Return the shift along y of cells, from their index along x, m. (...)"""
+        """Return the shifts of columns of cells along y, m. (...)"""
         return (self.read(data).uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
 
     def _size_index(self, cell: Any) -> Any:
@@ -199,7 +199,7 @@ class StandingObstacles(Scenery):
 class Forest(StandingObstacles):
     """Upright trunks, one at a random position in each square cell of area ``1 / density``.
 
-    Rows of cells along y are shifted against each other by a random length, so that there are no straight aisles along
+    Columns of cells, which extend along y, are shifted along y by random lengths, so that no straight aisle leads along
     x. A tree keeps a distance of ``gap / 2`` from the edges of its cell: from every point outside the trees there is a
     path of width ``gap`` to every other point. The radii of the trees, 8 different ones, are the same in all worlds.
     Positions differ between worlds and episodes.
@@ -251,7 +251,7 @@ class Pillars(StandingObstacles):
         return "wall", {"thickness": size, "length": size, "height": self.height}, shape
 
     def distance(self, obstacles: CellObstacles, offset: Sequence[Array]) -> Array:
-        sin, cos = jnp.sin(2 * obstacles.half_turn), jnp.cos(2 * obstacles.half_turn)
+        sin, cos = jnp.sin(2 * obstacles.half_yaw), jnp.cos(2 * obstacles.half_yaw)
         x, y, z = offset
         half_width = obstacles.size / 2
         box_pos = cos * x + sin * y, cos * y - sin * x, z

@@ -65,9 +65,9 @@ class Gates(Scenery):
             + self.wander(data, u[k], u[k + 3], record.difficulty * region_length[k])
             for k in range(3)
         ]
-        half_turn = (u[6] - 0.5) * self.turn * record.difficulty
-        quat = [0 * half_turn, 0 * half_turn, jnp.sin(half_turn), jnp.cos(half_turn)]
-        return jnp.stack([x.astype(half_turn.dtype) for x in pos], axis=-1), jnp.stack(quat, axis=-1)
+        half_yaw = (u[6] - 0.5) * self.turn * record.difficulty
+        quat = [0 * half_yaw, 0 * half_yaw, jnp.sin(half_yaw), jnp.cos(half_yaw)]
+        return jnp.stack([x.astype(half_yaw.dtype) for x in pos], axis=-1), jnp.stack(quat, axis=-1)
 
     def _undisplaced_positions(self) -> np.ndarray:
         """Return the middles of the gates before they are displaced, m. (count, 3)"""

@@ -71,13 +71,13 @@ class Rooms(Scenery):
         wall, panel = np.divmod(np.arange(self.n_walls * n_panels), n_panels)
         is_along_x = wall >= (self._room_counts()[0] - 1) * self._room_counts()[1]
         is_standing = record.uniform(self.n_walls + wall) < record.difficulty
-        has_door = jnp.floor(record.uniform(wall) * n_panels) == panel
-        depth = jnp.where(is_standing & ~has_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
+        is_door = jnp.floor(record.uniform(wall) * n_panels) == panel
+        depth = jnp.where(is_standing & ~is_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
         outer_walls = np.array([middle for _, middle in self._outer_walls()])
         pos = jnp.asarray(np.concatenate([outer_walls, self._panel_positions()]), depth.dtype)
         depth = jnp.concatenate([jnp.zeros((*depth.shape[:-1], 4), depth.dtype), depth], axis=-1)
-        half_turn = np.concatenate([[0.0, 0.0, np.pi / 4, np.pi / 4], is_along_x * np.pi / 4])
-        quat = jnp.asarray(np.stack([0 * half_turn, 0 * half_turn, np.sin(half_turn), np.cos(half_turn)], axis=-1))
+        half_yaw = np.concatenate([[0.0, 0.0, np.pi / 4, np.pi / 4], is_along_x * np.pi / 4])
+        quat = jnp.asarray(np.stack([0 * half_yaw, 0 * half_yaw, np.sin(half_yaw), np.cos(half_yaw)], axis=-1))
         pos = jnp.broadcast_to(pos, (*depth.shape, 3)) - depth[..., None] * np.array([0, 0, 1], depth.dtype)
         return pos, jnp.broadcast_to(quat.astype(depth.dtype), (*depth.shape, 4))
 

@@ -1,8 +1,8 @@
 """Base of layouts of obstacles that differ between worlds and episodes.
 
-A layout is not stored: the pose of every obstacle follows from two random words of the world by ``uniform_at``. So the
-record of a world has three numbers, whatever the number of obstacles, and the obstacles around a drone can be found
-without the poses of all others.
+A layout is not stored: the pose of every obstacle follows from two random words of the world by
+``random.uniform_at``. So the record of a world has three numbers, whatever the number of obstacles, and the obstacles
+around a drone can be found without the poses of all others.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Model(NamedTuple):
     shapes: Sequence[tuple[Shape, tuple[float, float, float]]]
     """Shapes of an obstacle, and their positions in its frame, m."""
     pos: np.ndarray
-    """Middles of the regions of the obstacles, m. They are the positions in the compiled scene, by which ray casting
-    sorts the obstacles. (n, 3)"""
+    """Middles of the regions, the squares in which obstacles stand or move, m. They are the positions in the compiled
+    scene, by which ray casting sorts the obstacles. (n, 3)"""
 
 
 class Scenery(Plugin):
@@ -103,7 +103,7 @@ class Scenery(Plugin):
             data: Data of all worlds or of one world.
 
         Returns:
-            (n_worlds, n, 3) and (n_worlds, n, 4), without n_worlds in one world
+            Positions (n_worlds, n, 3) and attitudes (n_worlds, n, 4), without n_worlds in one world
         """
         raise NotImplementedError
 
@@ -173,11 +173,11 @@ class Scenery(Plugin):
         pos, quat = self.poses(data)
         start = objects.names.index(f"{self.moved_kinds[0]}:0")
         end = start + pos.shape[0]
-        rows = {
+        poses = {
             name: jnp.concatenate([old[:start], new.astype(old.dtype), old[end:]])
             for name, old, new in (("pos", objects.pos, pos), ("quat", objects.quat, quat))
         }
-        return objects.replace(**rows)
+        return objects.replace(**poses)
 
     def wander(self, data: SimData, start: Any, velocity: Any, region_length: Any) -> Array:
         """Return the coordinate of points that move to and fro in their regions, relative to the middle, m. (...)

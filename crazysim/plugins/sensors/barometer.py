@@ -103,5 +103,5 @@ def pressure_at(altitude: Array) -> Array:
 
 def pressure_altitude(pressure: Array) -> Array:
     """Return the altitude at which the standard atmosphere has a pressure, m; the inverse of ``pressure_at``. (...)"""
-    log = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
-    return -SEA_LEVEL_TEMPERATURE / LAPSE_RATE * jnp.expm1(log / PRESSURE_EXPONENT)
+    log_ratio = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
+    return -SEA_LEVEL_TEMPERATURE / LAPSE_RATE * jnp.expm1(log_ratio / PRESSURE_EXPONENT)

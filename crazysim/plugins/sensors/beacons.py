@@ -82,7 +82,7 @@ class UWB(Sensor):
         return self.fill_record(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
 
     def ideal(self, data: SimData) -> Array:
-        """Return the distances, or their differences, m. (n,)"""
+        """Return the distances, (n_anchors,), or their differences from the first, (n_anchors - 1,), m."""
         return self._to_measurement(self._distances(data))
 
     def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
@@ -194,7 +194,7 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
 
 
 def _point_array(name: str, value: ArrayLike, min_points: int) -> np.ndarray:
-    """Return vectors as an array. (n, 3)"""
+    """Return the checked setting ``name`` as an array of vectors. (n, 3)"""
     points = np.asarray(value, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < min_points or not np.isfinite(points).all():
         raise ConfigError(f"expected {name} as at least {min_points} finite vectors (n, 3), got {points.tolist()}")

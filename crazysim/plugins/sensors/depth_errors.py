@@ -27,8 +27,8 @@ D435_MIN_DEPTH = 0.17
 D435_RESOLUTION = 1e-3
 """Steps in which a D400 camera reports depth by default, m (librealsense issue 999: 1000 um)."""
 
-MAX_ITERATIONS = 30
-"""Number of Newton steps in which a distortion must be inverted."""
+N_NEWTON_STEPS = 30
+"""Number of Newton steps that invert a distortion."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ class StereoNoise:
     """
 
     focal: float = setting(default=D435_WIDTH / 2 / np.tan(np.radians(D435_HFOV / 2)), positive=True)
-    """Focal length f of the images that are matched, pixels; these may be finer than the images of the camera."""
+    """Focal length f of the images that are matched, pixels. They may be finer than the returned images."""
     baseline: float = setting(default=D435_BASELINE, positive=True)
     """Distance b between the imagers, m."""
     disparity_noise: float = setting(default=D435_DISPARITY_NOISE, low=0.0)
@@ -63,7 +63,7 @@ class StereoNoise:
 
         Args:
             depth: True depths, m, finite. (height, width)
-            image_focal: Focal length of these images, pixels.
+            image_focal: Focal length of the image ``depth``, pixels.
             key: Random key.
         """
         deviation = depth**2 * (self.disparity_noise / (self.focal * self.baseline))
@@ -126,7 +126,7 @@ class Distortion:
         """
         u, v = x.copy(), y.copy()
         with np.errstate(all="ignore"):
-            for _ in range(MAX_ITERATIONS):
+            for _ in range(N_NEWTON_STEPS):
                 (a, b), (xx, xy, yy) = self.distort(u, v), self._slopes(u, v)
                 det = xx * yy - xy**2
                 u, v = u - (yy * (a - x) - xy * (b - y)) / det, v - (xx * (b - y) - xy * (a - x)) / det
@@ -140,7 +140,7 @@ class Distortion:
         return u, v
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of ``distort``: of x by x, of x by y (equal to that of y by x), and of y by y."""
+        """Return the derivatives of ``distort``: dx'/dx, dx'/dy (which equals dy'/dx) and dy'/dy. (...) each"""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))

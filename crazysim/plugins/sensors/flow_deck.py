@@ -163,7 +163,7 @@ def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
         pos: Position of the sensor relative to the centre of mass, body frame, m. (3,)
 
     Returns:
-        (1,) each
+        Distance and flag. (1,) each
     """
     s = data.states
     cosine = rotation.z_axis(s.quat)[2:]

@@ -39,7 +39,7 @@ ImageFn = Callable[[SimData], Images]
 
 
 class ImageData(PyTree):
-    """Images of a camera or lidar that were delivered last, and the images in transit."""
+    """The last delivered images of a camera or lidar, and the images in transit."""
 
     images: dict[str, Array] = leaf("drone", None)
     """Last image of each output. (n_worlds, n_drones, height, width), for normals (n_worlds, n_drones, height, width,
@@ -71,7 +71,7 @@ class ImageSensor(Plugin):
     drones: bool = True
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
-    """Images per second, Hz, a divisor of ``sim.freq``, in an environment of ``env.freq``; None for every step."""
+    """Images per second, Hz, a divisor of ``sim.freq``, or in an environment of ``env.freq``; None for every step."""
     latency: float = setting(default=0.0, low=0.0, high=MAX_DELAY)
     """Time from image to delivery, s, rounded to steps."""
     name: str = "images"
@@ -265,7 +265,7 @@ class ImageSensor(Plugin):
         period, latency = sampling_period(self, sim), self._latency_steps(sim.data)
 
         def update_record(data: SimData) -> SimData:
-            """Take and deliver images, in a call that is skipped if no world is due."""
+            """Take and deliver images; skip both if they are due in no world."""
 
             def update(data: SimData) -> SimData:
                 # The function is made here so that objects are visible that were added after the sensor.

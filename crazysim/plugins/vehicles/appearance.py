@@ -20,7 +20,7 @@ from crazysim.plugins.vehicles.trailer import trailer_axles
 
 BODY_COLOR, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
 RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
-"""Colours of bodies, rims, spokes, tyres and decks."""
+"""Colours of bodies, of rims, bumpers and axles, of spokes, tyres and decks."""
 CONTACT_ATTRIBUTES, NO_CONTACT_ATTRIBUTES = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
 """Attributes of geoms that drones touch, and of other geoms."""
 N_SPOKES = 5
@@ -28,7 +28,7 @@ N_SPOKES = 5
 
 
 def part_names(cars: Any) -> tuple[str, ...]:
-    """Return the names of the objects of cars, without their numbers."""
+    """Return the names of the kinds of objects of cars; a number is added for each object."""
     parts = ("body", "wheel", "drawbar", "trailer", "trailer_wheel") if cars.trailer else ("body", "wheel")
     return tuple(_object_name(cars, part) for part in parts)
 
@@ -77,22 +77,24 @@ def move_cars(objects: Objects, cars: Any, car: CarData) -> Objects:
         car: Record of the population, for one world. Leaves (n_members, ...)
     """
     vehicle = load_vehicle(cars.vehicle)
-    rows = {"body": (car.pos, car.quat), "wheel": _wheel_poses(vehicle, car)}
+    poses = {"body": (car.pos, car.quat), "wheel": _wheel_poses(vehicle, car)}
     if cars.trailer:
-        rows |= _trailer_poses(vehicle, car)
-    return objects.with_poses({_object_name(cars, part): row for part, row in rows.items()})
+        poses |= _trailer_poses(vehicle, car)
+    return objects.with_poses({_object_name(cars, part): pose for part, pose in poses.items()})
 
 
 def _wheel_poses(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     positions = wheel_positions(vehicle)
     shape = (car.pos.shape[0], len(positions))
-    body = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
-    pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(positions, ((0, 0), (0, 1))), car.pos.dtype))
-    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.kingpin_track"))[:, : len(positions) // 2]
-    steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
+    body_quat = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
+    pos = car.pos[:, None] + rotation.rotate(body_quat, jnp.asarray(np.pad(positions, ((0, 0), (0, 1))), car.pos.dtype))
+    front_steer = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.kingpin_track"))[
+        :, : len(positions) // 2
+    ]
+    steer = jnp.concatenate([front_steer, jnp.zeros_like(front_steer)], axis=-1)[..., None]
     roll_quat = _rolling_quat(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
-    quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), roll_quat))
+    quat = rotation.multiply(body_quat, rotation.multiply(heading_quat(steer), roll_quat))
     return pos.reshape(-1, 3), quat.reshape(-1, 4)
 
 
@@ -100,17 +102,17 @@ def _trailer_poses(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Ar
     """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
     radius, half_track = number("trailer.wheel_radius"), number("trailer.track") / 2
-    bar, deck = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
+    bar_quat, deck_quat = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
     front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
     roll_quat = _rolling_quat(car.distance / radius)
     wheels = []
-    for origin, attitude in ((front, bar), (rear, deck)):
+    for origin, attitude in ((front, bar_quat), (rear, deck_quat)):
         for side in (half_track, -half_track):
             offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], origin.dtype))
             wheels.append((origin + offset, rotation.multiply(attitude, roll_quat)))
     pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
     wheel = (pos.reshape(-1, 3), quat.reshape(-1, 4))
-    return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
+    return {"drawbar": (front, bar_quat), "trailer": (front, deck_quat), "trailer_wheel": wheel}
 
 
 def _above_plane(level_pos: Array, car: CarData, height: float) -> Array:
@@ -145,13 +147,13 @@ def _body_geoms(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
     A vehicle with four wheels has a plate, a hood, a cabin with a flat roof, and bumpers. Other vehicles are one box.
     """
     half_length, half_width, half_height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
-    front, floor = vehicle.number("axles.front"), 0.02
+    front, plate = vehicle.number("axles.front"), 0.02  # half the height of the plate
     if vehicle.number("wheels.number") != 4:
         return _geom_xml("box", (half_length, half_width / 2, half_height * 2), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
     inner_width = min(half_width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
-    cabin_half_height, cabin_x = half_height - floor / 2, -0.12 * half_length
+    cabin_half_height, cabin_x = half_height - plate / 2, -0.12 * half_length
     return (
-        _geom_xml("box", (half_length * 0.92, inner_width, floor), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
+        _geom_xml("box", (half_length * 0.92, inner_width, plate), (0, 0, 0), rgba, CONTACT_ATTRIBUTES)
         + _geom_xml(
             "box",
             (half_length * 0.45, inner_width * 0.8, cabin_half_height),
@@ -161,25 +163,30 @@ def _body_geoms(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
         )
         + _geom_xml(
             "box",
-            (half_length * 0.2, inner_width * 0.7, floor / 2),
-            (front - half_length * 0.12, 0, 1.5 * floor),
+            (half_length * 0.2, inner_width * 0.7, plate / 2),
+            (front - half_length * 0.12, 0, 1.5 * plate),
             rgba,
             NO_CONTACT_ATTRIBUTES,
         )
-        + _geom_xml("box", (0.008, half_width * 0.85, floor), (half_length - 0.008, 0, 0), DARK, CONTACT_ATTRIBUTES)
-        + _geom_xml("box", (0.008, half_width * 0.85, floor), (0.008 - half_length, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom_xml("box", (0.008, half_width * 0.85, plate), (half_length - 0.008, 0, 0), DARK, CONTACT_ATTRIBUTES)
+        + _geom_xml("box", (0.008, half_width * 0.85, plate), (0.008 - half_length, 0, 0), DARK, CONTACT_ATTRIBUTES)
     )
 
 
 def _wheel_geoms(radius: float, width: float) -> str:
     """Return the MJCF geoms of a wheel with the axis y: a tyre, a rim and spokes."""
-    axis, reach = 'zaxis="0 1 0"', 0.29 * radius
+    axis, half_length = 'zaxis="0 1 0"', 0.29 * radius
     rim = _geom_xml("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, NO_CONTACT_ATTRIBUTES, axis)
     spokes = ""
     for angle in np.arange(N_SPOKES) * 2 * np.pi / N_SPOKES:
-        pos, quat_wy = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
+        pos, quat_wy = (
+            (half_length * np.cos(angle), 0, -half_length * np.sin(angle)),
+            (np.cos(angle / 2), np.sin(angle / 2)),
+        )
         quat = f'quat="{quat_wy[0]:.6g} 0 {quat_wy[1]:.6g} 0"'
-        spokes += _geom_xml("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, NO_CONTACT_ATTRIBUTES, quat)
+        spokes += _geom_xml(
+            "box", (half_length, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, NO_CONTACT_ATTRIBUTES, quat
+        )
     return _geom_xml("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, CONTACT_ATTRIBUTES, axis) + rim + spokes
 
 

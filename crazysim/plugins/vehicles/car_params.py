@@ -31,7 +31,7 @@ class CarParams(PyTree):
     grip: Array = leaf("parameter", 1, (2,))
     """Largest horizontal force of front and rear axle, N. (2,)"""
     drive: Array = leaf("parameter", 1, (3,))
-    """Force of the drive per motor reference, N, its decrease with speed, N s/m, and its dry friction, N. (3,)"""
+    """Force of the drive at motor reference 1, N, its decrease with speed, N s/m, and its dry friction, N. (3,)"""
     drive_max: Array = leaf("parameter", 1, (1,))
     """Largest force of the drive, N. (1,)"""
     front_share: Array = leaf("parameter", 1, (1,))
@@ -47,10 +47,10 @@ class CarParams(PyTree):
     steer_bandwidth: Array = leaf("parameter", 1, (1,))
     """Rate at which the steering angle approaches its command, 1/s. (1,)"""
     slip_speed: Array = leaf("parameter", 1, (1,))
-    """Speed below which the forces of tyres and dry friction decrease to zero at standstill, m/s. (1,)"""
+    """Speed below which the forces of tyres and dry friction decrease, to zero at standstill, m/s. (1,)"""
     trailer: Array | None = leaf("parameter", 1, (3,))
-    """Distance of the hitch behind the centre of mass, length of the drawbar, distance of the axles of the trailer, m;
-    None without a trailer. (3,)"""
+    """Distance of the hitch behind the centre of mass, length of the drawbar, and distance between the axles of the
+    trailer, m; None without a trailer. (3,)"""
 
     @staticmethod
     def create(vehicle: VehicleModel, freq: int, trailer: bool = False) -> CarParams:

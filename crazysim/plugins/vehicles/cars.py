@@ -205,10 +205,13 @@ class Cars(Population):
     def _terrain_rates(self, data: SimData, car: CarData) -> dict[str, Array]:
         """Return the rates of position and normal of one car that follows terrain."""
         height, normal = ground_at(data, car.pos)
-        vel, rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
+        vel, settling_rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
         climb_rate = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
-        settling_vel = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
-        return {"pos": jnp.concatenate([vel[:2], climb_rate + settling_vel]), "normal": rate * (normal - car.normal)}
+        settling_vel = settling_rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        return {
+            "pos": jnp.concatenate([vel[:2], climb_rate + settling_vel]),
+            "normal": settling_rate * (normal - car.normal),
+        }
 
     def move_objects(self, data: SimData) -> Objects:
         return appearance.move_cars(data.objects, self, self.read(data))  # type: ignore[arg-type]

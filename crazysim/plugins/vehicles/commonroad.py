@@ -95,12 +95,12 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     wheelbase = front + rear
     # An axle has the load m (g l -+ a h) / L. Its slip force is friction times stiffness times load times slip angle.
     # Here forces are divided by the mass.
-    grip_front = p.friction * p.stiffness[..., :1] * (g * rear - acc * p.height) / wheelbase
-    grip_rear = p.friction * p.stiffness[..., 1:] * (g * front + acc * p.height) / wheelbase
+    stiffness_front = p.friction * p.stiffness[..., :1] * (g * rear - acc * p.height) / wheelbase
+    stiffness_rear = p.friction * p.stiffness[..., 1:] * (g * front + acc * p.height) / wheelbase
     is_slow = jnp.abs(v) < MAX_KINEMATIC_SPEED
     safe_speed = jnp.where(is_slow, 1.0, v)
-    lateral_acc_front = grip_front * (d - state.slip - front * state.yaw_rate / safe_speed)
-    lateral_acc_rear = grip_rear * (rear * state.yaw_rate / safe_speed - state.slip)
+    lateral_acc_front = stiffness_front * (d - state.slip - front * state.yaw_rate / safe_speed)
+    lateral_acc_rear = stiffness_rear * (rear * state.yaw_rate / safe_speed - state.slip)
     yaw_acc = p.mass / p.yaw_inertia * (front * lateral_acc_front - rear * lateral_acc_rear)
     slip_rate = (lateral_acc_front + lateral_acc_rear) / safe_speed - state.yaw_rate
     tan = jnp.tan(d)

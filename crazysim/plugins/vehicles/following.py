@@ -122,7 +122,7 @@ class PathController:
     speed_gain: float = setting(default=4.0, low=0.0)
     """Acceleration per error of the speed, 1/s."""
     reference_max: float = setting(default=0.25, low=0.0)
-    """Largest size of the motor reference, in the unit of the vehicle's motor reference."""
+    """Largest magnitude of the motor reference, in the unit of the vehicle's motor reference."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -192,10 +192,10 @@ class PathController:
 class PurePursuit(PathController):
     """Pure pursuit: the rear axle drives on the circle to a point ahead on the path.
 
-    ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) relative to the rear axle; the formula
-    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. The controller
-    needs no gains. It cuts corners: where the curvature jumps, the offset is about a tenth of the jump times the square
-    of the look-ahead distance.
+    The steering angle d is ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) relative to the
+    rear axle; the formula also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm",
+    1992. The controller needs no gains. It cuts corners: where the curvature jumps, the offset is about a tenth of the
+    jump times the square of the look-ahead distance.
     """
 
     lookahead: float = setting(default=0.3, positive=True)
@@ -222,8 +222,8 @@ class PurePursuit(PathController):
 class Stanley(PathController):
     """Stanley's law: front wheels along the path, plus an angle that grows with the offset of the front axle.
 
-    ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous
-    Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
+    The steering angle is ``-heading_error - arctan(k offset / (v_0 + v))`` with the speed v (Hoffmann, Tomlin,
+    Montemerlo and Thrun, "Autonomous Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
     """
 
     can_reverse: ClassVar[bool] = False

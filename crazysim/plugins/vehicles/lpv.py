@@ -41,14 +41,14 @@ class LPVGains(PyTree):
 
 
 class LPVMemory(PyTree):
-    """Memory of ``LPV``."""
+    """Memory of ``LPV``, whose docstring defines the offset e."""
 
     integral: Array = leaf("member", 1)
-    """Sum of the offsets at the ticks, scaled to ``INTEGRAL_FREQ``, m. (n_worlds, n_members, 1)"""
+    """Sum of e at the ticks, scaled to ``INTEGRAL_FREQ``, m. (n_worlds, n_members, 1)"""
     offset: Array = leaf("member", 1)
-    """Offset at the last tick, m. (n_worlds, n_members, 1)"""
+    """e at the last tick, m. (n_worlds, n_members, 1)"""
     offset_rate: Array = leaf("member", 1)
-    """Smoothed rate of the offset, m/s. (n_worlds, n_members, 1)"""
+    """Smoothed rate of e, m/s. (n_worlds, n_members, 1)"""
     started: Array = leaf("member", 1)
     """One after the first tick, zero before. (n_worlds, n_members, 1)"""
 
@@ -84,7 +84,10 @@ class LPV(PathController):
                 raise ConfigError(f"expected no {name} of LPV, got {getattr(self, name)}. Use longitudinal=.")
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> LPVGains:
-        """Return the gains; the feed-forward is ``(m / C_f) (1 - (l_r C_r - l_f C_f) / m)``."""
+        """Return the gains; the feed-forward is ``(m / C_f) (1 - (l_r C_r - l_f C_f) / m)``.
+
+        m is the mass, C the cornering stiffness of an axle, and l its distance from the centre of mass.
+        """
         m, front, rear = (float(np.asarray(x)[0]) for x in (car.mass, car.front, car.rear))
         stiffness_front, stiffness_rear = (float(x) for x in np.asarray(car.stiffness))
         feedforward = (

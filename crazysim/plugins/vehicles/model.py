@@ -146,7 +146,7 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
 
 def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
-    """Return the vehicle model of a source, which is the base of the sources ``bases``."""
+    """Return the vehicle model of a source; ``bases`` are the sources that led to it through their key ``base``."""
     if isinstance(source, VehicleModel):
         return source
     bases = extend_bases(bases, source)

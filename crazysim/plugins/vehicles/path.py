@@ -196,7 +196,7 @@ class Path(PyTree):
             t: Time since the start, s. ()
 
         Returns:
-            (1,) each
+            Arc length and speed. (1,) each
         """
         duration, is_closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
         laps = jnp.where(is_closed, lax.floor(t / duration), 0.0)

@@ -76,7 +76,9 @@ class PathLQR(PathController):
 
 
 def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) -> tuple[Array, Array]:
-    """Return the matrices A (4, 4) and B (4, 1) of offset, sideways velocity, heading and yaw rate.
+    """Return A (4, 4) and B (4, 1) of the linear model ``x' = A x + B steer``.
+
+    The state x is offset, sideways velocity, heading and yaw rate.
 
     Args:
         model: Dynamics of the vehicle.
@@ -99,7 +101,10 @@ def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) 
 def lateral_gains(
     model: Callable[..., CarState], car: CarParams, speed: Array, period: Array | float, Q: Array, R: Array
 ) -> Array:
-    """Return the four gains of the regulator at a speed, followed by the feed-forward of curvature. (5,)"""
+    """Return the four gains of the regulator at a speed, followed by the feed-forward of curvature. (5,)
+
+    See ``lateral_model`` for the arguments; ``period`` is the time between updates of the controller, s.
+    """
     A, B = lateral_model(model, car, speed)
     augmented = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
     discrete = matrix_exponential(augmented * period)  # the input is constant over a period

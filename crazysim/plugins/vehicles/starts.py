@@ -32,11 +32,11 @@ def member_array(
         member_shape: Shape for one car.
     """
     array = np.asarray(value, float)
-    shapes, finite = [member_shape, (counts[1], *member_shape), (*counts, *member_shape)], np.all(np.isfinite(array))
-    if array.shape not in shapes or not finite:
+    shapes, is_finite = [member_shape, (counts[1], *member_shape), (*counts, *member_shape)], np.all(np.isfinite(array))
+    if array.shape not in shapes or not is_finite:
         raise ConfigError(
             f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
-            f"got shape {array.shape}{'' if finite else ' with NaN or infinity'}. Use one value for "
+            f"got shape {array.shape}{'' if is_finite else ' with NaN or infinity'}. Use one value for "
             f"all cars, or one for each."
         )
     return array
