@@ -73,8 +73,10 @@ def load_flat_state(
     tension, rod_axis = _norm_and_direction(pull)  # axis from load to drone
     pos = [path[..., k, :] + length * rod_axis[k] for k in range(MAX_ORDER - 1)]
     force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(gravity_derivatives[:3])]
-    specific_thrusts = [f / mass for f in force]  # with its first two derivatives
-    attitude = attitude_of_thrust(*specific_thrusts, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
+    specific_thrust, first_derivative, second_derivative = (f / mass for f in force)
+    attitude = attitude_of_thrust(
+        specific_thrust, first_derivative, second_derivative, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:]
+    )
     momentum = rotation.matvec(inertia, attitude.ang_vel)
     return LoadedState(
         pos=pos[0],
