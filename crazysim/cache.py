@@ -29,8 +29,8 @@ from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reaso
 CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
-"""Size of all files, bytes, of about 5,000 programs. If a folder exceeds it when a process first uses the folder, the
-least recently used files are removed."""
+"""Largest size of all files, bytes: about 5,000 programs. If a folder exceeds it when a process first uses the folder,
+the least recently used files are removed."""
 TRIMMED_FRACTION = 0.8
 """Fraction of ``MAX_CACHE_BYTES`` to which a removal reduces the size, so that not every process removes files."""
 MIN_FREE_BYTES = 50_000_000

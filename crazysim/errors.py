@@ -10,13 +10,16 @@ import warnings
 import jax
 
 MAX_REPR_LENGTH = 60
-"""Largest number of characters of a value in a message."""
+"""Largest number of characters of a value in a message. A list or dict with this many entries is not shown at all."""
 SKIPPED_PACKAGES = ("crazysim", "jax", "contextlib", "functools", "importlib")
 """Packages that are skipped in the search for the user's line that caused a warning."""
 
 
 def short_repr(value: object) -> str:
-    """Return the representation of a value for a message, cut to ``MAX_REPR_LENGTH`` characters."""
+    """Return the representation of a value for a message, cut to ``MAX_REPR_LENGTH`` characters.
+
+    A long list or dict is described by its type, as "a list".
+    """
     try:
         text = (
             repr(value)

@@ -15,6 +15,7 @@ from jax import Array
 from crazysim.errors import ConfigError
 
 Scope = Literal["drone", "member", "world", "batched", "shared", "opaque", "parameter"]
+"""Scope of a leaf as a field declares it; see ``leaf``."""
 
 WITHOUT_MEMBERS = ("world", "batched", "shared", "opaque")
 """Results of ``scopes`` for leaves without an axis over members; other results are ``drone`` or a population's name."""
@@ -166,7 +167,10 @@ def n_batch_axes(scope: str) -> int:
 
 
 def n_world_axes(scope: str) -> int:
-    """Return the number of batch axes that are removed from a leaf for functions of one world."""
+    """Return the number of batch axes that a leaf loses where a function receives the data of one world.
+
+    It is 1 for leaves of members, which keep the axis over members, and 2 for leaves of worlds, (n_worlds, 1, ...).
+    """
     return 1 if has_members(scope) else n_batch_axes(scope)
 
 

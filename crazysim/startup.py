@@ -3,8 +3,8 @@
 JAX and MuJoCo read environment variables when they are imported, so these variables are set first.
 
 XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache, because the options
-``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are not features of any CPU. Real
-failures are raised as exceptions.
+``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are not features of any CPU.
+Therefore XLA's errors are hidden. Real failures are raised as exceptions.
 
 MuJoCo draws through GLFW by default, which needs a screen. Without a screen, EGL is selected if it is installed. A
 value of ``MUJOCO_GL`` that MuJoCo refuses would make the import of crazysim fail. Therefore MuJoCo is imported here,
@@ -68,7 +68,7 @@ def _is_command() -> bool:
     return name in ("crazysim", "crazysim.exe") or (name == "-m" and "crazysim" in sys.orig_argv)
 
 
-def import_required() -> None:
+def import_required_packages() -> None:
     """Import JAX and MuJoCo.
 
     Raises:
@@ -107,4 +107,4 @@ def lazy_getattr(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
 
 
 set_variables()
-import_required()
+import_required_packages()

@@ -134,7 +134,7 @@ def _as_array(
 
 
 def _is_allowed_shape(shape: tuple[int, ...], allowed: tuple[int | str, ...]) -> bool:
-    return len(shape) == len(allowed) and all(a in ("any", b) for a, b in zip(allowed, shape, strict=True))
+    return len(shape) == len(allowed) and all(length in ("any", n) for length, n in zip(allowed, shape, strict=True))
 
 
 def as_number_array(owner: str, path: str, value: Any) -> NDArray[np.float64]:
@@ -150,7 +150,7 @@ def as_number_array(owner: str, path: str, value: Any) -> NDArray[np.float64]:
     return _as_array(path, value, owner=f"{owner}: ")
 
 
-def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -> None:
+def check_numbers(owner: str, path: str, value: NDArray, key: Key, n_rotors: int = 0) -> None:
     """Check the shape and the range of a number or array.
 
     Args:
@@ -158,9 +158,9 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
         path: Table and key.
         value: The number or array.
         key: Its shapes and range.
-        n: Number of rotors.
+        n_rotors: Number of rotors, the length ``"n"`` in shapes.
     """
-    shapes = tuple(tuple(n if length == "n" else length for length in shape) for shape in key.shapes)
+    shapes = tuple(tuple(n_rotors if length == "n" else length for length in shape) for shape in key.shapes)
     read_numbers(path, value, key.range, shapes, owner=owner)
 
 
@@ -219,12 +219,12 @@ class Layout:
         """Return a hint at paths that are probably meant: first the same key in other tables, then similar ones."""
         paths = list(paths)
         table, _, key = path.rpartition(".")
-        same_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
-        keys = {p.rpartition(".")[2]: p for p in paths}
+        path_by_key_in_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
+        path_by_key = {p.rpartition(".")[2]: p for p in paths}
         candidates = [p for p in paths if p.rpartition(".")[2] == key]
-        candidates += [same_table[k] for k in difflib.get_close_matches(key, same_table)]
+        candidates += [path_by_key_in_table[k] for k in difflib.get_close_matches(key, path_by_key_in_table)]
         candidates += difflib.get_close_matches(path, paths)
-        candidates += [keys[k] for k in difflib.get_close_matches(key, keys)]
+        candidates += [path_by_key[k] for k in difflib.get_close_matches(key, path_by_key)]
         return self._did_you_mean(repr(p) for p in dict.fromkeys(candidates))
 
     def _did_you_mean(self, candidates: Iterable[str]) -> str:

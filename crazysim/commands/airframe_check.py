@@ -93,7 +93,7 @@ def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _thrust_to_weight(airframe)
     max_thrust, min_thrust = (float(airframe.value(f"rotors.thrust_{limit}")) for limit in ("max", "min"))
-    hover = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
+    hover_thrust = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
     yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {min_thrust:.3g} to {max_thrust:.3g} N"
     positions = airframe.value("rotors.position")
     wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))
@@ -112,7 +112,11 @@ def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
     if Dynamics.first_principles in supported_dynamics(airframe):
         arms["yaw"] = yaw_arm(airframe)
     for axis, (name, arm) in enumerate(arms.items()):
-        torque = min(hover - min_thrust, max_thrust - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
+        torque = (
+            min(hover_thrust - min_thrust, max_thrust - hover_thrust)
+            * arm
+            * np.sum(np.abs(airframe.mixing_matrix[axis]))
+        )
         acc = torque / airframe.inertia[axis, axis]
         rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
         yield (
@@ -124,8 +128,8 @@ def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
 
 def _rotor_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield speeds, lag and the rates of the default controller."""
-    hover, max_speed = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
-    yield "rotor speed", f"{hover:,.0f} rpm in hover, {hover / max_speed:.0%} of {max_speed:,.0f} rpm"
+    hover_speed, max_speed = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
+    yield "rotor speed", f"{hover_speed:,.0f} rpm in hover, {hover_speed / max_speed:.0%} of {max_speed:,.0f} rpm"
     yield "rotor time constant", f"{1 / rotor_rate(airframe):.3g} s in hover"
     gains: Any = Auto().params(airframe)
     damping, stiffness = float(gains.damping[0]), float(gains.stiffness[0])

@@ -1,6 +1,6 @@
-"""Commands that run on several hosts: a process on each host, and its parent process, which explains its end.
+"""Commands that run on several hosts. Each host runs the command in a child process of ``crazysim``.
 
-JAX's runtime aborts a process when another host is lost, so only the parent process can say what happened.
+JAX's runtime aborts the child process when another host is lost, so only its parent can say what happened.
 """
 
 from __future__ import annotations
@@ -193,12 +193,12 @@ def _explain_end(log: str, status: int, host: Host, arguments: Sequence[str]) ->
 
 def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
     """Connect with the other hosts, run the command, and end with them; return the exit status."""
-    log = int(os.environ.pop("CRAZYSIM_HOST_LOG"))
+    log_descriptor = int(os.environ.pop("CRAZYSIM_HOST_LOG"))
     sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1) for n in (1, 2))
     for n in (1, 2):  # for output of libraries that are not written in Python
-        os.dup2(log, n)
-    os.close(log)
-    parent = os.getppid()
+        os.dup2(log_descriptor, n)
+    os.close(log_descriptor)
+    parent_id = os.getppid()
 
     import jax
 
@@ -219,7 +219,7 @@ def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], o
         _notify_parent()
         print(f"crazysim: expected an address to listen at as {host.coordinator}, got: {error}", file=sys.stderr)
         return 2
-    threading.Thread(target=_stop_with_others, args=(host, parent), daemon=True).start()
+    threading.Thread(target=_stop_with_others, args=(host, parent_id), daemon=True).start()
     try:
         require_same_versions()
         devices = jax.local_devices()
@@ -275,18 +275,18 @@ def _end_process(host: Host, line: str, reason: str | None) -> None:
     os._exit(2)
 
 
-def _stop_with_others(host: Host, parent: int) -> None:
+def _stop_with_others(host: Host, parent_id: int) -> None:
     """End this process as soon as another host stops with an error, or the parent process has ended."""
     from crazysim.jaxcompat import connected_hosts
 
     while True:
         time.sleep(POLL_SECONDS)
-        if os.getppid() != parent:
+        if os.getppid() != parent_id:
             os._exit(2)
         hosts = connected_hosts()
         with suppress(Exception):  # the coordinator has gone: JAX's runtime ends this process
-            others = [] if hosts is None else hosts.client.key_value_dir_get(STOP_KEY)
-            for name, reason in others:
+            stop_reasons = [] if hosts is None else hosts.client.key_value_dir_get(STOP_KEY)
+            for name, reason in stop_reasons:
                 other = int(name.rpartition("/")[2])
                 if other != host.host_id:
                     _end_process(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)

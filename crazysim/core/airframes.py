@@ -153,7 +153,7 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
 
 
 def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
-    """Return a record in which empty fields ``ROTOR_MASK``, also of nested records, are True for its rotors."""
+    """Return a record in which ``None`` in fields ``ROTOR_MASK``, also of nested records, is replaced by a mask."""
     if not isinstance(record, PyTree):
         return record
     changes = {}

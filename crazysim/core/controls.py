@@ -259,7 +259,7 @@ class SimControls(PyTree):
 
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd = host_array(np.eye(16)[12], *shape, 16)
+            cmd = host_array(np.eye(16)[12], *shape, 16)  # zeros, with the identity quaternion
             has_feedforward = controller_by_level[control].follows_feedforward
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(

@@ -72,7 +72,7 @@ def check_setpoint(
 ) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
-    Arguments and errors are those of ``state_control``, but leaves of ``data`` may also be ``jax.ShapeDtypeStruct``.
+    Arguments and errors are as in ``state_control``, but leaves of ``data`` may also be ``jax.ShapeDtypeStruct``.
     """
     require_data(data)
     explicit_parts = {name: x for name, x in parts.items() if x is not None}
@@ -100,12 +100,12 @@ def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.nda
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     batch_shape = data.states.pos.shape[:2]
-    checked = {
+    checked_parts = {
         name: _check_part(name, x, batch_shape if name == "yaw" else (*batch_shape, 3)) for name, x in parts.items()
     }
-    if any(isinstance(x, jax.Array) for x in checked.values()):
-        return _device_setpoint(batch_shape, data.states.pos.dtype, checked)
-    return _setpoint(np, batch_shape, float, checked)
+    if any(isinstance(x, jax.Array) for x in checked_parts.values()):
+        return _device_setpoint(batch_shape, data.states.pos.dtype, checked_parts)
+    return _setpoint(np, batch_shape, float, checked_parts)
 
 
 def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
@@ -124,7 +124,10 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
 
 
 def _setpoint(xp: Any, batch_shape: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
-    """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)"""
+    """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)
+
+    ``xp`` is the array module: ``numpy`` or ``jax.numpy``.
+    """
     zeros = xp.zeros((*batch_shape, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
     half_yaw = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
@@ -138,7 +141,7 @@ _device_setpoint = jax.jit(functools.partial(_setpoint, jnp), static_argnums=(0,
 def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage roll, pitch, yaw, rad, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors are those of ``state_control``.
+    Arguments and errors are as in ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.attitude, controls, check_finite)))
 
@@ -146,7 +149,7 @@ def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = Fa
 def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage body rates, rad/s, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors are those of ``state_control``.
+    Arguments and errors are as in ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.body_rate, controls, check_finite)))
 
@@ -154,7 +157,7 @@ def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage collective thrust, N, and body torque, N m, for every drone. (n_worlds, n_drones, 4)
 
-    Arguments and errors are those of ``state_control``.
+    Arguments and errors are as in ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.force_torque, controls, check_finite)))
 
@@ -162,7 +165,7 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Command rotor speeds, rpm, for every drone; they take effect at the next step. (n_worlds, n_drones, n_rotors)
 
-    Arguments and errors are those of ``state_control``.
+    Arguments and errors are as in ``state_control``.
     """
     return stage_command(data, put_command(data, check_command(data, Control.rotor_vel, controls, check_finite)))
 

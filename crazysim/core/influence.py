@@ -66,13 +66,13 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     record = data.plugins.get(plugin.name)
     field_scopes = None if record is None else scopes(record)
     fields = [] if record is None else [f.name for f in dataclasses.fields(record) if not f.metadata.get("static")]
-    states = [name for name in fields if getattr(field_scopes, name) == plugin.scope]
+    state_names = [name for name in fields if getattr(field_scopes, name) == plugin.scope]
     for field, rate in rates.items():
-        if field not in states:
+        if field not in state_names:
             owner = "drone" if plugin.scope == "drone" else "member"
             raise ConfigError(
                 f"expected {title} to return rates of leaves of {owner}s in its record, which are "
-                f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
+                f"{', '.join(map(repr, state_names)) or 'none'}, got one of {field!r}. Declare such a state with "
                 f"leaf({owner!r}, ...)."
             )
         x = getattr(record, field)

@@ -20,6 +20,7 @@ from crazysim.pytree import PyTree
 R = TypeVar("R", bound=PyTree)
 
 DerivFn = Callable[[SimData], SimStateDeriv]
+"""Function from data to the time derivative of the states."""
 
 MAX_ROTATION = 1.0
 """Largest rotation per step about a body axis, rad. Angular velocities are limited to ``MAX_ROTATION * freq``.
@@ -152,7 +153,7 @@ class Integration:
         if not constraining_plugins:
             return deriv
         dt = 1 / data.core.freq
-        if self.method is symplectic_euler:
+        if self.method is symplectic_euler:  # the constraint acts on the velocities that move the positions
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
         return apply_constraint(constraining_plugins[0], influenced_data, deriv, None if self.method is rk4 else dt)

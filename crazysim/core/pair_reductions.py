@@ -23,7 +23,7 @@ Reduction = Literal["sum", "min", "max"]
 
 
 def safe_min(x: Array, axis: int) -> Array:
-    """Return the smallest number along an axis, or NaN if there is one; ``jnp.min`` with a safe derivative.
+    """Return the smallest number along an axis, or NaN if any is NaN; ``jnp.min`` with a safe derivative.
 
     ``jnp.min`` passes the derivative to the elements that equal the result. If XLA recomputes the elements with other
     rounding, no element equals the result, and the derivative is lost.
@@ -70,10 +70,10 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     def pair_fn(*args: Any) -> list[Array]:
         nonlocal structure
         *other_values, is_self = args
-        values_of_pair, structure = jax.tree.flatten(
+        pair_results, structure = jax.tree.flatten(
             jax.tree.map(jnp.asarray, fn(treedef.unflatten(other_values), is_self))
         )
-        return values_of_pair
+        return pair_results
 
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     pair_jaxpr = jax.make_jaxpr(pair_fn)(*avals, jax.ShapeDtypeStruct((), bool))
@@ -104,7 +104,11 @@ def _result_types(*args: object, jaxpr: ClosedJaxpr, n_captured: int, reduce: st
 def _batching_rule(
     axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_captured: int, reduce: str
 ) -> Any:
-    """Return the batched results and their axes: computed over the axis of drones, or bound again over other axes."""
+    """Return the batched results and their axes.
+
+    Over the axis of drones, the reduction is computed. Over any other axis, the primitive is bound again for a batched
+    ``jaxpr``.
+    """
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:
@@ -127,14 +131,18 @@ def _reduce_for_all(
     jaxpr: ClosedJaxpr,
     reduce: str,
 ) -> list[Array]:
-    """Return the reduction for each drone of a world. (n, ...) each"""
-    pair_fn, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
-    batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
+    """Return the reduction for each of ``n`` drones of a world. (n, ...) each
 
-    def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
-        captured_rows = iter(row)
+    ``captured`` and ``other`` are the captured and the published values. Their axes are None for values that all drones
+    share.
+    """
+    pair_fn, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
+    captured_by_drone = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
+
+    def reduce_for_one(i: Array, values_of_drone: Sequence[Array]) -> list[Array]:
+        remaining_values = iter(values_of_drone)
         captured_values = [
-            x if axis is None else next(captured_rows) for x, axis in zip(captured, captured_axes, strict=True)
+            x if axis is None else next(remaining_values) for x, axis in zip(captured, captured_axes, strict=True)
         ]
 
         def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
@@ -144,9 +152,9 @@ def _reduce_for_all(
         return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in pairs]
 
     if n * n <= MAX_PAIRS:
-        return jax.vmap(reduce_for_one)(indices, batched)
+        return jax.vmap(reduce_for_one)(indices, captured_by_drone)
     reduce_in_batch = jax.checkpoint(lambda xs: reduce_for_one(*xs))
-    return jax.lax.map(reduce_in_batch, (indices, batched), batch_size=max(1, MAX_PAIRS // n))
+    return jax.lax.map(reduce_in_batch, (indices, captured_by_drone), batch_size=max(1, MAX_PAIRS // n))
 
 
 reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batching_rule, _refuse_outside)

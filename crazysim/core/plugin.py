@@ -146,7 +146,7 @@ def check_parameter(
     Returns:
         (*core) or (n_worlds, n_drones, *core)
     """
-    allowed = range_between(low, high, positive)
+    allowed_range = range_between(low, high, positive)
     batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
     if core == (1,) and array.shape == batch:
         array = array[..., None]
@@ -158,7 +158,7 @@ def check_parameter(
             f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
             f"{array.dtype}"
         )
-    array = read_numbers(name, array, allowed, whole=array.dtype.kind != "f")
+    array = read_numbers(name, array, allowed_range, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
 
@@ -261,8 +261,10 @@ class Plugin:
             elif scope == "parameter" and name in settings:
                 value, core = getattr(self, name), core or sim.data.states.rotor_vel.shape[-1:]
                 dtype, per_axis = settings[name].dtype, settings[name].per_axis
-                checked = value is not None and check_parameter(sim, name, value, core, dtype=dtype, per_axis=per_axis)
-                values.setdefault(name, None if value is None else checked)
+                checked_value = value is not None and check_parameter(
+                    sim, name, value, core, dtype=dtype, per_axis=per_axis
+                )
+                values.setdefault(name, None if value is None else checked_value)
         return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:
@@ -334,7 +336,7 @@ class Plugin:
 
     @property
     def moved_kinds(self) -> tuple[str, ...] | None:
-        """Names of the objects that ``move_objects`` moves, without the number at the end; None for any object."""
+        """Names of the objects that ``move_objects`` moves, such as ``"pole"`` for ``pole:0``; None for any object."""
         return None
 
     @property

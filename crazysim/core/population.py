@@ -63,17 +63,17 @@ class Population(Plugin):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the members, in order."""
-        members, kind = self.members, type(self).__name__
+        members, class_name = self.members, type(self).__name__
         if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
             if members > MAX_MEMBERS:
-                raise ConfigError(f"expected at most {MAX_MEMBERS} members of {kind} in a world, got {members}")
+                raise ConfigError(f"expected at most {MAX_MEMBERS} members of {class_name} in a world, got {members}")
             names = tuple([f"{self.prefix}_{k}" for k in range(members)])
         else:
             names = tuple(members) if isinstance(members, Sequence) and not isinstance(members, str) else ()
         if not names or not all(isinstance(name, str) and name for name in names):
             raise ConfigError(
-                f"expected members of {kind} as a positive number or a list of names, got {members!r}. Use {kind}(2) "
-                f"or {kind}(['{self.prefix}_0'])."
+                f"expected members of {class_name} as a positive number or a list of names, got {members!r}. Use "
+                f"{class_name}(2) or {class_name}(['{self.prefix}_0'])."
             )
         if len(set(names)) < len(names):
             repeated_name = next(name for name in names if names.count(name) > 1)
@@ -256,12 +256,12 @@ def _repeat_for_members(name: str, value: Any, metadata: Mapping[str, Any], coun
     array = np.asarray(value)
     is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # a Python int such as 1 becomes the float 1.0
     dtype = np.int32 if is_integer else float_dtype() if array.dtype.kind in "iuf" else array.dtype
-    n_core = metadata["core_ndim"]
-    core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None
-    batch = array.shape[: array.ndim - n_core] if core is not None else ()
+    core_ndim = metadata["core_ndim"]
+    core = array.shape[max(array.ndim - core_ndim, 0) :] if array.ndim >= core_ndim else None
+    batch = array.shape[: array.ndim - core_ndim] if core is not None else ()
     if core is None or metadata["core"] not in (None, core) or batch not in ((), counts[1:], counts):
         raise ConfigError(
-            f"expected {name} with {n_core} dimensions for all members, or behind {counts[1:]} = (n_members,) or "
+            f"expected {name} with {core_ndim} dimensions for all members, or behind {counts[1:]} = (n_members,) or "
             f"{counts} = (n_worlds, n_members), got shape {array.shape}. Use np.broadcast_to."
         )
     return np.array(np.broadcast_to(array, (*counts, *core)), dtype)

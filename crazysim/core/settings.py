@@ -37,9 +37,9 @@ MAX_SOFTNESS = 10.0
 NUMERIC_TYPES = frozenset((int, float, np.ndarray))
 """Types of fields with numbers; ``np.ndarray`` represents ``ArrayLike``."""
 SLOW_FREQ = 200
-"""Rate of physics steps, Hz, that replaces a lower one in the check of default rates: a rate must be at least half of
-its default or of the rate of physics steps, whichever is smaller. The cascades of small drones are stable from 100 Hz
-on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
+"""Rate of physics steps, Hz, that replaces a lower one in a check of ``default_rates``: the divisor of ``freq`` that
+replaces a default rate must be at least half of that default, or of ``freq`` if it is smaller. The cascades of small
+drones are stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
 
 
 def positive_integer(name: str, value: object, at_most: int | None = None) -> int:
@@ -162,28 +162,31 @@ def check_settings(settings: Any) -> None:
     annotation or the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked
     later.
     """
-    kind = type(settings)
+    settings_class = type(settings)
     for field in dataclasses.fields(settings):
-        value, kinds = getattr(settings, field.name), allowed_types(kind)[field.name]
-        if (value is None and (type(None) in kinds or field.default is None)) or not kinds:
+        value, value_types = getattr(settings, field.name), allowed_types(settings_class)[field.name]
+        if (value is None and (type(None) in value_types or field.default is None)) or not value_types:
             continue
-        name, declared_setting = f"{field.name} of {kind.__name__}", collect_settings(kind)[field.name]
-        remedy = f"help({kind.__name__}) describes it."
-        kinds = set(kinds) - {type(None)}
-        classes = tuple(kinds - NUMERIC_TYPES)
-        if kinds == {bool}:
+        name, declared_setting = (
+            f"{field.name} of {settings_class.__name__}",
+            collect_settings(settings_class)[field.name],
+        )
+        remedy = f"help({settings_class.__name__}) describes it."
+        value_types = set(value_types) - {type(None)}
+        classes = tuple(value_types - NUMERIC_TYPES)
+        if value_types == {bool}:
             check_flag(name, value)
-        elif kinds == {NumbersByName}:
+        elif value_types == {NumbersByName}:
             if not isinstance(value, Mapping):
                 raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
             for key, item in value.items():
                 read_numbers(f"{key!r} in {name}", item, declared_setting.range, ((),), remedy=remedy)
-        elif kinds & NUMERIC_TYPES and not isinstance(value, classes):
-            shapes = declared_setting.shapes if np.ndarray in kinds or declared_setting.is_parameter else ((),)
-            is_whole = kinds & NUMERIC_TYPES == {int} or declared_setting.dtype is not None
+        elif value_types & NUMERIC_TYPES and not isinstance(value, classes):
+            shapes = declared_setting.shapes if np.ndarray in value_types or declared_setting.is_parameter else ((),)
+            is_whole = value_types & NUMERIC_TYPES == {int} or declared_setting.dtype is not None
             read_numbers(name, value, declared_setting.range, shapes, whole=is_whole, remedy=remedy)
         elif not isinstance(value, classes):
-            names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
+            names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in value_types))
             raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
 
 
@@ -399,7 +402,7 @@ def controller_at_rates(
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
     The requested rate of the command level is the rate of the outer loop if there is one; then the requested rate of
-    attitude is the rate of ``update``. A rate equal to the default of its class is replaced by a rate
+    attitude is the rate of ``update``, the inner loop. A rate equal to the default of its class is replaced by a rate
     from ``default_rates``.
 
     Args:

@@ -1,4 +1,8 @@
-"""Stages with a declared scope, such as one drone or one world, and transformations of functions to all worlds."""
+"""Stages with a declared scope, such as one drone or one world, and transformations of functions to all worlds.
+
+Leaves have scopes too, which ``leaf`` in ``crazysim.pytree`` defines. A batched leaf, (n_worlds, ...), has axes over
+worlds only; it is not the same as ``Stage.batched``, which describes a function.
+"""
 
 from __future__ import annotations
 
@@ -73,11 +77,11 @@ class Stage:
     def __call__(self, data: SimData) -> SimData:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
-            return self.apply_unbatched(data)
+            return self.apply_unmapped(data)
         return vmap_worlds(world_function(self, Axes(data)), 2)(data)
 
-    def apply_unbatched(self, data: SimData) -> SimData:
-        """Return the data after the stage, without mapping it over worlds or members.
+    def apply_unmapped(self, data: SimData) -> SimData:
+        """Return the data after the stage, from one call of its function that is not mapped over worlds or members.
 
         Args:
             data: Data as the function takes it: of one unit of the scope, or with any leading axes if ``batched``.
@@ -241,7 +245,7 @@ class Axes:
     def unbatched_shape(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the shape and type of leaf ``i`` as a stage with a scope receives it."""
         leaf_scope, n_leading = self.scopes[i], 0
-        if scope != "batch" and leaf_scope != "batched":
+        if scope != "batch" and leaf_scope != "batched":  # stages receive batched leaves unchanged
             n_leading = n_batch_axes(leaf_scope) if leaf_scope == scope else n_world_axes(leaf_scope)
         return jax.ShapeDtypeStruct(jnp.shape(x)[n_leading:], x.dtype)
 
@@ -256,8 +260,8 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
 
     Args:
         fn: The function of one world: takes any number of trees of arrays, and returns a tree of arrays.
-        min_batch_axes: Smallest number of batch axes of the leaves that are split into worlds: 2 excludes batched
-            leaves.
+        min_batch_axes: Leaves with fewer batch axes are passed unchanged. With 2, as for stages, this includes batched
+            leaves, which have one batch axis.
     """
 
     def apply_to_worlds(*args: Any) -> Any:
@@ -272,15 +276,15 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
             result = fn(*treedef.unflatten(values))
             paths, result_structure["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             result_structure["scopes"] = result_scopes = _leaf_scopes(result)
-            # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. Only shared
-            # leaves can be the same array, and then it does not matter which of them is found.
+            # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. If two shared
+            # leaves are the same array, either may be found.
             indices = {id(x): i for i, x in enumerate(values)}
             input_indices = [indices.get(id(x)) for _, x in paths]
             for k, i in enumerate(input_indices):
                 if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= min_batch_axes:
                     input_indices[k] = None  # a shared leaf, returned in a field that has a value for every world
                 elif i is not None and n_batch_axes(result_scopes[k]) < min_batch_axes:
-                    result_scopes[k] = leaf_scopes[i]  # within one world, a leaf of a foreign record loses its scope
+                    result_scopes[k] = leaf_scopes[i]  # its record may not declare a scope: one world has fewer axes
             result_structure["input_indices"] = input_indices
             for (path, _), scope, i in zip(paths, result_scopes, input_indices, strict=True):
                 if n_batch_axes(scope) < min_batch_axes and i is None:
@@ -336,7 +340,7 @@ def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
         written: list[int] = []
 
         def apply_to_values(values: list[Array]) -> list[Array]:
-            data_after = stage.apply_unbatched(axes.treedef.unflatten(values))
+            data_after = stage.apply_unmapped(axes.treedef.unflatten(values))
             written[:] = axes.written_leaves(values, data_after, stage)
             new_leaves = jax.tree.leaves(data_after)
             return [new_leaves[i] for i in written]

@@ -30,9 +30,9 @@ def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] |
     return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True)
 
 
-def _rate_condition(controller: str) -> Callable[[SimData], Array | None]:
-    """Return the condition of a stage that acts at the rate of a command level, ``data.controls.<controller>.freq``."""
-    return lambda data: is_tick(data, getattr(data.controls, controller).freq)
+def _rate_condition(level: str) -> Callable[[SimData], Array | None]:
+    """Return the condition of a stage that acts at the rate of a command level, ``data.controls.<level>.freq``."""
+    return lambda data: is_tick(data, getattr(data.controls, level).freq)
 
 
 def build_step_pipeline(

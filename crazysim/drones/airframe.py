@@ -129,7 +129,7 @@ class Airframe:
 
     @property
     def mixing_matrix(self) -> NDArray[np.float64]:
-        """Matrix from rotor thrusts to torque divided by the arm, 1. (3, n_rotors)
+        """Matrix from rotor thrusts to torque divided by the arm. (3, n_rotors)
 
         A rotor at (x, y) with thrust f exerts the torque (y f, -x f), so the rows are y / arm, -x / arm and
         the sign of the torque that its drag exerts on the body about z.

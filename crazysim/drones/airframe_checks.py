@@ -54,6 +54,9 @@ def check_airframe(airframe: Airframe) -> None:
             raise ConfigError(f"{owner}: {message}. Check the number; {GUIDE} has the units.")
 
 
+# Each check returns a message about the first problem, without its full stop, or None.
+
+
 def _check_inertia(airframe: Airframe) -> str | None:
     inertia = airframe.inertia
     moments = np.sort(np.linalg.eigvalsh(inertia))
@@ -101,11 +104,11 @@ def _check_rotors(airframe: Airframe) -> str | None:
             f"{short_repr(value('rotors.position')[:, :2].tolist())} m with "
             f"yaw_torque_sign {short_repr(signs.tolist())}"
         )
-    hover = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY_MAGNITUDE
-    if not np.all((hover >= low) & (hover <= high)):
+    hover_thrusts = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY_MAGNITUDE
+    if not np.all((hover_thrusts >= low) & (hover_thrusts <= high)):
         return (
             f"expected rotors that keep the drone level in hover with {low} to {high} N each, got "
-            f"{short_repr(hover.round(4).tolist())} N, which their positions around the centre of mass need"
+            f"{short_repr(hover_thrusts.round(4).tolist())} N, which their positions around the centre of mass need"
         )
     moments = np.linalg.eigvalsh(airframe.inertia)
     if airframe.arm * n * high / moments[0] > MAX_ANG_ACC:
@@ -138,8 +141,8 @@ def _check_curves(airframe: Airframe) -> str | None:
             k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
             torques = np.array([k0 + speed * (k1 + speed * k2) for speed in (low, high)])
             max_torque = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
-            hover = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE / airframe.n_rotors])
-            if not np.all(k1 + 2 * k2 * hover > 0):
+            hover_speed = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE / airframe.n_rotors])
+            if not np.all(k1 + 2 * k2 * hover_speed > 0):
                 return (
                     f"expected torque_curve that rises at the speed of hover, got "
                     f"{short_repr(np.atleast_2d(numbers['rotors.torque_curve']).tolist())}"

@@ -22,12 +22,12 @@ from crazysim.tables import POSITIVE, read_number
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
 PITCH_RATIO = 0.5
-"""Default ratio of the pitch to the diameter of a propeller, 1."""
+"""Default ratio of the pitch to the diameter of a propeller."""
 OUTER_MASS_SHARE = 0.4
-"""Fraction of the mass that is located at the rotors, 1; the inertias about z of the built-in airframes correspond to
+"""Fraction of the mass that is located at the rotors; the inertias about z of the built-in airframes correspond to
 0.31 to 0.53."""
 MERIT_DIAMETERS, FIGURES_OF_MERIT = (0.127, 0.254), (0.44, 0.68)
-"""Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover, 1."""
+"""Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover."""
 DRAG_RATE = 0.45
 """Ratio of linear drag to mass, 1/s; the built-in airframes that were identified from flights have 0.29 to 0.58."""
 ROTOR_TIME_CONSTANT = 0.05
@@ -36,11 +36,11 @@ MAX_TABLE_ERROR = 0.05
 """Fraction of the largest value of a motor table by which thrust or torque may fall where the speed rises, or by which
 two columns of one quantity may differ: an assumption about the errors of data sheets."""
 IDLE_THRUST_RATIO = 0.05
-"""Ratio of the smallest to the largest thrust of a rotor that is on, 1."""
+"""Ratio of the smallest to the largest thrust of a rotor that is on."""
 MOTOR_EFFICIENCY = 0.75
-"""Ratio of mechanical to electric power of a motor with its speed controller, 1."""
+"""Ratio of mechanical to electric power of a motor with its speed controller."""
 BATTERY_SHARE = 0.22
-"""Ratio of the battery's mass to the drone's mass, 1; a Crazyflie 2.1 Brushless has 0.21."""
+"""Ratio of the battery's mass to the drone's mass; a Crazyflie 2.1 Brushless has 0.21."""
 BATTERY_ENERGY = 153.0
 """Energy per mass of lithium-polymer batteries, W h/kg."""
 CELL_VOLTAGE = 3.7
@@ -321,41 +321,43 @@ def _add_thrust(
     pitch_ratio = PITCH_RATIO if pitch is None else pitch / diameter
     ct = 0.0427 + 0.144 * pitch_ratio
     if "rpm" in motor_data:
-        k, error = _fit_quadratic(motor_data["rpm"], motor_data["thrust"])
+        thrust_factor, error = _fit_quadratic(motor_data["rpm"], motor_data["thrust"])
         file.describe("motor_curve", f"Least squares T = k rpm^2 to the {table_name}, off by at most {error:.2g} N")
         source = "motor_curve"
     else:
-        k, source = ct * AIR_DENSITY * diameter**4 / 3600, "thrust_curve"
+        thrust_factor, source = ct * AIR_DENSITY * diameter**4 / 3600, "thrust_curve"
     pitch_text = f"pitch {pitch_ratio:g} D" + (" assumed" if pitch is None else "")
-    file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text)
+    file.add(
+        "rotors", "thrust_curve", np.array([0, 0, thrust_factor]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text
+    )
 
     area, rpm_to_rad_s = np.pi * diameter**2 / 4, 2 * np.pi / 60
     merit = float(np.interp(diameter, MERIT_DIAMETERS, FIGURES_OF_MERIT))
-    torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / rpm_to_rad_s, "torque_curve"
+    torque_factor, source = thrust_factor**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / rpm_to_rad_s, "torque_curve"
     if "rpm" in motor_data and "torque" in motor_data:
-        torque, error = _fit_quadratic(motor_data["rpm"], motor_data["torque"])
+        torque_factor, error = _fit_quadratic(motor_data["rpm"], motor_data["torque"])
         file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {table_name}, off by at most {error:.2g} N m")
         source = "motor_torque"
     elif "rpm" in motor_data and "power" in motor_data:
         shaft_torque = MOTOR_EFFICIENCY * motor_data["power"] / (motor_data["rpm"] * rpm_to_rad_s)
-        torque, error = _fit_quadratic(motor_data["rpm"], shaft_torque)
+        torque_factor, error = _fit_quadratic(motor_data["rpm"], shaft_torque)
         file.describe(
             "motor_power",
             f"estimate: least squares Q = k rpm^2 to the {table_name}, with {MOTOR_EFFICIENCY:g} of the electric power "
             f"at the propeller, off by at most {error:.2g} N m",
         )
         source = "motor_power"
-    file.add("rotors", "torque_curve", np.array([0, 0, torque]), "N m, N m/rpm, N m/rpm^2", source, merit=merit)
+    file.add("rotors", "torque_curve", np.array([0, 0, torque_factor]), "N m, N m/rpm, N m/rpm^2", source, merit=merit)
     return thrust
 
 
 def _check_units(mass: float, propeller: float, rotor_pos: NDArray, thrust: float) -> None:
     """Refuse numbers in other units, such as grams or inches."""
-    pressure, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(rotor_pos, axis=-1)))
-    if pressure > MAX_DISC_LOADING or reach > 20 * propeller:
+    disc_loading, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(rotor_pos, axis=-1)))
+    if disc_loading > MAX_DISC_LOADING or reach > 20 * propeller:
         raise ConfigError(
             f"expected mass in kg and lengths in m, got {mass:g} kg, propellers of {propeller:g} m, rotors up to "
-            f"{reach:.3g} m from the centre, and {thrust:.3g} N of thrust each: {pressure:.3g} N/m^2 of propeller. "
+            f"{reach:.3g} m from the centre, and {thrust:.3g} N of thrust each: {disc_loading:.3g} N/m^2 of propeller. "
             f"Convert units: 5 inches are 0.127 m."
         )
 
@@ -371,7 +373,7 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
     """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     column_names = ", ".join(COLUMNS)
-    by_quantity: dict[str, NDArray] = {}
+    column_by_quantity: dict[str, NDArray] = {}
     for key, values in columns.items():
         if str(key).strip().lower() not in COLUMNS:
             raise ConfigError(f"expected columns of a motor table among {column_names}, got {short_repr(key)}")
@@ -384,33 +386,34 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
             raise ConfigError(
                 f"expected finite numbers of at least 0 in column {key!r}, got {short_repr(array.tolist())}"
             )
-        previous = by_quantity.setdefault(quantity, array)
+        previous = column_by_quantity.setdefault(quantity, array)
         if previous.shape == array.shape and np.any(np.abs(previous - array) > MAX_TABLE_ERROR * np.max(previous)):
             k = int(np.argmax(np.abs(previous - array)))
             raise ConfigError(
                 f"expected columns of the motor table that agree on the {quantity}, got {previous[k]:.4g} and "
                 f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
             )
-    if "thrust" not in by_quantity or not np.max(by_quantity["thrust"]) > 0:
+    if "thrust" not in column_by_quantity or not np.max(column_by_quantity["thrust"]) > 0:
         raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {short_repr(list(columns))}")
-    if len({len(array) for array in by_quantity.values()}) != 1:
+    if len({len(array) for array in column_by_quantity.values()}) != 1:
         raise ConfigError("expected columns of equal lengths in the motor table")
-    if "rpm" in by_quantity:
-        is_running = by_quantity["rpm"] > 0
+    if "rpm" in column_by_quantity:
+        is_running = column_by_quantity["rpm"] > 0
         if not np.any(is_running):
             raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
-        order = np.argsort(by_quantity["rpm"][is_running], kind="stable")
-        by_quantity = {quantity: array[is_running][order] for quantity, array in by_quantity.items()}
+        order = np.argsort(column_by_quantity["rpm"][is_running], kind="stable")
+        column_by_quantity = {quantity: array[is_running][order] for quantity, array in column_by_quantity.items()}
         for quantity in ("thrust", "torque"):
-            values = by_quantity.get(quantity, np.zeros(1))
+            values = column_by_quantity.get(quantity, np.zeros(1))
             fall = np.maximum.accumulate(values) - values
             if np.max(fall) > MAX_TABLE_ERROR * np.max(values):
                 k = int(np.argmax(fall))
                 raise ConfigError(
                     f"expected a motor table whose {quantity} grows with the speed, got {values[k]:.4g} at "
-                    f"{by_quantity['rpm'][k]:.6g} rpm, and {np.max(values[:k]):.4g} below that. Check the columns."
+                    f"{column_by_quantity['rpm'][k]:.6g} rpm, and "
+                    f"{np.max(values[:k]):.4g} below that. Check the columns."
                 )
-    return by_quantity
+    return column_by_quantity
 
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
@@ -427,6 +430,7 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
 def _add_battery(
     file: _AirframeFile, mass: float, cells: int | None, capacity: float | None, resistance: float | None
 ) -> None:
+    """Add the battery, with estimates of the numbers that are None."""
     n_cells = cells or next(n_cells for n_cells, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
     charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n_cells * CELL_VOLTAGE)
     file.add("battery", "cells", n_cells, "1, in series", "given" if cells else "cells")

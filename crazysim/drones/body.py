@@ -22,7 +22,7 @@ MATERIALS = {
 }
 """Colours that all drones share, rgba."""
 
-BATTERY_VOLUME = 1.2e-4
+BATTERY_VOLUME_PER_MASS = 1.2e-4
 """Default ratio of the battery's volume to the drone's mass, m^3/kg; the built-in airframes have 0.8e-4 to 1.7e-4."""
 
 
@@ -73,7 +73,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     height = float(np.mean(rotors[:, 2]))
     gaps = np.linalg.norm(rotors[:, None, :2] - rotors[None, :, :2], axis=-1)
     spacing = float(np.min(gaps[gaps > 0], initial=2 * reach))
-    battery_thickness = (BATTERY_VOLUME * float(airframe.value("rigid_body.mass")) / 6) ** (1 / 3)
+    battery_thickness = (BATTERY_VOLUME_PER_MASS * float(airframe.value("rigid_body.mass")) / 6) ** (1 / 3)
     shape = {
         "battery": np.array([3, 2, 1]) * battery_thickness,
         "plate": np.array([0.75, 0.55, 0.04]) * reach,
@@ -85,7 +85,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
         "led_radius": 0.06 * reach,
     } | dict(airframe.tables.get("shape", {}))
 
-    plate, battery, led = shape["plate"], shape["battery"], shape["led_radius"]
+    plate, battery, led_radius = shape["plate"], shape["battery"], shape["led_radius"]
     shape = {"battery_height": (plate[2] + battery[2]) / 2} | shape
     battery_top = shape["battery_height"] + battery[2] / 2
     half_height = max(0.5 * shape["motor_height"] + shape["propeller_height"], abs(height) / 2 + battery[2])
@@ -95,7 +95,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
         "led_heights": np.array(
             [max(battery_top, plate[2] / 2), min(shape["battery_height"] - battery[2] / 2, -plate[2] / 2)]
         )
-        + led / 2 * np.array([1, -1]),
+        + led_radius / 2 * np.array([1, -1]),
         "collision_sphere": np.array([0, 0, height / 2, reach + shape["propeller_radius"]]),
         "collision_box": np.array([0, 0, height / 2, *half_sides, half_height]),
         "fpv_camera": np.array([0.9 * plate[0], 0, 0]),

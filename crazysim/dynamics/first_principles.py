@@ -32,9 +32,9 @@ class Params(PyTree):
     mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     L: Array = leaf("parameter", 1)
-    """Arm that scales the first two rows of the mixing matrix, m; (n_rotors,) if rotors differ. (1,)"""
+    """Arm that scales the first two rows of the mixing matrix, m. (1,), or (n_rotors,) if rotors differ"""
     prop_inertia: Array = leaf("parameter", 1)
-    """Inertia of a propeller and motor about its axis, kg m^2; (n_rotors,) if rotors differ. (1,)"""
+    """Inertia of a propeller and motor about its axis, kg m^2. (1,), or (n_rotors,) if rotors differ"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration, world frame, m/s^2. (3,)"""
     J: Array = leaf("parameter", 2)
@@ -42,19 +42,20 @@ class Params(PyTree):
     J_inv: Array = leaf("parameter", 2)
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve, N, N/rpm, N/rpm^2; (n_rotors, 3) if rotors differ. (1, 3)"""
+    """Thrust curve, N, N/rpm, N/rpm^2. (1, 3), or (n_rotors, 3) if rotors differ"""
     rpm2torque: Array = leaf("parameter", 2)
-    """Drag torque curve, N m, N m/rpm, N m/rpm^2; (n_rotors, 3) if rotors differ. (1, 3)"""
+    """Drag torque curve, N m, N m/rpm, N m/rpm^2. (1, 3), or (n_rotors, 3) if rotors differ"""
     mixing_matrix: Array = leaf("parameter", 2)
-    """Mixing matrix, rotor thrusts to torque: positions over L, and signs of the drag torque, 1. (3, n_rotors)"""
+    """Mixing matrix, rotor thrusts to torque: positions over L, and signs of the drag torque. (3, n_rotors)"""
     drag_matrix: Array = leaf("parameter", 2)
     """Linear drag coefficients, body frame, N s/m. (3, 3)"""
     rotor_dyn_coef: Array = leaf("parameter", 2)
-    """Rotor lag on spin-up and spin-down, 1/s, 1/(s rpm); (n_rotors, 4) if rotors differ. (1, 4)"""
+    """Coefficients of ``rotor_acceleration`` on spin-up, then on spin-down, 1/s, 1/(s rpm). (1, 4), or (n_rotors, 4) if
+    rotors differ"""
     rotor_vel_min: Array = leaf("parameter", 1)
-    """Minimum speed of a rotor that is on, rpm; (n_rotors,) if rotors differ. (1,)"""
+    """Minimum speed of a rotor that is on, rpm. (1,), or (n_rotors,) if rotors differ"""
     rotor_vel_max: Array = leaf("parameter", 1)
-    """Maximum rotor speed, rpm; (n_rotors,) if rotors differ. (1,)"""
+    """Maximum rotor speed, rpm. (1,), or (n_rotors,) if rotors differ"""
 
     @staticmethod
     def create(airframe: Airframe) -> Params:
@@ -121,14 +122,14 @@ def dynamics(
     body_force = along_z(jnp.sum(thrust, axis=-1)) + body_drag_force(quat, vel, p.drag_matrix)
     force = rotation.rotate(quat, body_force, offset=dist_f)
 
-    sign = p.mixing_matrix[..., 2, :]
+    yaw_torque_sign = p.mixing_matrix[..., 2, :]
     torque = rotor_torque(thrust, drag_torque, p.L, p.mixing_matrix)
-    torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
+    torque = torque + reaction_torque(rotor_acc, yaw_torque_sign, p.prop_inertia)
     if dist_t is not None:
         torque = rotation.rotate_inverse(quat, dist_t, offset=torque)
 
     acc = linear_acceleration(force, p.mass, p.gravity_vec)
-    momentum = rotor_momentum(rotor_vel, sign, p.prop_inertia)
+    momentum = rotor_momentum(rotor_vel, yaw_torque_sign, p.prop_inertia)
     if dt is None:
         ang_acc = angular_acceleration(torque, ang_vel, p.J, p.J_inv, momentum)
     else:
@@ -165,18 +166,18 @@ def hover_rotor_vel(params: Params) -> Array:
 
 def pad_rotors(params: Params, n_rotors: int) -> Params:
     """Return the parameters of an airframe padded to ``n_rotors``; added rotors have no thrust, torque or speed."""
-    n_present = params.mixing_matrix.shape[-1]
-    if n_present == n_rotors:
+    n_own_rotors = params.mixing_matrix.shape[-1]
+    if n_own_rotors == n_rotors:
         return params
 
     def extend(x: Array, axis: int, mode: Any = "constant") -> np.ndarray:
         array = np.asarray(x)
         per_rotor = (
-            np.broadcast_to(array, [*array.shape[:axis], n_present, *array.shape[axis + 1 :]])
+            np.broadcast_to(array, [*array.shape[:axis], n_own_rotors, *array.shape[axis + 1 :]])
             if array.shape[axis] == 1
             else array
         )
-        return np.pad(per_rotor, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)], mode)
+        return np.pad(per_rotor, [(0, n_rotors - n_own_rotors if k == axis else 0) for k in range(array.ndim)], mode)
 
     curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
     limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}

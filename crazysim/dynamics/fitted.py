@@ -26,7 +26,7 @@ from crazysim.rotation import along_z, matvec
 
 MIN_FITTED_COSINE = math.cos(math.radians(80))
 MIN_BLENDED_COSINE = math.cos(math.radians(88))
-"""Cosines of the pitch at which the blend of the fit into the spring begins, and of the pitch at which it ends, 1."""
+"""Cosines of the pitch at which the blend of the fit into the spring begins, and of the pitch at which it ends."""
 MAX_FITTED_MAGNITUDE = 100.0
 """Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 
@@ -49,7 +49,7 @@ class Params(PyTree):
     acc_coef: Array = leaf("parameter", 1, (1,))
     """Thrust at command zero, N. (1,)"""
     cmd_f_coef: Array = leaf("parameter", 1, (1,))
-    """Thrust per commanded thrust, 1. (1,)"""
+    """Thrust per commanded thrust, dimensionless. (1,)"""
     rpy_coef: Array = leaf("parameter", 1)
     """Stiffness of roll, pitch and yaw, 1/s^2. (3,)"""
     rpy_rates_coef: Array = leaf("parameter", 1)
@@ -160,10 +160,13 @@ def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p:
     weight = blend * blend * blend * (10 - 15 * blend + 6 * blend * blend)
 
     # Where the weight is zero the fit is evaluated at rest: 0 * inf is NaN, in gradients too.
-    level = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
+    level_quat = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
     is_fitted = weight > 0
     fitted_acc = _euler_spring(
-        jnp.where(is_fitted, quat, level), jnp.where(is_fitted, ang_vel, 0.0), jnp.where(is_fitted, cmd_rpy, 0.0), p
+        jnp.where(is_fitted, quat, level_quat),
+        jnp.where(is_fitted, ang_vel, 0.0),
+        jnp.where(is_fitted, cmd_rpy, 0.0),
+        p,
     )
 
     error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd_rpy)), quat)

@@ -85,7 +85,7 @@ def thrust_in_flight(
         blade: Coefficient b, N s^2/(m rad). (...)
         radius: Radius of the propeller, m. (...)
         air_density: Density of air, kg/m^3. (...)
-        ceiling: ``ceiling_factor`` g, 1. (...)
+        ceiling: Factor g from ``ceiling_factor``, dimensionless. (...)
     """
     hover_thrust = jnp.where(static_thrust > 0, static_thrust, 0.0)
     disc, loss = disc_factor(radius, air_density), blade * ang_vel
@@ -107,7 +107,7 @@ def thrust_in_flight(
 
 
 def ceiling_factor(gap: Array, radius: Array) -> Array:
-    """Return half the ratio of the air speed in the far wake to the air speed at the disc, below a ceiling, 1. (...)
+    """Return half the ratio of the air speed in the far wake to the air speed at the disc, below a ceiling. (...)
 
     The factor is ``1/2 + 1/2 sqrt(1 + (R / d)^2 / 8)`` for a disc at a distance d. Below the ceiling, the air flows
     inwards at the velocity ``v r / (2 d)`` at a distance r from the axis (conservation of mass). Therefore the suction

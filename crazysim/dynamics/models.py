@@ -12,7 +12,7 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
 MAX_LAG_STEP = 1.5
-"""Largest ratio of the time step to the time constant of a lag, 1. Euler steps diverge at a ratio of 2; at 1.5, a lag
+"""Largest ratio of the time step to the time constant of a lag. Euler steps diverge at a ratio of 2; at 1.5, a lag
 overshoots by half its error."""
 GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
 """Gravitational acceleration, world frame, m/s^2."""

@@ -14,7 +14,7 @@ from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
 CASCADE_NAME = "mellinger"
-"""Crazyflow's name for its cascade, which is ``controller="crazyflow"`` here; not the controller ``Mellinger``."""
+"""Crazyflow's name for its cascade of controllers, which is ``"crazyflow"`` here; not the controller ``Mellinger``."""
 _CORE_KEYS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
 _ROTOR_NAMES = {
     "thrust_curve": "rpm2thrust",

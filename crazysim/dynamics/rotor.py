@@ -15,8 +15,9 @@ RPM_TO_RAD_S = 2 * math.pi / 60
 def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> Array:
     """Return the accelerations of the rotors towards their command, rpm/s.
 
-    ``a (cmd - r) + b (cmd^2 - r^2)``: a motor's back-EMF gives the linear term, the propeller's drag the
-    quadratic one. Spinning up is driven and spinning down is coasting, so each has its own pair (a, b).
+    The acceleration at the speed r is ``a (cmd - r) + b (cmd^2 - r^2)``. A motor's back-EMF gives the linear term, the
+    propeller's drag the quadratic one. Spinning up is driven and spinning down is coasting, so each has its own pair
+    (a, b).
 
     Args:
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
@@ -60,8 +61,8 @@ def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Arr
     """
     positions = mixing_matrix[..., :2, :]
     # One arm scales two sums, which costs less than to scale each thrust.
-    tilt = L * matvec(positions, thrust) if L.shape[-1] == 1 else matvec(positions, L * thrust)
-    return jnp.concatenate([tilt, matvec(mixing_matrix[..., 2:, :], drag_torque)], axis=-1)
+    roll_pitch_torque = L * matvec(positions, thrust) if L.shape[-1] == 1 else matvec(positions, L * thrust)
+    return jnp.concatenate([roll_pitch_torque, matvec(mixing_matrix[..., 2:, :], drag_torque)], axis=-1)
 
 
 def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
@@ -110,7 +111,7 @@ def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
 
 
 def thrust_slope(thrust: Array, rpm2thrust: Array) -> Array:
-    """Return the slope of the thrust curve at the speed with a given thrust, N/rpm; zero for thrusts below its minimum.
+    """Return the slope of the thrust curve at the speed with a given thrust, N/rpm; zero below the curve's minimum.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)

@@ -107,6 +107,7 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     # Origin and direction in units of cells.
     u, v = (origin.x + shape.size[0]) / side_x, (origin.y + shape.size[1]) / side_y
     du, dv = direction.x / side_x, direction.y / side_y
+    # Distance at which the ray enters the grid, seen from above.
     start = jnp.zeros_like(origin.x)
     for p, step, n in ((u, du, n_columns - 1), (v, dv, n_rows - 1)):
         is_moving = jnp.abs(step) > MIN_COMPONENT

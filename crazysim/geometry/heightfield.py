@@ -1,7 +1,7 @@
 """Signed distances to a height field: the solid below triangles over a grid, with walls and a bottom.
 
-Only the triangles of the cells near a point are examined, so the cost does not depend on the size of the grid. Their
-indices depend on the data.
+Only the triangles of the cells near a point are examined, so the cost does not depend on the size of the grid. The
+indices of these triangles are computed from the point.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     Args:
         shape: Height field.
         point: Points in the frame of the field, m. (..., 3)
-        radius: Distance up to which the result is exact, m; at least one side of a cell.
+        radius: Distance up to which the result is exact, m. Values below the side of a cell act as one side.
     """
     position = to_vector(point)
     x_half, y_half, _, base = shape.size

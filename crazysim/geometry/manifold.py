@@ -25,7 +25,7 @@ EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
 FACE_BIAS = 1e-3
 """Preference for faces of the first box, as a fraction of the smallest half length: a face of the second box is chosen
 only if its overlap is smaller by this length. Otherwise rounding would choose between the faces of aligned boxes, and
-impulses of the last step would not match the points."""
+the impulses of the last step, from which a solver may start, would not match the points."""
 FACE_SHARE = 1 - 1e-4
 """Fraction of a face within which the corners of the other face are separate points. Closer to the border, the clipped
 edges give the points; they are clipped at ``2 - FACE_SHARE`` times the half lengths of the face."""
@@ -180,6 +180,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
     det = jnp.where(jnp.abs(det) > 1e-12, det, 1e-12)
     face_offsets = face_corners - middle[:2]
+    # Position on the other face, from -1 to 1 along each of its half edges.
     p = (face_offsets[:, 0] * edge_2[1] - face_offsets[:, 1] * edge_2[0]) / det
     q = (edge_1[0] * face_offsets[:, 1] - edge_1[1] * face_offsets[:, 0]) / det
     valid.append((jnp.abs(p) < FACE_SHARE) & (jnp.abs(q) < FACE_SHARE))
@@ -196,14 +197,14 @@ def _edge_contact(
 ) -> tuple[Array, Array, Array]:
     """Return gap, normal and point of the contact of edge ``edge_pair // 3`` of b with edge ``edge_pair % 3`` of a."""
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
-    ends = []
+    edges = []  # middle, direction and half length of the edge of each box
     for (half, pos, rot), number, side in zip(boxes, (edge_pair % 3, edge_pair // 3), (-1.0, 1.0), strict=True):
         local_normal = matvec(rot.T, normal)
         is_edge = jnp.arange(3) == number
         local_middle = jnp.where(is_edge, 0.0, side * jnp.where(local_normal < 0, -1.0, 1.0) * half)
         direction = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
-        ends.append((pos + matvec(rot, local_middle), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
-    (p, u, half_p), (q, v, half_q) = ends
+        edges.append((pos + matvec(rot, local_middle), direction, jnp.sum(jnp.where(is_edge, half, 0.0))))
+    (p, u, half_p), (q, v, half_q) = edges
     offset_pq = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, offset_pq), (v, offset_pq)))
     det = jnp.maximum(1 - c * c, MIN_EDGE_SINE**2)

@@ -73,18 +73,18 @@ def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDire
     """Return the direction with the largest gap: ``best``, or a candidate normal of the Minkowski difference."""
     b, edges = pair.other, pair.edges
     box_axes = [axis_vector(k, pair.centre.x) for k in range(3)]
-    sides = {"box": box_axes, "cylinder": box_axes[2:]}.get(b.kind, [])
-    faces = [*(edges if is_box else []), *sides]
+    side_axes = {"box": box_axes, "cylinder": box_axes[2:]}.get(b.kind, [])
+    normals = [*(edges if is_box else []), *side_axes]
     if b.kind == "box":
-        faces += [normalize(edge.cross(axis), axis, MIN_SQUARED_SINE) for edge in edges for axis in box_axes]
-    if faces:
-        n = stack_vectors([*faces, *(-n for n in faces)])
+        normals += [normalize(edge.cross(axis), axis, MIN_SQUARED_SINE) for edge in edges for axis in box_axes]
+    if normals:
+        n = stack_vectors([*normals, *(-n for n in normals)])
         best = _select_best((pair.gap(n), n), best)
     if b.kind == "box":
         return best
     if b.kind == "mesh":
         best = larger_gap(_best_face_normal(pair), best)
-    best = _select_best(_best_perpendicular(pair, stack_vectors([*edges, *sides])), best)
+    best = _select_best(_best_perpendicular(pair, stack_vectors([*edges, *side_axes])), best)
     return _best_ellipsoid_normal(pair, best) if b.kind == "ellipsoid" else best
 
 
@@ -113,7 +113,7 @@ def _best_face_normal(pair: ShapePair) -> BestDirection:
 
 def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
     """Return the direction with the largest gap: ``best``, or an ellipsoid's normal at a point nearest to a corner."""
-    shortest = min(range(3), key=lambda k: pair.other.size[k])
+    shortest_axis = min(range(3), key=lambda k: pair.other.size[k])
 
     def try_corner(k: Array, best: BestDirection) -> BestDirection:
         point = pair.centre
@@ -121,7 +121,7 @@ def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirectio
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
         n = normalize(Vector(*ellipsoid_normal(pair.other, (point.x, point.y, point.z))), best[1])
         # The nearest point may be on the wrong side of the ellipsoid, so the mirror image is tried too.
-        sign = [-1.0 if k == shortest else 1.0 for k in range(3)]
+        sign = [-1.0 if k == shortest_axis else 1.0 for k in range(3)]
         return pair.with_candidate(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.with_candidate(n, best))
 
     return lax.fori_loop(0, 2 ** len(pair.edges), try_corner, best)
@@ -135,11 +135,14 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     there is no further corner between them. Each arc gives such an estimate, and the search is refined in the best
     arc, on the side where the gap still increases.
     """
-    # Angles start at the cross product with the coordinate axis that is closest to perpendicular.
+    # The basis of the plane is (e, f). Angles are measured from e, the cross product with the coordinate axis that is
+    # closest to perpendicular.
     x, y, z = (jnp.abs(v) for v in (axis.x, axis.y, axis.z))
     frame_axes = [axis_vector(k, axis.x) for k in range(3)]
-    farthest = select_vector((x <= y) & (x <= z), frame_axes[0], select_vector(y <= z, frame_axes[1], frame_axes[2]))
-    e = normalize(axis.cross(farthest), frame_axes[0])
+    reference_axis = select_vector(
+        (x <= y) & (x <= z), frame_axes[0], select_vector(y <= z, frame_axes[1], frame_axes[2])
+    )
+    e = normalize(axis.cross(reference_axis), frame_axes[0])
     f = axis.cross(e)
 
     def direction(n: PlaneVector) -> Vector:
@@ -178,7 +181,7 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     # An arc is (n, p, m, q, peak): directions n and m with support points p and q, and the estimate between them.
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first = support_point(start)
-    _, _, gap, widest_arc = lax.fori_loop(
+    _, _, gap, initial_arc = lax.fori_loop(
         0, N_ARCS, try_arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
     )
 
@@ -192,7 +195,7 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         m, q = _choose(is_rising, m, middle), _choose(is_rising, q, r)
         return jnp.where(middle_gap > gap, middle_gap, gap), (n, p, m, q, _choose(middle_gap > gap, middle, peak))
 
-    _, (*_, peak) = lax.fori_loop(0, N_ARC_STEPS, narrow_arc, (gap, widest_arc))
+    _, (*_, peak) = lax.fori_loop(0, N_ARC_STEPS, narrow_arc, (gap, initial_arc))
     n = direction(peak)
     n = normalize(n, e)
     return pair.gap(n), n

@@ -98,28 +98,28 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
     The unknown is s = t + min(a)^2, which keeps its precision where the point is near the centre.
     """
-    axes = np.asarray(shape.size)
-    gaps = (axes**2 - axes.min() ** 2).tolist()
+    semi_axes = np.asarray(shape.size)
+    square_gaps = (semi_axes**2 - semi_axes.min() ** 2).tolist()
     # A point on a plane of symmetry may have two nearest points. Every point is therefore moved away from these planes,
     # by twice the machine epsilon times the semi-axis.
-    displacements = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
-    displaced = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, displacements, strict=True)]
-    scaled = [a * p for a, p in zip(shape.size, displaced, strict=True)]
+    displacements = (2 * float(jnp.finfo(point[0].dtype).eps) * semi_axes).tolist()
+    displaced_point = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, displacements, strict=True)]
+    scaled_point = [a * p for a, p in zip(shape.size, displaced_point, strict=True)]
 
-    def newton_step(s: Array, scaled: list[Array]) -> Array:
-        inverse = [1 / (s + gap) for gap in gaps]
-        terms = [(x * i) ** 2 for x, i in zip(scaled, inverse, strict=True)]
+    def newton_step(s: Array, scaled_point: list[Array]) -> Array:
+        inverses = [1 / (s + gap) for gap in square_gaps]
+        terms = [(x * i) ** 2 for x, i in zip(scaled_point, inverses, strict=True)]
         square = sum(terms)
-        slope = sum(term * i for term, i in zip(terms, inverse, strict=True))
+        slope = sum(term * i for term, i in zip(terms, inverses, strict=True))
         return s + square * (jnp.sqrt(square) - 1) / slope
 
-    constants = [lax.stop_gradient(x) for x in scaled]
-    start = constants[0] * 0
-    for x, gap in zip(constants, gaps, strict=True):
+    constant_point = [lax.stop_gradient(x) for x in scaled_point]
+    start = constant_point[0] * 0
+    for x, gap in zip(constant_point, square_gaps, strict=True):
         start = maximum(start, jnp.abs(x) - gap)
-    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton_step(s, constants), start)
-    s = newton_step(s, scaled)  # the last step carries the derivative of the root
-    x, y, z = (p / (s + gap) for p, gap in zip(displaced, gaps, strict=True))
+    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton_step(s, constant_point), start)
+    s = newton_step(s, scaled_point)  # the last step carries the derivative of the root
+    x, y, z = (p / (s + gap) for p, gap in zip(displaced_point, square_gaps, strict=True))
     return x, y, z
 
 

@@ -90,7 +90,10 @@ def _plane_distance(origin: Components, direction: Components) -> tuple[Array, A
 
 
 def slab_interval(origin: Array, direction: Array, half: Array | float) -> Interval:
-    """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
+    """Return the interval of a line between two parallel planes at ``-half`` and ``half``.
+
+    ``origin`` and ``direction`` are the components of the line along the normal of the planes. (...) each
+    """
     is_parallel = jnp.abs(direction) < MIN_COMPONENT
     inverse = 1 / jnp.where(is_parallel, MIN_COMPONENT, direction)
     a, b = (-half - origin) * inverse, (half - origin) * inverse

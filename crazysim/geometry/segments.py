@@ -77,8 +77,8 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
 def _largest_gap(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
     """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
-    faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
-    largest_gap = maximum(maximum(faces[0], faces[1]), faces[2])
+    face_gaps = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
+    largest_gap = maximum(maximum(face_gaps[0], face_gaps[1]), face_gaps[2])
     for i, j in ((1, 2), (2, 0), (0, 1)):
         square = axis[i] * axis[i] + axis[j] * axis[j]
         is_defined = square > MIN_SQUARED_SINE

@@ -119,10 +119,10 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
             f"outside; omit faces for up to {MAX_HULL_VERTICES} vertices, and they are computed"
         )
     # Coplanar triangles share a plane through the outermost vertex, so that all vertices are inside.
-    planes = _unique_normals(normals)
-    offsets = np.max(v @ planes.T, axis=0)
+    plane_normals = _unique_normals(normals)
+    offsets = np.max(v @ plane_normals.T, axis=0)
     used_vertices, indices = np.unique(triangles, return_inverse=True)
-    return Shape("mesh", (), *map(_read_only_copy, (v[used_vertices], indices.reshape(-1, 3), planes, offsets)))
+    return Shape("mesh", (), *map(_read_only_copy, (v[used_vertices], indices.reshape(-1, 3), plane_normals, offsets)))
 
 
 def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
@@ -188,13 +188,15 @@ def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
     triangles: list[tuple[int, int, int]] = []
     for normal in _unique_normals(outward_normals):
         heights_along = v @ normal
-        side = np.flatnonzero(heights_along >= heights_along.max() - 2 * tolerance)
+        side_vertices = np.flatnonzero(heights_along >= heights_along.max() - 2 * tolerance)
         axis = np.eye(3)[np.argmin(np.abs(normal))]
         x = np.cross(normal, axis)
-        middle = v[side] - v[side].mean(axis=0)
-        angle = np.arctan2(middle @ np.cross(normal, x), middle @ x)
-        side = side[np.argsort(angle)]
-        triangles += [(side[0], side[n], side[n + 1]) for n in range(1, len(side) - 1)]
+        offsets = v[side_vertices] - v[side_vertices].mean(axis=0)
+        angle = np.arctan2(offsets @ np.cross(normal, x), offsets @ x)
+        side_vertices = side_vertices[np.argsort(angle)]
+        triangles += [
+            (side_vertices[0], side_vertices[n], side_vertices[n + 1]) for n in range(1, len(side_vertices) - 1)
+        ]
     return np.array(triangles, np.int64).reshape(-1, 3)
 
 

@@ -1,5 +1,8 @@
 """Support functions and support points of convex shapes.
 
+The support point of a shape along a direction is its point farthest in that direction. The support function is the
+coordinate of that point along the direction.
+
 A support point is selected by the sign of a number that is often zero up to rounding, for example where two sides are
 parallel. A compiler that computes such a number twice with different rounding would mix two corners into a point
 outside the shape. Within a small angle of a tie the support point is therefore interpolated between the two.
@@ -72,6 +75,7 @@ def _ellipsoid_point(shape: Shape, n: Vector) -> Vector:
 
 
 def _mesh_products(shape: Shape, n: Vector) -> tuple[Array, list[Array]]:
+    """Return the products of a direction with all vertices, (..., n_vertices), and the x, y and z of the vertices."""
     x, y, z = (jnp.asarray(column, n.x.dtype) for column in shape.array("vertices").T)
     return x * n.x[..., None] + y * n.y[..., None] + z * n.z[..., None], [x, y, z]
 

@@ -29,7 +29,7 @@ def closest_point(a: Vector, b: Vector, c: Vector) -> Barycentric:
 
 
 def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
-    """Return the same as ``closest_point`` if the nearest point is not on the side from ``b`` to ``c``."""
+    """Return the same as ``closest_point``, but without the side from ``b`` to ``c`` as a candidate."""
     ab, ac = b - a, c - a
     s, t = _nearest_on_segment(a, ab), _nearest_on_segment(a, ac)
     point_on_side = _nearer_point((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)

@@ -1,4 +1,4 @@
-"""The simulation: its data, its pipeline of stages, and the shell that holds them."""
+"""The simulation: its data, its pipelines of stages, and the class ``Sim``, which holds them."""
 
 from crazysim.control import Control
 from crazysim.core.integration import Integrator

@@ -108,7 +108,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     if len(staged_leaves(data)) > 1 and FEEDFORWARD not in parameters:
         stages = [stage("drone")(_stage_default_feedforward), *stages]
     program = fuse(lower_stages(stages, data))
-    leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
+    leaves, names = jax.tree.leaves(data), [x.name for x in program.leaves]
     command = _command_field(data)
     state = [names.index(name) for name in STATES]
     inputs = [names.index(command), *_parameter_leaves(program, parameters, command)]
@@ -192,7 +192,7 @@ def _command_field(data: SimData) -> str:
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
     """Return the indices of the leaves requested as parameters."""
-    names = [leaf.name for leaf in program.leaves]
+    names = [x.name for x in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
         raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")
     choices = [

@@ -1,4 +1,4 @@
-"""Sampling model-predictive control (MPPI) with rollouts in worlds of the engine, with the full dynamics."""
+"""Sampling model-predictive control (MPPI) with rollouts in a second simulation, with the full dynamics."""
 
 from __future__ import annotations
 
@@ -159,8 +159,9 @@ class MPPI:
             self._sim.add(plugin)
         self.period = self.substeps / freq
         """Time from one command to the next, s."""
-        self.hover, self.low, self.high, default = _command_range(sim)
-        self.noise = default if noise is None else read_floats("noise", noise).astype(float_dtype())
+        # Commands: in hover, smallest and largest. (k,) each
+        self.hover, self.low, self.high, default_noise = _command_range(sim)
+        self.noise = default_noise if noise is None else read_floats("noise", noise).astype(float_dtype())
         if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
             raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
@@ -228,8 +229,8 @@ class MPPI:
             setpoint=jax.tree.map(self._repeat_for_samples, setpoints),
             cost=jnp.zeros((n_worlds * self.samples, n_drones, 1), plan.dtype),
         )
-        final = self._step(self._rollouts(data, record), self.horizon * self.substeps)
-        costs = final.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
+        final_data = self._step(self._rollouts(data, record), self.horizon * self.substeps)
+        costs = final_data.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         excess_cost = costs - jnp.min(costs, axis=1, keepdims=True)
         is_finite = jnp.isfinite(excess_cost)  # the plan of a drone does not change if all of its rollouts fail
@@ -309,22 +310,29 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     """Return the hover command, smallest and largest commands, and standard deviation of samples. (k,) each"""
     airframe, level = sim.airframe, sim.control
     mass = float(airframe.value("rigid_body.mass", ()))
-    low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
-    high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
+    min_thrust = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
+    max_thrust = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
     weight = -GRAVITY[2] * mass
-    thrust_deviation = 0.2 * (high - low)
+    thrust_deviation = 0.2 * (max_thrust - min_thrust)
     if level == Control.rotor_vel:
         min_rotor_vel, max_rotor_vel = rotor_vel_limits(sim.dynamics, airframe)
-        hover = min_rotor_vel + (max_rotor_vel - min_rotor_vel) * np.sqrt(max(weight - low, 0.0) / (high - low))
+        hover = min_rotor_vel + (max_rotor_vel - min_rotor_vel) * np.sqrt(
+            max(weight - min_thrust, 0.0) / (max_thrust - min_thrust)
+        )
         n = airframe.n_rotors
         rows = [[hover] * n, [min_rotor_vel] * n, [max_rotor_vel] * n, [0.05 * max_rotor_vel] * n]
     elif level == Control.force_torque:
-        max_torque = 0.5 * airframe.arm * (high - low)
+        max_torque = 0.5 * airframe.arm * (max_thrust - min_thrust)
         torque = np.array([max_torque, max_torque, 0.1 * max_torque])
-        rows = [[weight, 0, 0, 0], [low, *-torque], [high, *torque], [thrust_deviation, *(0.05 * torque)]]
+        rows = [[weight, 0, 0, 0], [min_thrust, *-torque], [max_thrust, *torque], [thrust_deviation, *(0.05 * torque)]]
     else:
-        limit, deviation = (
+        limits, deviations = (
             ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
         )
-        rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, thrust_deviation]]
+        rows = [
+            [0, 0, 0, weight],
+            [*(-x for x in limits), min_thrust],
+            [*limits, max_thrust],
+            [*deviations, thrust_deviation],
+        ]
     return tuple(np.asarray(row, float_dtype()) for row in rows)  # type: ignore[return-value]

@@ -165,12 +165,12 @@ class Sim:
         self.device, self.mesh, self.engine = c.device, mesh, engine
 
         self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
-        kernels = RayKernels.choose(engine, self.device, mesh, strict)
+        ray_kernels = RayKernels.choose(engine, self.device, mesh, strict)
         self._scene = Scene(
             xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh, self.plugins.values,
-            kernels,
+            ray_kernels,
         )  # fmt: skip
-        self._adopted_revision = self._scene.revision
+        self._adopted_revision = self._scene.revision  # of the scene whose objects are in the data
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = SceneQueries(self._scene)
         self._seed = as_key(rng_key)

@@ -113,11 +113,12 @@ def state_variable_filter(
     from scipy.linalg import expm  # a fifth of a second to import
 
     y, t = np.atleast_2d(np.asarray(y, np.float64)), np.asarray(t, np.float64)
-    grid = np.linspace(t[0], t[-1], len(t))
+    even_times = np.linspace(t[0], t[-1], len(t))
+    # ``u`` is the input of the low-pass, the signals at even times.
     if zero_order_hold:
-        u = y[:, np.clip(np.searchsorted(t, grid + 1e-9, side="right") - 1, 0, len(t) - 1)]
+        u = y[:, np.clip(np.searchsorted(t, even_times + 1e-9, side="right") - 1, 0, len(t) - 1)]
     else:
-        u = np.stack([np.interp(grid, t, x) for x in y])
+        u = np.stack([np.interp(even_times, t, x) for x in y])
     order, omega = N_deriv + 2, 2 * np.pi * f_c
     poles = np.exp(1j * np.pi * (2 * np.arange(1, order + 1) + order - 1) / (2 * order))
     # State: signal and derivatives in the time unit 1 / omega, then the input and its change over a sample.
@@ -146,5 +147,5 @@ def state_variable_filter(
     else:
         backward_pass = low_pass(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
     states = low_pass(backward_pass, np.concatenate([np.diff(backward_pass, axis=1), zero], axis=1))
-    interpolated = [[np.interp(t, grid, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
+    interpolated = [[np.interp(t, even_times, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
     return np.squeeze(np.array(interpolated))

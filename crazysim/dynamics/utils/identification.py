@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 RATE_RANGE = (0.5, 500.0)
 """Range in which the rate of the thrust's lag is searched, 1/s."""
 BLOCK_DURATION = 5.0
-"""Duration of the blocks of time for the standard deviations of the rotation, which follow from the scatter between
-blocks, s. The translation has ten blocks for each log on average."""
+"""Duration of a block of samples, s. The standard deviations of the rotation's parameters follow from the scatter
+between blocks. For the translation, a log has ten blocks on average."""
 EDGE_DURATION = 0.5
 """Duration at both ends of a log, s, that is omitted: the 6 Hz filters start there at rest, with a wrong velocity."""
 FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
@@ -53,7 +53,7 @@ def sys_id_translation(
         plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
 
     Returns:
-        ``cmd_f_coef``, thrust per commanded thrust, 1; with a lag ``thrust_dyn_coef``, its rate, 1/s; with drag
+        ``cmd_f_coef``, thrust per commanded thrust; with a lag ``thrust_dyn_coef``, its rate, 1/s; with drag
         ``drag_xy_coef`` and ``drag_z_coef``, N s/m.
     """
     del verbose  # an argument of Crazyflow
@@ -115,6 +115,7 @@ def fit_translation(
     model = Dynamics(dynamics)
 
     def solve_for_rate(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
+        """Return the sum of squared residuals, coefficients, their terms, and residuals for a rate of the lag."""
         parts = [_acceleration_terms(model, mass, log, rate, gravity) for log in logs]
         terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
         coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
@@ -123,9 +124,9 @@ def fit_translation(
 
     rate = np.inf
     if model != Dynamics.so_rpy:
-        grid = np.geomspace(*RATE_RANGE, 31)
-        k = int(np.argmin([solve_for_rate(x)[0] for x in grid]))
-        bounds = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
+        rates = np.geomspace(*RATE_RANGE, 31)
+        k = int(np.argmin([solve_for_rate(x)[0] for x in rates]))
+        bounds = np.log(rates[[max(0, k - 1), min(len(rates) - 1, k + 1)]])
         result = minimize_scalar(
             lambda x: solve_for_rate(np.exp(x))[0], bounds=bounds, method="bounded", options={"xatol": 1e-7}
         )
@@ -146,7 +147,7 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
     """Return the parameters of ``sys_id_rotation`` for several logs, and their standard deviations."""
     from scipy.optimize import least_squares  # a fifth of a second to import
 
-    groups = []
+    results = []  # values and standard deviations, of roll and pitch, then of yaw
     for axes in ([0, 1], [2]):
         data = [_angle_samples(log, axes) for log in logs]
 
@@ -162,12 +163,12 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
             for key in ("SVF_rpy", "SVF_drpy", "SVF_cmd_rpy", "SVF_ddrpy")
         ]
         guess = np.linalg.lstsq(np.stack(columns[:3], -1), columns[3], rcond=None)[0]
-        start = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
+        initial_values = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
         error = lambda x, residuals=residuals: residuals(x).ravel()  # noqa: E731
         jacobian: Any = lambda x, slopes=slopes: -slopes(x).reshape(-1, 3)  # noqa: E731
-        x = least_squares(error, start, jacobian, method="lm").x
-        groups.append((x, _standard_deviations(slopes(x), residuals(x), _block_numbers(logs))))
-    (tilt_values, tilt_deviations), (yaw_values, yaw_deviations) = groups
+        x = least_squares(error, initial_values, jacobian, method="lm").x
+        results.append((x, _standard_deviations(slopes(x), residuals(x), _block_numbers(logs))))
+    (tilt_values, tilt_deviations), (yaw_values, yaw_deviations) = results
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
     values = {name: np.array([tilt_values[k], tilt_values[k], yaw_values[k]]) for k, name in enumerate(names)}
     deviations = {
@@ -223,7 +224,10 @@ def _angle_samples(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[f
 
 
 def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
-    """Return the angles of damped springs with parameters ``x``, exact for commands linear between samples. (n, k)"""
+    """Return the angles of damped springs, exact for commands that are linear between samples. (n, k)
+
+    ``x`` is stiffness, damping and gain; ``start`` has the first angles and their rates.
+    """
     stiffness, damping, gain = x
     zero = jnp.zeros_like(gain)
     system = jnp.array([
@@ -245,6 +249,7 @@ def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
 
 @jax.jit
 def _residual(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Array:
+    """Return the logged angles minus the simulated ones; for the arguments see ``_simulate``. (n, k)"""
     return rpy - _simulate(x, dt, cmd, start)
 
 
