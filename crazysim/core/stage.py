@@ -1,7 +1,7 @@
 """Stages with a declared scope, such as one drone or one world, and transformations of functions to all worlds.
 
 Leaves have scopes too, which ``leaf`` in ``crazysim.pytree`` defines. A batched leaf, (n_worlds, ...), has axes over
-worlds only; it is not the same as ``Stage.batched``, which describes a function.
+worlds only. ``Stage.batched`` is another term: it describes a function that accepts any leading axes.
 """
 
 from __future__ import annotations
@@ -284,7 +284,8 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
                 if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= min_batch_axes:
                     input_indices[k] = None  # a shared leaf, returned in a field that has a value for every world
                 elif i is not None and n_batch_axes(result_scopes[k]) < min_batch_axes:
-                    result_scopes[k] = leaf_scopes[i]  # its record may not declare a scope: one world has fewer axes
+                    # A batched leaf of another library's record appears as opaque without its axis over worlds.
+                    result_scopes[k] = leaf_scopes[i]
             result_structure["input_indices"] = input_indices
             for (path, _), scope, i in zip(paths, result_scopes, input_indices, strict=True):
                 if n_batch_axes(scope) < min_batch_axes and i is None:
