@@ -30,8 +30,8 @@ class AllocationParams(PyTree):
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
     weight: Array | None = leaf("parameter", 1, (1,), default=None)
-    """Weight, N: roll and pitch torque may raise the collective thrust up to this value. None for allocation without
-    priorities. (1,)"""
+    """Weight, N, to which roll and pitch torque may raise the collective thrust in ``crazysim.control.priority``; None
+    for no such limit. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:

@@ -27,11 +27,11 @@ class AttitudeParams(PyTree):
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, PWM. (3,)"""
     kw: Array = leaf("parameter", 1)
-    """Gain on the body rates, PWM s/rad. (3,)"""
+    """Gain on the error of the body rates, PWM s/rad. (3,)"""
     ki_m: Array = leaf("parameter", 1)
-    """Gain on the integral of the rotation error, PWM/(rad s). (3,)"""
+    """Gain on the integral of the negative rotation error, PWM/(rad s). (3,)"""
     kd_omega: Array = leaf("parameter", 1)
-    """Gain on the derivative of the body rates, PWM s^2/rad. (3,)"""
+    """Gain on the derivative of the error of the body rates, PWM s^2/rad. (3,)"""
     int_err_max: Array = leaf("parameter", 1)
     """Limit of the integral of the rotation error, rad s. (3,)"""
     torque_pwm_max: Array = leaf("parameter", 1)
@@ -88,9 +88,9 @@ def attitude2force_torque(
     """Return the wrench that rotates the drone to an attitude, and the new integral.
 
     This is the attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie
-    firmware: without the factor one half on the rotation error, with a derivative of the rates, and in PWM units. Each
-    torque and then each rotor is clipped independently, whereas the firmware lowers all rotors by the largest excess. A
-    thrust of zero or less switches the motors off.
+    firmware: without the factor one half on the rotation error, with a derivative of the rate error, and in PWM units.
+    Each torque and then each rotor is clipped independently, whereas the firmware lowers all rotors by the largest
+    excess. A thrust of zero or less switches the motors off.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -99,7 +99,7 @@ def attitude2force_torque(
         ang_vel_des: Desired body rates, rad/s. (..., 3)
         prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
         prev_ang_vel_des: Desired body rates at the previous tick, rad/s. (..., 3)
-        r_int_error: Integral of the rotation error, rad s. (..., 3)
+        r_int_error: Integral of the negative rotation error, rad s. (..., 3)
         ctrl_freq: Rate of this controller, Hz.
         params: Gains, shared or with the leading axes of the state.
 
@@ -150,7 +150,7 @@ def body_rate2force_torque(
         cmd: Desired body rates, rad/s, and collective thrust, N. (..., 4)
         prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
         prev_cmd: Command of the previous tick. (..., 4)
-        r_int_error: Integral of the rotation error, rad s. (..., 3)
+        r_int_error: Integral of the negative rotation error, rad s. (..., 3)
         ctrl_freq: Rate of this controller, Hz.
         params: Gains, shared or with the leading axes of the state.
 

@@ -80,7 +80,7 @@ STIFFNESS_RATIO = 0.12
 OBSERVER_RATE_RATIO = 0.6
 """Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
 MAX_COMPENSATED_ERROR = 0.5
-"""Rotation error with a feedback torque as large as the largest unknown torque that is compensated, rad."""
+"""Largest unknown torque that is compensated, as the rotation error with a feedback torque of that size, rad."""
 YAW_RATE_MAX = 35.0
 """Largest desired rate about body z that holds a heading, rad/s. It is the range of a Crazyflie's gyroscope (BMI088,
 data sheet)."""

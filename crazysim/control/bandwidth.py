@@ -1,7 +1,8 @@
 """Gains of controllers: the highest bandwidth that the rotors and the rate of a controller allow.
 
-If the rotors have the lag rate ``a``, and kp and kd are the gains per inertia on attitude and body rate, the
-characteristic polynomial is ``s^3 / a + s^2 + kd s + kp``. The rule here is
+Let a be the rate at which the rotors follow their command (the lag rate), and kp and kd the gains per inertia on
+attitude and body rate (``stiffness`` and ``damping``). The characteristic polynomial is ``s^3 / a + s^2 + kd s + kp``.
+The rule here is
 
     kd = a,   kp = 0.3 a^2,   about yaw with a / 2 or less in place of a, since rotors have less authority there,
 
@@ -15,7 +16,7 @@ line kp e + kd e' = 0, on which the rotors must brake with the angular accelerat
 it (``max_ang_acc``), the drone turns faster than it can stop. Therefore ``max_gain_ratios`` bounds kp / kd.
 
 The second limit is the reaction to accelerating rotors: a rotor that speeds up turns the body the other way at once.
-Let r be the lag rate, and z the ratio of the changes of a rotor's angular momentum and drag torque
+Let r be the ``rotor_rate``, and z the ratio of the changes of a rotor's angular momentum and drag torque
 (``momentum_per_torque``). In the first tick, the yaw torque is then up to 1 + r z times the demanded torque. A
 controller that does not model this may remove at most ``MAX_YAW_CORRECTION`` of an error of the yaw rate in a tick.
 """
@@ -71,7 +72,7 @@ def fastest_rotor_rate(airframe: Airframe) -> float:
 
 
 def _lag_rates(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
-    """Return the rates of the lag at a speed of the rotors, rpm, on spin-up and spin-down, 1/s. (n, 2)"""
+    """Return the rates of the lag at a speed of the rotors, rpm, on spin-up and spin-down, 1/s. (n_rotors, 2)"""
     lag = np.atleast_2d(airframe.value("rotors.lag"))
     return lag[:, 0::2] + 2 * lag[:, 1::2] * rotor_vel[:, None]
 
@@ -105,8 +106,8 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
     torques = []
     for axis in (1, 2):
         ratio = thrusts_per_wrench[:, axis] / lift_shares
-        # At a torque t, rotor i needs a collective thrust of at least low / lift_i - t ratio_i. Rotor k allows at most
-        # high / lift_k - t ratio_k. The weight is another upper limit.
+        # At a torque t, rotor i needs a collective thrust of at least low / lift_shares_i - t ratio_i. Rotor k allows
+        # at most high / lift_shares_k - t ratio_k. The weight is another upper limit.
         thrust_margins = np.append(high / lift_shares, weight)[None] - (low / lift_shares)[:, None]
         margin_rates = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
         torques.append(np.min(thrust_margins[margin_rates > 0] / margin_rates[margin_rates > 0]))

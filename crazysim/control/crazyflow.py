@@ -32,7 +32,7 @@ class AttitudeMemory(PyTree):
     ang_vel_des: Array = leaf("drone", 1)
     """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
     r_int_error: Array = leaf("drone", 1)
-    """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+    """Integral of the negative rotation error, rad s. (n_worlds, n_drones, 3)"""
     prev_ang_vel: Array = leaf("drone", 1)
     """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
 
@@ -97,18 +97,26 @@ class Crazyflow(Controller):
         s, m = data.states, memory
         cmd: Array = command  # type: ignore[assignment]  # never a Setpoint at these levels
         if data.controls.mode == Control.body_rate:
-            rates = cmd[..., :3]
+            ang_vel_des = cmd[..., :3]
             wrench, r_int_error = body_rate2force_torque(
                 s.quat, s.ang_vel, cmd, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params
             )
         else:
-            rates = data.controls.attitude.staged_ang_vel_des
-            if rates is None:  # the controller is one of several
-                rates = jnp.zeros_like(s.ang_vel)
+            ang_vel_des = data.controls.attitude.staged_ang_vel_des
+            if ang_vel_des is None:  # the controller is a member of a ``Switch``
+                ang_vel_des = jnp.zeros_like(s.ang_vel)
             wrench, r_int_error = attitude2force_torque(
-                s.quat, s.ang_vel, cmd, rates, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params
+                s.quat,
+                s.ang_vel,
+                cmd,
+                ang_vel_des,
+                m.prev_ang_vel,
+                m.ang_vel_des,
+                m.r_int_error,
+                self.freq,
+                params=params,
             )
-        return wrench, AttitudeMemory(rates, r_int_error, s.ang_vel)
+        return wrench, AttitudeMemory(ang_vel_des, r_int_error, s.ang_vel)
 
 
 def _zeros() -> Array:

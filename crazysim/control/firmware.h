@@ -43,7 +43,7 @@ size_t crazysim_memory_size(void);
 /* Initialise the memory of a drone at rest; all of its bytes are zero before the call. */
 void crazysim_init(void *memory);
 
-/* Write the motor commands of one drone, in the order of the airframe's rotors and in the unit CFirmware.motors. */
+/* Write the motor commands of one drone, in the order of the airframe's rotors, in the unit of CFirmware.motors. */
 void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *input, float *motors);
 
 /* Write the motor commands of `n` drones with memories `stride` bytes apart. crazysim calls this function. */

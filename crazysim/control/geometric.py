@@ -47,7 +47,7 @@ class GeometricParams(RigidBodyParams):
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, N m. (3,)"""
     kw: Array = leaf("parameter", 1)
-    """Gain on the body rates, N m s. (3,)"""
+    """Gain on the error of the body rates, N m s. (3,)"""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, gains: Gains = "bandwidth") -> GeometricParams:
@@ -70,14 +70,14 @@ class GeometricParams(RigidBodyParams):
         )
 
 
-def bandwidth_gains(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
+def bandwidth_gains(airframe: Airframe, bandwidths: Bandwidth) -> dict[str, Any]:
     """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe a bandwidth, by name."""
     mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
     return {
-        "kr": mass * rates.position**2,
-        "kv": mass * 2 * rates.position,
-        "kR": moments * rates.stiffness,
-        "kw": moments * rates.damping,
+        "kr": mass * bandwidths.position**2,
+        "kv": mass * 2 * bandwidths.position,
+        "kR": moments * bandwidths.stiffness,
+        "kw": moments * bandwidths.damping,
     }
 
 
@@ -221,9 +221,11 @@ class Geometric(Controller):
         s = data.states
         if self.integral:
             limit = -MAX_INTEGRAL_RATIO * GRAVITY[2]
-            acc = params.kr * (command.pos - s.pos) / params.mass
-            acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Larger errors are transients, not disturbances.
-            memory = GeometricMemory(clip(memory.acc + self.integral / self.freq * acc, -limit, limit))
+            error_acc = params.kr * (command.pos - s.pos) / params.mass
+            error_acc = jnp.where(
+                jnp.abs(error_acc) < limit, error_acc, 0.0
+            )  # Larger errors are transients, not disturbances.
+            memory = GeometricMemory(clip(memory.acc + self.integral / self.freq * error_acc, -limit, limit))
         state = (s.pos, s.quat, s.vel, s.ang_vel)
         acc = memory.acc if self.integral else None
         return geometric_control(*state, command, params=params, feedforward=self.feedforward, integral=acc), memory

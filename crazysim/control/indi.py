@@ -33,7 +33,7 @@ MAX_FEEDBACK_STEP = 0.5
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: about half of gravity."""
 TORQUE_MAX = 0.5
-"""Rotation error with a feedback torque as large as the largest disturbance torque that is compensated, rad."""
+"""Largest disturbance torque that is compensated, as the rotation error with a feedback torque of that size, rad."""
 
 
 class INDIParams(PyTree):
@@ -51,7 +51,7 @@ class INDIParams(PyTree):
     """Fraction of the missing yaw torque that is demanded from rotor drag, 1. The reaction to spin-up gives the rest.
     (1,)"""
     filter: Array = leaf("parameter", 1)
-    """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
+    """Coefficients b0, a1, a2 of the low-pass filter, from ``butterworth``. (3,)"""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
@@ -136,8 +136,8 @@ def indi_control(
 ) -> tuple[Array, INDIMemory]:
     """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
 
-    The loops are those of ``geometric_control``, but force and torque are increments to the current force and torque of
-    the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
+    The loops are the same as in ``geometric_control``, but force and torque are increments to the current force and
+    torque of the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
 
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 

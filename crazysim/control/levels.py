@@ -53,10 +53,13 @@ def mask_rotors(rotors: Array | None, x: Array, fill_value: float) -> Array:
 
 
 def allocation_matrix(airframe: Airframe) -> np.ndarray:
-    """Return the matrix from collective thrust and torque over the torque arms to rotor thrusts. (n_rotors, 4)
+    """Return the matrix that maps collective thrust, and torque divided by the torque arms, to rotor thrusts.
 
     It is the pseudoinverse of the mixing matrix with a row of ones on top, so that rotor thrusts have the least norm.
     For a quadrotor in X its entries are the signs of the rotors divided by four.
+
+    Returns:
+        (n_rotors, 4)
     """
     mixing = airframe.mixing_matrix
     return np.linalg.pinv(np.vstack([np.ones(mixing.shape[1]), mixing]))

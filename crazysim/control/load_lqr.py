@@ -168,7 +168,7 @@ def load_reference(
 
 
 def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Reference, Array, Array]:
-    """Return the reference for a setpoint of the drone, with the load where it hangs at a constant acceleration.
+    """Return the reference for a setpoint of the drone. The load hangs as it would if the acceleration were constant.
 
     Args:
         setpoint: Setpoint of the drone.
@@ -311,13 +311,13 @@ class LoadLQR(Controller):
         s, load = data.states, data.plugins[self.load]
         # The rod of a hook swings even when the hook holds no load.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
-        offset, rate = tip_pos - s.pos, tip_vel - s.vel
+        offset, relative_vel = tip_pos - s.pos, tip_vel - s.vel
         if params.attach is not None:
             arm, joint_vel = _joint_motion(rotation.matrix(s.quat), s.ang_vel, params.attach)
-            offset, rate = offset - arm, rate - joint_vel
+            offset, relative_vel = offset - arm, relative_vel - joint_vel
         distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
         direction = offset / distance
-        direction_rate = (rate - dot(direction, rate) * direction) / distance
+        direction_rate = (relative_vel - dot(direction, relative_vel) * direction) / distance
         rod_acc = -thrust_direction(command.acc - params.gravity_vec, command.jerk, command.snap)[2]
         rod_jerk = memory.started * (rod_acc - memory.rod_acc) * self.freq
         wrench = load_lqr_control(

@@ -76,17 +76,17 @@ def lqr_weights(
     Args:
         airframe: The airframe.
         freq: Rate of the controller, Hz.
-        Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for the rule.
-        R: Weights of the inputs: a diagonal or a matrix; None for the rule.
+        Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for Bryson's rule.
+        R: Weights of the inputs: a diagonal or a matrix; None for Bryson's rule.
         load_mass: Mass of the load, kg.
         length: Length of the rod of the load, m; None without a load.
     """
-    rates, g = bandwidth(airframe, freq), -GRAVITY[2]
-    w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
+    bandwidths, g = bandwidth(airframe, freq), -GRAVITY[2]
+    w, mass, moments = bandwidths.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
     angle = [] if length is None else [1 / length, 1 / length, w / length, w / length]
     acceptable_errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
-    acceptable_inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
+    acceptable_inputs = np.array([(mass + load_mass) * w**2, *(moments * bandwidths.stiffness * tilt)])
     Q, R = acceptable_errors**-2 if Q is None else Q, acceptable_inputs**-2 if R is None else R
     return weight_matrix("Q", Q, len(acceptable_errors)), weight_matrix("R", R, 4)
 

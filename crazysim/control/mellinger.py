@@ -51,13 +51,13 @@ class MellingerParams(PyTree):
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, PWM. (3,)"""
     kw: Array = leaf("parameter", 1)
-    """Gain on the body rates, PWM s/rad. (3,)"""
+    """Gain on the error of the body rates, PWM s/rad. (3,)"""
     ki_m: Array = leaf("parameter", 1)
-    """Gain on the integral of the rotation error, PWM/(rad s). (3,)"""
+    """Gain on ``integral_m``, PWM/(rad s). (3,)"""
     kd_omega: Array = leaf("parameter", 1)
-    """Gain on the derivative of the body rates, PWM s^2/rad. (3,)"""
+    """Gain on the derivative of the error of the body rates, PWM s^2/rad. (3,)"""
     integral_m_max: Array = leaf("parameter", 1)
-    """Limit of the integral of the rotation error, rad s. (3,)"""
+    """Limit of ``integral_m``, rad s. (3,)"""
     torque_max: Array = leaf("parameter", 1)
     """Limit of the torque, PWM. (3,)"""
     motors: PowerDistributionParams
@@ -83,7 +83,7 @@ class MellingerMemory(PyTree):
     integral: Array = leaf("drone", 1)
     """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
     integral_m: Array = leaf("drone", 1)
-    """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+    """Integral of the negative rotation error, rad s. (n_worlds, n_drones, 3)"""
     ang_vel: Array = leaf("drone", 1)
     """Angular velocity at the last tick, rad/s. (n_worlds, n_drones, 3)"""
     ang_vel_des: Array = leaf("drone", 1)
@@ -128,7 +128,7 @@ def torque_of_rotation(
 ) -> tuple[Array, MellingerMemory]:
     """Return the torque that turns the drone to an attitude, PWM (..., 3), and the memory.
 
-    The law is that of Mellinger and Kumar (2011, eq. 10 to 13), without the factor one half on the rotation error, and
+    The law is eq. 10 to 13 of Mellinger and Kumar (2011), without the factor one half on the rotation error, and
     with an integral and a derivative of the rates.
 
     Args:

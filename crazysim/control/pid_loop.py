@@ -159,9 +159,9 @@ def continue_integral(memory: PIDLoopMemory, output: Array, desired_output: Arra
 def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
     b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
-    last_delay, previous_delay = delays[..., 0, :], delays[..., 1, :]
-    new_delay = sample - last_delay * a1 - previous_delay * a2
-    return b0 * (new_delay + 2 * last_delay + previous_delay), jnp.stack([new_delay, last_delay], axis=-2)
+    delay_1, delay_2 = delays[..., 0, :], delays[..., 1, :]
+    new_delay = sample - delay_1 * a1 - delay_2 * a2
+    return b0 * (new_delay + 2 * delay_1 + delay_2), jnp.stack([new_delay, delay_1], axis=-2)
 
 
 def _wrap_angle(x: Array, is_angle: Sequence[bool]) -> Array:

@@ -30,7 +30,8 @@ With all rotors at minimum thrust, the built-in airframes ``cf...`` and ``hb_x50
 the other built-in airframes have no thrust.
 """
 MIN_FEEDBACK_RATIO = 0.1
-"""Lower bound on the upward and horizontal limits of the feedback over gravity, 1, for drones with little lift."""
+"""Lower bound on the limits of upward and horizontal acceleration by feedback, over gravity, 1; for drones with little
+lift."""
 MAX_DISTURBANCE_RATIO = 0.5
 """Largest acceleration by unknown forces along an axis that is compensated, over gravity, 1."""
 

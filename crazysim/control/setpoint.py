@@ -38,7 +38,7 @@ class Setpoint(PyTree):
     def command(self) -> Array:
         """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
 
-        The quaternion is xyzw, and the body rates are those of a level drone, (0, 0, yaw rate).
+        The quaternion is xyzw, and the body rates are (0, 0, yaw rate), which a level drone would have.
         """
         zeros = jnp.zeros_like(self.pos[..., :2])
         quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]
@@ -62,16 +62,16 @@ class Setpoint(PyTree):
         """
         if feedforward is None:
             zeros = jnp.zeros_like(cmd[..., :6])
-            rates = jnp.concatenate([zeros, cmd[..., 15:16], zeros[..., :1]], axis=-1)
+            derivatives = jnp.concatenate([zeros, cmd[..., 15:16], zeros[..., :1]], axis=-1)
         else:
-            rates = feedforward
+            derivatives = feedforward
         return Setpoint(
             pos=cmd[..., 0:3],
             vel=cmd[..., 3:6],
             acc=cmd[..., 6:9],
-            jerk=rates[..., 0:3],
-            snap=rates[..., 3:6],
+            jerk=derivatives[..., 0:3],
+            snap=derivatives[..., 3:6],
             yaw=rotation.yaw(cmd[..., 9:13])[..., None],
-            yaw_rate=rates[..., 6:7],
-            yaw_acc=rates[..., 7:8],
+            yaw_rate=derivatives[..., 6:7],
+            yaw_acc=derivatives[..., 7:8],
         )

@@ -50,7 +50,7 @@ class TrackingLQRParams(RigidBodyParams):
 def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
     """Return the derivative of the errors of a drone about a reference, for an error of its wrench.
 
-    To first order, the errors are those of ``state_error``: position, velocity, a small rotation vector e_R with
+    To first order, the errors are the same as in ``state_error``: position, velocity, a small rotation vector e_R with
     ``R = R_d exp(e_R^)``, and ``e_w = w - R^T R_d w_d``, so that ``e_R' = e_w``.
 
     Args:
@@ -119,8 +119,8 @@ def tracking_gains(
     end_gain = gain_continuous(A[-1], B[-1], Q, R)
     P = solve_lyapunov(A[-1] - B[-1] @ end_gain, Q + end_gain.T @ R @ end_gain)
 
-    def step_backward(P: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        F, G = step
+    def step_backward(P: Array, matrices: tuple[Array, Array]) -> tuple[Array, Array]:
+        F, G = matrices
 
         def riccati_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
             P, _ = carry

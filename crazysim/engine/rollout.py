@@ -20,7 +20,7 @@ from crazysim.pytree import leaf_indices
 
 Policy = Callable[[Any, SimData], Any]
 """Function from parameters and data to a command for every drone, (n_worlds, n_drones, k)."""
-RecordFunction = Callable[[SimData], Any]
+KeepFunction = Callable[[SimData], Any]
 """Function from data to any tree of arrays to record."""
 
 
@@ -36,7 +36,7 @@ def rollout(
     params: Any,
     n_control_steps: int,
     n_substeps: int,
-    keep: RecordFunction = get_states,
+    keep: KeepFunction = get_states,
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:

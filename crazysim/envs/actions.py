@@ -73,8 +73,8 @@ class Actions:
         command = centre + scale * clip(action, -1.0, 1.0)
         if self.control != Control.state:
             return command
-        zero_fields = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)
-        return jnp.concatenate([command, zero_fields], axis=-1)
+        other_fields = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)
+        return jnp.concatenate([command, other_fields], axis=-1)
 
     def __str__(self) -> str:
         """Return the command level, and the commands at -1 and 1."""
@@ -94,8 +94,10 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
     airframes = as_airframes(airframe)
     if all(drone_airframe is airframes[0] for drone_airframe in airframes):
         return _drone_actions(airframes[0], params, control, tilt, 0)
-    by_drone = [_drone_actions(drone_airframe, params, control, tilt, k) for k, drone_airframe in enumerate(airframes)]
-    centres, scales = ([getattr(actions, name) for actions in by_drone] for name in ("centre", "scale"))
+    drone_actions = [
+        _drone_actions(drone_airframe, params, control, tilt, k) for k, drone_airframe in enumerate(airframes)
+    ]
+    centres, scales = ([getattr(actions, name) for actions in drone_actions] for name in ("centre", "scale"))
     return Actions(np.stack(centres), np.stack(scales), control)
 
 

@@ -28,13 +28,13 @@ class State(PyTree):
     done: Array
     """One where the episode ended in this step, zero elsewhere, as a float. (n_worlds,)"""
     metrics: dict[str, Array]
-    """``error``: mean task error of the drones. (n_worlds,) each"""
+    """``error``: mean task error of the drones. (n_worlds,)"""
     info: dict[str, Any]
     """Entries that Brax's algorithms read: ``steps``, ``truncation``, ``episode_done``, ``episode_metrics``."""
 
 
 class BraxEnv:
-    """Adapter that gives a functional environment without automatic resets the interface of Brax.
+    """Brax's interface to a functional environment that has no automatic resets.
 
     Brax batches an environment of one world with ``vmap``. Here the worlds are batched already, so this class
     corresponds to an environment after Brax's ``training.wrap``. Keys, observations and actions have an axis over
@@ -134,15 +134,15 @@ class BraxEnv:
         """Return the key that seeds all worlds."""
         if not hasattr(rng, "dtype"):
             raise ConfigError(f"expected a random key, got {short_repr(rng)}. Use jax.random.key(0).")
-        n_worlds, typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
-        shape = rng.shape if typed else rng.shape[:-1]
+        n_worlds, is_typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        shape = rng.shape if is_typed else rng.shape[:-1]
         if shape not in ((), (n_worlds,)):
             raise ValueError(
                 f"expected one key, or one for each of the {n_worlds} worlds, got "
-                f"{'keys' if typed else 'key data'} of shape {rng.shape}. Make the environment with n_worlds equal to "
-                f"Brax's num_envs."
+                f"{'keys' if is_typed else 'key data'} of shape {rng.shape}. Make the environment with n_worlds "
+                f"equal to Brax's num_envs."
             )
-        rng = rng if typed else jax.random.wrap_key_data(rng)
+        rng = rng if is_typed else jax.random.wrap_key_data(rng)
         return rng[0] if shape else rng
 
     @staticmethod

@@ -286,7 +286,7 @@ class DroneEnv(Env):
         Args:
             sim: The simulation, after ``task.install(sim)``; episodes begin from ``sim.default_data``.
             task: The task.
-            freq: Environment steps per second, Hz; must divide the simulation's frequency.
+            freq: Environment steps per second, Hz; must divide ``sim.freq`` and ``sim.control_freq``.
             actions: Meaning of an action; None for ``actions_of``.
             measured: True to observe the states as the sensors of the simulation measure them. Rewards and the ends of
                 episodes always depend on the true states.
@@ -408,6 +408,6 @@ def _set_keys(core: SimCore, key: Array) -> SimCore:
 
 
 def _default_arrays(sim: Sim) -> list[Any]:
-    """Return the arrays from which episodes begin, without the scene's, which change when the scene is compiled."""
+    """Return the arrays from which episodes begin, without arrays of the scene, which change when it is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))

@@ -221,13 +221,13 @@ def entry_of(task: str | Task, is_named: bool = True) -> Entry:
     if is_reference(task):
         loaded = load_task(task, TASKS) if is_named else load_listed_task(task, TASKS)
         return TASKS[loaded] if isinstance(loaded, str) else Entry(_check_class(loaded), "")
-    plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
-    if task in plugins.names:
-        register(task, plugins[task].load())
+    entry_points = importlib.metadata.entry_points(group=ENTRY_POINTS)
+    if task in entry_points.names:
+        register(task, entry_points[task].load())
         return TASKS[task]
     raise UnknownNameError(
-        f"task {task!r} does not exist; there are {', '.join([*TASKS, *sorted(plugins.names)])}. Name a custom task "
-        f"as FILE.py:CLASS."
+        f"task {task!r} does not exist; there are {', '.join([*TASKS, *sorted(entry_points.names)])}. Name a custom "
+        f"task as FILE.py:CLASS."
     )
 
 

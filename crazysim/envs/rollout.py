@@ -63,7 +63,7 @@ class Transition(PyTree):
         return self.state.final_obs
 
 
-RecordFunction = Callable[[Transition], Any]
+KeepFunction = Callable[[Transition], Any]
 """``keep(transition)``: the part of a transition to store, any tree of arrays."""
 
 
@@ -73,7 +73,7 @@ def rollout(
     policy: Policy,
     key: Array,
     n_steps: int,
-    keep: RecordFunction = lambda transition: (transition.reward, transition.done),
+    keep: KeepFunction = lambda transition: (transition.reward, transition.done),
     initial_memory: Any = (),
     memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
@@ -106,6 +106,7 @@ def rollout(
                 f"expected initial_memory of shape ({n_worlds}, ...) = (n_worlds, ...), got {shapes[0]}. Use "
                 f"jnp.broadcast_to(x, (n_worlds, *x.shape))."
             )
+    # Only these leaves change: those that a step writes, and the flag that the scene is in sync with the data.
     carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf})
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
@@ -114,7 +115,7 @@ def rollout(
         action, memory, extras = _evaluate(policy, state.obs, memory, key)
         flat_after = env.advance(flat_before, validate_action(action, state, env.actions))
         new_state = EnvState(flat_after.data())
-        if env.reset_policy is not None:
+        if env.reset_policy is not None:  # the policy forgets where a new episode begins
             must_reset = env.reset_policy.must_reset(state.done, new_state)
             memory = jax.tree.map(lambda initial, x: select_worlds(must_reset, initial, x), initial_memory, memory)
         output = keep(Transition(state.obs, action, extras, new_state))

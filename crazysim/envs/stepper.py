@@ -40,8 +40,11 @@ class EnvStepper:
         ))  # fmt: skip
         self._flat: FlatData | None = None
         self._ends: tuple[Array, Array]
+        """``terminated`` and ``truncated`` of the state. (n_worlds,) each"""
         self._carried_indices: list[int] = []
+        """Indices of the leaves of ``_flat`` that the compiled step changes."""
         self._fixed_indices: list[int] = []
+        """Indices of the leaves of ``_flat`` that the compiled step only reads."""
         self.compiled: Any = None
         """The compiled step; None before a state is assigned."""
 
@@ -87,20 +90,20 @@ class EnvStepper:
         """Compile the step. Its carry omits results that the next step does not read."""
         plan, env = flat.plan, self._env
         record, n = plan.leaf_indices.plugins[ENV_RECORD_NAME], len(flat.leaves)
-        flags = [record.terminated, record.truncated]
-        outputs = set(jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS]))
+        end_indices = [record.terminated, record.truncated]
+        result_indices = set(jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS]))
         self._carried_indices = carried_indices = [
-            i for i in plan.written_leaves if i not in outputs - set(plan.inputs) and i not in flags
+            i for i in plan.written_leaves if i not in result_indices - set(plan.inputs) and i not in end_indices
         ]
-        fixed_outputs = outputs - set(plan.written_leaves)  # entries of info that only a reset sets
+        fixed_results = result_indices - set(plan.written_leaves)  # entries of info that only a reset sets
         self._fixed_indices = fixed_indices = sorted(
-            {*plan.inputs, *fixed_outputs} - {*carried_indices, *flags, record.next_action}
+            {*plan.inputs, *fixed_results} - {*carried_indices, *end_indices, record.next_action}
         )
         template = flat.leaves[record.next_action]
 
         def step(carry: list[Array], fixed_leaves: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
             leaves = replace_leaves(replace_leaves([None] * n, fixed_indices, fixed_leaves), carried_indices, carry)
-            leaves = replace_leaves(leaves, flags, [x[:, None] for x in ends])
+            leaves = replace_leaves(leaves, end_indices, [x[:, None] for x in ends])
             new_flat = env.advance(FlatData(leaves, plan), jnp.asarray(actions, template.dtype).reshape(template.shape))
             state = EnvState(new_flat.data())
             return (

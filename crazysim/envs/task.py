@@ -127,7 +127,7 @@ class Task:
         return {}
 
     def target(self, data: SimData) -> Array | None:
-        """Return the target position of each drone, or several marks per drone, to draw in images, m; None for none.
+        """Return the target position of each drone, or several marks per drone, to draw in images, m; None if none.
 
         Returns:
             (n_drones, 3) or (n_drones, n_marks, 3)
@@ -136,7 +136,7 @@ class Task:
         return None
 
     def subjects(self, data: SimData) -> Array | None:
-        """Return points that films keep in view besides drones and marks, such as a pad's rim, m; None for none.
+        """Return points that films keep in view besides drones and marks, such as a pad's rim, m; None for no points.
 
         Returns:
             (n_points, 3)
@@ -153,7 +153,7 @@ class Task:
         return None
 
     def policy_camera(self) -> ImageSensor | None:
-        """Return the camera that takes images for the policy on every drone; None for none. ``make`` adds it."""
+        """Return the camera on every drone whose images the policy observes, which ``make`` adds; None for none."""
         return None
 
     def succeeded(self, data: SimData) -> Array | None:

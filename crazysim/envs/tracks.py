@@ -31,7 +31,9 @@ Points = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class Track:
-    """A course. The default is the course of lsy_drone_racing's levels 0 to 2, with the start in the air."""
+    """A course. The default is the course of levels 0 to 2 of the drone racing project lsy_drone_racing, with the start
+    in the air.
+    """
 
     gates_pos: Points = ((0.5, 0.25, 0.7), (1.05, 0.75, 1.2), (-1.0, -0.25, 0.7), (0.0, -0.75, 1.2))
     """Middle of each gate's opening, in the order of the race, m. (n_gates, 3)"""

@@ -68,8 +68,10 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._restart_fn = jax.jit(self.env.restart)
         self._stepper = EnvStepper(self.env, self._output)
         self._outputs: Any = None
+        """Observations, rewards and infos of the last reset or step, as ``_output`` returns them."""
         shapes = self._reset_fn.eval_shape(jax.random.key(0))  # ``reset`` reuses this trace
         self._drone_entries = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
+        """Names of the entries of ``info`` with a row for each drone."""
         self.single_observation_space = gymnasium.spaces.Dict(
             {name: self._box(x, np.inf) for name, x in shapes.obs.items()}
         )

@@ -31,7 +31,7 @@ from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
-from crazysim.engine.rollout import Policy, RecordFunction, get_states, run_rollout
+from crazysim.engine.rollout import KeepFunction, Policy, get_states, run_rollout
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
@@ -486,7 +486,7 @@ class Sim:
         params: Any = None,
         n_control_steps: int = 1,
         *,
-        keep: RecordFunction = get_states,
+        keep: KeepFunction = get_states,
         every: int = 1,
         progress: bool = False,
     ) -> Any:

@@ -73,9 +73,9 @@ class Field(NamedTuple):
     n_cells_across: int
     """Number of cells across the flight direction."""
     size: np.ndarray
-    """Length and width, m. (2,)"""
+    """Length and width of the field, along x and y, m. (2,)"""
     arena_half_size: np.ndarray
-    """Half the size of the arena, m. (2,)"""
+    """Half the size of the arena along x and y, m. (2,)"""
     goals: np.ndarray
     """Mean positions of the goals, m; mean positions of the starts have the opposite x. (n_drones, 3)"""
 
@@ -138,7 +138,7 @@ class Avoid(Task):
 
         @stage("drone")
         def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the arena, and record when it reaches its goal."""
+            """Disable a drone that touches something or leaves the arena; mark one that reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
             has_left = jnp.any(jnp.abs(pos[:2]) > half_size.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
             disabled = record.disabled | (~record.reached & (has_left | contacts(data).any))
@@ -193,12 +193,12 @@ class Avoid(Task):
         n_poles, n_boxes = self.n_poles, self.n_boxes
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
         middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
-        size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX_WIDTH / 2] * 3] * n_boxes)
+        half_sizes = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX_WIDTH / 2] * 3] * n_boxes)
         radius = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
         is_box = np.arange(n_poles + n_boxes)[:, None] >= n_poles
         pos, quat = (x[..., rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         local_pos = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
-        half_size = jnp.asarray(size, dtype)
+        half_size = jnp.asarray(half_sizes, dtype)
         nearest = rotation.clip(local_pos, -half_size, half_size)
         distance = rotation.safe_norm(nearest - local_pos)
         gap = distance - radius[:, None].astype(dtype)

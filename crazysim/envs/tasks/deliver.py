@@ -63,11 +63,11 @@ class Deliver(BringLoad):
     """Pick up a load from a moving trailer with a hook, and hold it at a goal.
 
     A car that drives in circles, or straight ahead, pulls a trailer with a load. The load has a ring, and does not slip
-    on the trailer. A drone starts in flight above it with a hook on a swinging rod. The hook picks up the load within
-    7 cm of the ring, at a relative speed below 0.6 m/s. The load is delivered when it has been within ``tolerance`` of
-    its goal, slower than 0.2 m/s, for ``hold`` seconds. A drone crashes when it is lower than 0.25 m, higher than 2.5 m
-    or more than 4.5 m from its car's initial position along x or y, or when the ring of its load sinks below 0.15 m
-    after the pick-up. A crash ends the episode.
+    on the trailer. A drone starts in flight above the load with a hook on a swinging rod. The hook picks up the load
+    within 7 cm of the ring, at a relative speed below 0.6 m/s. The load is delivered when it has been within
+    ``tolerance`` of its goal, slower than 0.2 m/s, for ``hold`` seconds. A drone crashes when it is lower than 0.25 m,
+    higher than 2.5 m or more than 4.5 m from its car's initial position along x or y, or when the ring of its load
+    sinks below 0.15 m after the pick-up. A crash ends the episode.
     """
 
     name = "deliver"
@@ -208,8 +208,8 @@ def ring_motion(car: CarData) -> tuple[Array, Array]:
     def positions_of_state(*state: Array) -> Array:
         return ring_positions(car.replace(**dict(zip(("pos", "yaw", "joints"), state, strict=True))))
 
-    rates = car.vel, car.yaw_rate, trailer_rates(car.state, car.params)
-    return jax.jvp(positions_of_state, (car.pos, car.yaw, car.joints), rates)
+    derivatives = car.vel, car.yaw_rate, trailer_rates(car.state, car.params)
+    return jax.jvp(positions_of_state, (car.pos, car.yaw, car.joints), derivatives)
 
 
 def initial_car_pos(data: SimData) -> Array:

@@ -27,8 +27,8 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 HALF_WIDTH, CEILING = 8.0, 4.0
-"""Half the width of the corridor of one drone, and its height, m. At the default density about four trees stand side by
-side in it; all trees are higher than the corridor."""
+"""Half the width of the corridor with one drone, and the height of the corridor, m. At the default density about four
+trees stand side by side in it; all trees are higher than the corridor."""
 HEIGHT = 1.5
 """Height of starts and goals, m."""
 TREE_HEIGHT = 5.0
@@ -133,7 +133,7 @@ class Forest(Task):
 
         @stage("drone", when=lambda data: (data.core.steps + 1) % period == 0)
         def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the corridor, and record where it reaches its goal."""
+            """Disable a drone that touches something or leaves the corridor; mark one that crosses the goal line."""
             record, pos = passage_of(data), data.states.pos
             has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE_DISTANCE) | on_floor(data)
             touches_tree = trees.clearance(data, pos) < radius
@@ -141,6 +141,7 @@ class Forest(Task):
             reached = record.reached | (~disabled & (pos[0] >= self.length))
             return with_record(data, record.replace(disabled=disabled, reached=reached))
 
+        # ``checks_collisions`` also disables drones that touch each other.
         install_rules(sim, Passage(zero, false, false, false), update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
@@ -162,10 +163,11 @@ class Forest(Task):
         return with_record(data, record.replace(flight_over_before=record.flight_over))
 
     def nearest_trees(self, data: SimData, n: int) -> Array:
-        """Return the nearest trees of each drone: distance to the trunk ahead and to the left, and its radius, m.
+        """Return the nearest trees of each drone, the nearest first.
 
-        The trees of twelve cells around and in front of the drone are searched. Trees that are farther away than
-        ``VIEW_RANGE``, and trees that do not stand, are returned at this distance.
+        An entry has the horizontal vector from the drone to the trunk's surface, as components ahead and to the left,
+        m, and the radius of the trunk, m. The trees of twelve cells around and in front of the drone are searched.
+        Trees that are farther away than ``VIEW_RANGE``, and trees that do not stand, are returned at this distance.
 
         Returns:
             (n_drones, n, 3)
@@ -192,13 +194,14 @@ class Forest(Task):
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return attitude, velocities, height, direction and distance of the goal, and the nearest trees.
 
-        Velocity and direction of the goal are in the frame of the heading: ahead, left, up. ``offset`` is y, the
-        distance to the left of the middle of the corridor, m. ``trees_near`` has the nearest ``trees_seen`` trees.
+        Velocity and direction of the goal are in the frame of the heading: ahead, left, up. ``offset`` is the
+        drone's distance to the left of the middle of the corridor, m. ``trees_near`` has the nearest ``trees_seen``
+        trees.
         """
-        offset = passage_of(data).goal - data.states.pos
-        distance = rotation.safe_norm(offset)
+        to_goal = passage_of(data).goal - data.states.pos
+        distance = rotation.safe_norm(to_goal)
         obs = motion_of(data) | {
-            "goal_direction": to_heading(data, offset / jnp.maximum(distance, 1e-3)),
+            "goal_direction": to_heading(data, to_goal / jnp.maximum(distance, 1e-3)),
             "goal_distance": distance,
             "offset": data.states.pos[..., 1:2],
         }
@@ -211,8 +214,8 @@ class Forest(Task):
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record, s = passage_of(data), data.states
-        offset, (_, left) = record.goal - s.pos, rotation.heading(s.quat)
-        approach = jnp.sum(s.vel * offset, axis=-1) / jnp.maximum(rotation.safe_norm(offset)[..., 0], 1e-3)
+        to_goal, (_, left) = record.goal - s.pos, rotation.heading(s.quat)
+        approach = jnp.sum(s.vel * to_goal, axis=-1) / jnp.maximum(rotation.safe_norm(to_goal)[..., 0], 1e-3)
         speed = rotation.safe_norm(s.vel)[..., 0]
         gap = self.trees(data.core.n_drones).clearance(data, s.pos)
         reward_terms = {

@@ -176,12 +176,12 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
 
 
 def install_rules(sim: Sim, record: PyTree, rules: Stage, checks_collisions: bool = False) -> None:
-    """Add a task's record, and a stage that updates it at the end of every physics step.
+    """Add a task's record, and a stage with the task's rules that updates it at the end of every physics step.
 
     Args:
         sim: The simulation.
         record: Record of all worlds, for ``data.plugins["task"]``.
-        rules: The stage.
+        rules: Stage that updates the record, such as the marks of drones that are disabled or at their goals.
         checks_collisions: True to disable drones that touch each other, in a stage before ``rules``.
     """
     placements = [StagePlacement(rules, before="increment_steps")]

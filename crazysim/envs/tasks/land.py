@@ -62,7 +62,8 @@ class Land(TouchDown):
     name = "land"
     Record = PadLanding
     target_name = "pad"
-    # At a cost of 10, the reward of a landing, policies hover next to the pad: few of their first contacts are soft.
+    # If a crash cost 10, as much as a landing earns, policies would hover next to the pad: few of their first contacts
+    # are soft.
     crash_cost = 2.0
     height: ClassVar[float] = HEIGHT
     """Height of the upper side of a pad, m."""

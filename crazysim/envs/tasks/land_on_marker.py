@@ -18,8 +18,8 @@ class LandOnMarker(Land):
     """Land on a marker on the ground, 2 cm thick, that the drone observes with a camera.
 
     Rules and settings are the same as in ``land``, with a marker instead of the pad. Policies observe neither the
-    position of the marker nor the horizontal position of the drone. ``make`` adds a camera that looks down:
-    ``segmentation`` is 1 where a pixel shows the marker.
+    position of the marker nor the horizontal position of the drone. ``make`` adds a camera that looks down. Its
+    image ``segmentation`` is 1 where a pixel shows the marker.
     """
 
     name = "land_on_marker"

@@ -48,7 +48,7 @@ Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
 
 @dataclass(frozen=True, kw_only=True)
 class Race(Task):
-    """Race through gates among obstacles, by the rules of lsy_drone_racing.
+    """Race through gates among obstacles, by the rules of the drone racing project lsy_drone_racing.
 
     A drone passes a gate when it crosses the gate's plane within the opening, in the direction of the gate's x axis. A
     drone is disabled when it touches a gate, an obstacle, the floor or another drone, or leaves the arena. Contacts are
@@ -67,7 +67,7 @@ class Race(Task):
     Record = rules.RaceRecord
 
     level: int = setting(default=0, low=0, high=3)
-    """Amount of randomness, 0 to 3."""
+    """Amount of randomness, 0 to 3, as in the table above."""
     track: Track = field(default_factory=Track)
     """The course. Level 3 uses only the limits of the arena, and numbers and heights of gates and obstacles."""
     sensor_range: float = setting(default=SENSOR_RANGE, low=0.0)
@@ -78,7 +78,7 @@ class Race(Task):
     """Function that returns the terms of the reward; ``race_rules.sparse`` is an alternative."""
     practice: bool = False
     """True to start anywhere on the course, for learning: with equal probability at the start or just behind any gate
-    except the last. The gates up to there are passed. Several drones all begin at the start, or behind different
+    except the last. The gates up to there count as passed. Several drones all begin at the start, or behind different
     gates."""
 
     def install(self, sim: Sim) -> None:

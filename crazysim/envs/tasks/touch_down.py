@@ -21,7 +21,7 @@ from crazysim.scene.contact_report import ContactFn
 MAX_TOUCH_DOWN_SPEED = 0.5
 """Largest speed relative to the target at touch-down, m/s."""
 MIN_UP_AXIS_Z = np.cos(np.pi / 9)
-"""Smallest vertical component of the body z axis at touch-down, at a tilt of 20 degrees."""
+"""Smallest vertical component of the body z axis at touch-down, 1; it corresponds to a tilt of 20 degrees."""
 
 
 class Landing(PyTree):

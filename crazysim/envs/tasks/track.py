@@ -27,7 +27,7 @@ from crazysim.trajectories import Trajectory, figure_eight
 MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
-"""Largest number of future samples; an observation then has 3,000 numbers of samples."""
+"""Largest number of future samples; ``local_samples`` then has 3,000 numbers."""
 MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 

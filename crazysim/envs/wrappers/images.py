@@ -45,8 +45,10 @@ class CameraImages(Wrapper):
         freq = env.base.freq
         rate = freq if camera.freq is None else dividing_rate(f"freq of {camera.name!r}", camera.freq, freq)
         self._period = sim.freq // rate
+        """Physics steps from one image to the next."""
         camera.check(sim, self._period)
         self._is_immediate = self._period == env.n_substeps and camera.latency == 0
+        """True if each environment step takes an image that is observed at its end."""
         self._take_images = camera.image_fn(sim)
 
     @property

@@ -1,4 +1,7 @@
-"""Wrappers that change observations."""
+"""Wrappers that change observations.
+
+``state.obs`` has all observations, ``state.record.obs`` has them without images.
+"""
 
 from __future__ import annotations
 
@@ -125,7 +128,8 @@ class Normalize(Wrapper):
 
     Mean and variance are over all worlds, drones and steps so far; ``state.memory["Normalize"]`` has them by name of
     the observation. To fly a policy with the statistics of its training, pass them: ``Normalize(env, stats)`` does not
-    update them. Blocks of worlds with different keys, such as several seeds in one training, share the statistics.
+    update them. If ``reset`` gets one key for each block of worlds, as in a training with several seeds, all blocks
+    share the statistics.
     """
 
     batched = True

@@ -41,8 +41,8 @@ class RandomizeWith(Wrapper):
 
     def prepare(self, data: SimData) -> SimData:
         batch_shape = data.states.pos.shape[:2]
-        shared = [name for name in self.params if getattr(scopes(data.params), name) == "shared"]
-        values = {name: getattr(data.params, name) for name in shared}
+        shared_params = [name for name in self.params if getattr(scopes(data.params), name) == "shared"]
+        values = {name: getattr(data.params, name) for name in shared_params}
         repeated = {name: jnp.broadcast_to(x, (*batch_shape, *x.shape)) for name, x in values.items()}
         return data.replace(params=data.params.replace(**repeated))
 
