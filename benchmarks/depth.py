@@ -5,7 +5,7 @@ One JSON line for each number of poles, fixed and movable, with rates by wall ti
 PYTHONPATH.
 
 With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
-``fraction_that_meets`` is the fraction of the first four rays that meet something.
+``fraction_that_meets`` is the fraction of the four horizontal rays that meet something.
 
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
 """

@@ -26,7 +26,8 @@ COMMANDS = {
     "force_torque": lambda weight, hover_rpm: [weight, 0.0, 0.0, 0.0],
     "rotor_vel": lambda weight, hover_rpm: [hover_rpm] * 4,
 }
-"""Command of each level that makes a cf21B_500 hover, since a crashed drone costs less to simulate."""
+"""Function from weight, N, and rotor speed, rpm, to the hover command of a cf21B_500, by level. Drones hover in all
+measurements, since a crashed drone costs less to simulate."""
 
 BATCH_STEPS = {"cpu": 100, "gpu": 1000}
 """Steps after which a flight restarts. Without a position controller, hovering drones drift by 7 cm in 1,000 steps."""
@@ -75,6 +76,7 @@ class Flight:
         self.is_queued = device != "cpu"
         self.n_calls = max(BATCH_STEPS["gpu" if self.is_queued else "cpu"] // n_steps, 1)
         self.first_s = seconds(self._step)
+        """Time of the first call with compilation, s."""
         self.seconds()  # Crazyflow compiles again for data that a step returned; no figure includes this
 
     def seconds(self) -> float:
@@ -132,7 +134,7 @@ def report_flights(
     """Time flights alternately, and print a line for each, with its rate and the ratio of its time to a reference.
 
     Args:
-        device: The platform.
+        device: Platform, ``"cpu"`` or ``"gpu"``.
         flights: Flights by name of the case.
         repeats: Number of times that each flight is measured.
         references: Name of the reference of each flight.

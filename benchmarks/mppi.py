@@ -28,7 +28,9 @@ def main() -> None:
     parser.add_argument("--samples", type=int, nargs="+", help="numbers of rollouts")
     parser.add_argument("--horizon", type=int, default=50, help="control steps")
     parser.add_argument("--substeps", type=int, default=2, help="physics steps of a control step")
-    parser.add_argument("--knots", type=int, default=10)
+    parser.add_argument(
+        "--knots", type=int, default=10, help="sampled commands in the horizon, joined by straight lines"
+    )
     parser.add_argument("--freq", type=int, default=125, help="physics steps per second of the rollouts")
     parser.add_argument("--repeats", type=int, default=50)
     args = parser.parse_args()

@@ -176,7 +176,7 @@ class HostCall:
         for k, (kernel, owned_leaves) in enumerate(zip(kernels, owned, strict=True)):
             first_result, n_drones = len(results), kernel.program.n_drones
             for i in kernel.outputs:
-                key = i if owned_leaves is None or i in owned_leaves else (k, i)
+                key = i if owned_leaves is None or i in owned_leaves else (k, i)  # (k, i) is not read
                 results.append((key, leaves[i].shape, np.dtype(leaves[i].dtype)))
             results.append((("flags", k), (n_worlds, n_drones), np.dtype(bool)))
             outputs = slice(first_result, len(results))

@@ -5,9 +5,9 @@ Planning finds what an engine cannot run before the first step. There are three 
 - A documented limit, which ``explain`` names. A stage without a scope splits the step: it runs unfused, between kernels
   of the stages before and after it. On a machine without a compiler, ``lanes`` runs. For data on several devices,
   ``plain`` runs if a stage is unfused, or if the data is not distributed by a mesh.
-- Something unsupported (``UnsupportedError``). A stage with a primitive without a rule, or with a parameter of a
-  primitive that a newer JAX has renamed, splits the step too, or with a mesh ``plain`` runs. If a kernel cannot be
-  written, or its compiler refuses it, ``lanes`` runs. There is one ``EngineWarning``; with ``strict``, a
+- Something unsupported (``UnsupportedError``). A stage splits the step too if one of its primitives has no rule, or has
+  a parameter that a newer JAX has renamed; with a mesh, ``plain`` runs instead. If a kernel cannot be written, or its
+  compiler refuses it, ``lanes`` runs. There is one ``EngineWarning``; with ``strict``, a
   ``ConfigError`` is raised instead. With ``engine="fused"``, a missing compiler or kernel is a ``ConfigError``.
 - Any other exception (except ``ConfigError`` and ``MemoryError``, which are raised as they are). It is a bug in a stage
   or in the engine. With ``strict``, or with an engine chosen by name, it is raised. Otherwise ``plain`` is tried. If
@@ -53,7 +53,8 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 
 SeparateLeaves = frozenset[int] | None
 """Leaves that stay separate arrays when the other written leaves are stored as rows of a few arrays. With an empty set
-every written leaf is stored as rows, except for random keys and ``core.mjx_synced``. With None no leaf is."""
+every written leaf is stored as rows, except for random keys and ``core.mjx_synced``. With None no leaf
+is stored as rows."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

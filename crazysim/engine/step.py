@@ -140,10 +140,13 @@ class Step:
         self._plans: dict[Any, Plan] = {}
         self._reported: set[str] = set()
         self._called: set[tuple[int, int | None]] = set()
+        """Calls so far: id of the plan, and the number of steps, or None for an array."""
         self._zeros_cache = ZerosCache()
         self._pack_cache = PackCache()
         self._home_sharding: Any = None
+        """Last sharding that was found to be at ``location``."""
         self._last_false_flag: Any = None
+        """Last flag of ``_make_false_flag``."""
 
     def without_stages(self, names: Collection[str]) -> Step:
         """Return a step without the stages of some names."""

@@ -45,11 +45,17 @@ class Stepper:
         self.device, self.mesh, self.engine, self.strict = device, mesh, engine, strict
         self._data: SimData | FlatData | None = None
         self._shapes: tuple[Plan, SimData] | None = None
+        """Plan of the last flattened data, and its shapes, types and devices."""
         self._step_counts: dict[int, Array] = {}
+        """Arrays of numbers of steps that ``advance`` received."""
         self._unsynced_flag: object = None
+        """Array of ``core.mjx_synced`` that is known to be false."""
         self._max_step_count: int | None = None
+        """Largest number of steps of a world since its reset, or an upper bound; None if unknown."""
         self._last_count: tuple[object, int] = (None, 0)
+        """Step counts that were read last, and their maximum."""
         self._compiled_step: Step | None = None
+        """Step of the last call of ``advance``."""
 
     @property
     def data(self) -> SimData:

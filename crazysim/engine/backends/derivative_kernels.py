@@ -149,6 +149,7 @@ def _launch_cotangents(
     n_worlds, n_drones = lanes.batch_counts(program, list(values))
 
     def pad_seed(i: int) -> Array:
+        """Return the cotangent of a leaf with one row for each drone; a leaf of the world has it in the first row."""
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 

@@ -149,7 +149,7 @@ class Writer(LineWriter):
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
     def _write_lookup(self, op: Operation, args: list[str], depth: int) -> None:
-        """Write the read of a table entry; if the block reads three of a group of four, one read serves the group."""
+        """Write the read of a table entry. A group of four entries is read at once if the block reads three of them."""
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new_name()
@@ -179,12 +179,12 @@ class Writer(LineWriter):
 
     def _write_loop(self, op: Operation, args: list[str], depth: int) -> None:
         (body,) = op.blocks
-        shared = self._shared_carry(op)
-        name = self._define_carry(op, args, shared, depth)
+        shared_flags = self._shared_carry(op)
+        name = self._define_carry(op, args, shared_flags, depth)
         counter = self.new_name("n")
         self.write_line(f"for (int {counter} = 0; {counter} < {op.param('length')}; ++{counter}) {{", depth)
         outs = self.write_block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
-        self._assign_carry(op, name, outs, shared, None, depth + 1)
+        self._assign_carry(op, name, outs, shared_flags, None, depth + 1)
         self.write_line("}", depth)
 
     def _write_over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
@@ -222,27 +222,29 @@ class Writer(LineWriter):
 
     def _write_while(self, op: Operation, args: list[str], depth: int) -> None:
         test, body = op.blocks
-        shared = self._shared_carry(op)
-        name = self._define_carry(op, args, shared, depth)
+        shared_flags = self._shared_carry(op)
+        name = self._define_carry(op, args, shared_flags, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
         self.write_line("for (;;) {", depth)
         (continues,) = self.write_block(test, carry, depth + 1)
         self.write_line(f"if (!any({continues})) break;", depth + 1)
         mask = None if is_shared(test.outputs[0], self.shared) else continues
-        self._assign_carry(op, name, self.write_block(body, carry, depth + 1), shared, mask, depth + 1)
+        self._assign_carry(op, name, self.write_block(body, carry, depth + 1), shared_flags, mask, depth + 1)
         self.write_line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
         """Return whether all lanes share each number that a loop carries, and mark shared inputs of its blocks."""
-        shared = shared_carry(op, self.shared)
+        shared_flags = shared_carry(op, self.shared)
         for block in op.blocks:
-            self.shared.update(x for x, is_shared_number in zip(block.inputs, shared, strict=True) if is_shared_number)
-        return shared
+            self.shared.update(
+                x for x, is_shared_number in zip(block.inputs, shared_flags, strict=True) if is_shared_number
+            )
+        return shared_flags
 
-    def _define_carry(self, op: Operation, initial: Sequence[str], shared: Sequence[bool], depth: int) -> str:
+    def _define_carry(self, op: Operation, initial: Sequence[str], shared_flags: Sequence[bool], depth: int) -> str:
         """Write a variable with its initial number for each result of an operation; return the prefix of the names."""
         name = self._name_results(op)
-        for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared, strict=True)):
+        for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared_flags, strict=True)):
             ctype = type_name(x.dtype)
             self.write_line(
                 f"{ctype} {name}_{k} = {value};" if is_shared_number else f"auto {name}_{k} = {ctype}_lanes({value});",
@@ -251,7 +253,7 @@ class Writer(LineWriter):
         return name
 
     def _assign_carry(
-        self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
+        self, op: Operation, name: str, outs: Sequence[str], shared_flags: Sequence[bool], mask: str | None, depth: int
     ) -> None:
         """Write the assignments at the end of an iteration; lanes where ``mask`` is false keep their old values.
 
@@ -259,19 +261,19 @@ class Writer(LineWriter):
         """
         new_names = [self.new_name() for _ in outs]
         for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
-            text = result if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {result})"
+            text = result if mask is None or shared_flags[k] else f"select_n_({mask}, {name}_{k}, {result})"
             self.write_line(f"const auto {new_name} = {text};", depth)
-        for k, (new_name, x, is_shared_number) in enumerate(zip(new_names, op.results, shared, strict=True)):
+        for k, (new_name, x, is_shared_number) in enumerate(zip(new_names, op.results, shared_flags, strict=True)):
             value = new_name if is_shared_number else f"{type_name(x.dtype)}_lanes({new_name})"
             self.write_line(f"{name}_{k} = {value};", depth)
 
 
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
     """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
-    earlier = [x for op in block.operations[:position] for x in op.results if not x.size]
+    earlier_values = [x for op in block.operations[:position] for x in op.results if not x.size]
     used = dataclasses.replace(block, operations=block.operations[position + 1 :]).used_values()
     used = used.union(*(inner.used_values() for inner in block.operations[position].blocks))
-    return [(x, type_name(x.dtype)) for x in earlier if x in used]
+    return [(x, type_name(x.dtype)) for x in earlier_values if x in used]
 
 
 def _entry_group(op: Operation) -> EntryGroup:

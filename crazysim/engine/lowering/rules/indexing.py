@@ -87,6 +87,7 @@ def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> ElementArray:
 
 
 def _conjunction(ctx: Lowering, conditions: Iterable[ElementArray]) -> ElementArray | None:
+    """Return True where all conditions hold; None if there is no condition."""
     result = None
     for condition in conditions:
         result = condition if result is None else ctx.elementwise("and", [result, condition], bool)
@@ -115,7 +116,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
         return move_by_indices(eqn, [x], [known_values(indices)])
     dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
     limits = [x.shape[axis] - sizes[axis] for axis in dims.start_index_map]
-    n_places = int(np.prod([limit + 1 for limit in limits]))
+    n_window_positions = int(np.prod([limit + 1 for limit in limits]))
     rows = indices.reshape(-1, indices.shape[-1])
     out = eqn.outvars[0].aval
     # For each element of the result, the row of indices that selects it: the batch axes of the result number the rows.
@@ -126,7 +127,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
         shape[axis] = size
     row_by_element = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
 
-    table = tables.find_table(ctx, x, dims.start_index_map, n_places)
+    table = tables.find_table(ctx, x, dims.start_index_map, n_window_positions)
     if table is not None:
         zeros = np.zeros(indices.shape, np.int32)
         offsets = move_by_indices(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
