@@ -85,8 +85,8 @@ class CarriedCamera:
     def on_drone(cls, camera: DroneCamera, drone: int) -> CarriedCamera:
         """Return the camera that one drone carries."""
         forward, left, up = camera.rot.T
-        columns = tuple(tuple(map(float, row)) for row in np.stack([-left, up, -forward], axis=-1))
-        return cls("drone", f"drone:{drone}", drone, tuple(map(float, camera.pos[drone])), columns, True, 0.0)
+        rot_rows = tuple(tuple(map(float, row)) for row in np.stack([-left, up, -forward], axis=-1))
+        return cls("drone", f"drone:{drone}", drone, tuple(map(float, camera.pos[drone])), rot_rows, True, 0.0)
 
 
 def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[CarriedCamera]:
@@ -131,8 +131,8 @@ def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Carri
         if mode == fixed:
             to_body = data.xmat[root].reshape(3, 3).T
             pos, rot = to_body @ pos, to_body @ rot
-    columns = tuple(tuple(map(float, line)) for line in rot)
-    return CarriedCamera(carrier, name, row, tuple(map(float, pos)), columns, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
+    rot_rows = tuple(tuple(map(float, line)) for line in rot)
+    return CarriedCamera(carrier, name, row, tuple(map(float, pos)), rot_rows, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
 
 
 def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:

@@ -36,7 +36,7 @@ class MjxScene:
         self._model: mjx.Model | None = None
         self._data: mjx.Data | None = None
         self._initial_poses: tuple[NDArray, ...] | None = None
-        self._is_synced = False
+        self._has_synced = False
 
     @property
     def model(self) -> mjx.Model:
@@ -71,7 +71,7 @@ class MjxScene:
 
     def sync(self, data: SimData) -> SimData:
         """Copy the poses in the data of all worlds into MJX, and return the data with ``core.mjx_synced`` set."""
-        is_first, self._is_synced = not self._is_synced, True
+        is_first, self._has_synced = not self._has_synced, True
         with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if is_first else nullcontext():
             data, self._data = sync_sim2mjx(data, self.data, self.model)
         return data
@@ -113,7 +113,7 @@ class MjxScene:
 
     def shard(self, mesh: Mesh) -> None:
         """Distribute the worlds over devices."""
-        self._mesh, self._model, self._is_synced = mesh, None, False
+        self._mesh, self._model, self._has_synced = mesh, None, False
         if self._data is not None:
             self._data = self._to_device(self._data)
 

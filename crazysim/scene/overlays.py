@@ -84,18 +84,18 @@ class Overlays:
 
     def write(self, scene: mujoco.MjvScene) -> None:
         """Append the geoms to MuJoCo's scene before it is drawn."""
-        for kind, size, a, b, rgba, emission in self._geoms:
+        for kind, size, start, end_or_label, rgba, emission in self._geoms:
             if scene.ngeom >= scene.maxgeom:
                 raise ValueError(
                     f"expected at most {scene.maxgeom} geoms in one image, got more. Increase sim.max_visual_geom."
                 )
             geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, kind, np.full(3, size), a, np.eye(3).ravel(), rgba)
+            mujoco.mjv_initGeom(geom, kind, np.full(3, size), start, np.eye(3).ravel(), rgba)
             geom.emission = emission
-            if isinstance(b, str):
-                geom.label = b
-            elif b is not None:
-                mujoco.mjv_connector(geom, kind, size, a, np.asarray(b, float))
+            if isinstance(end_or_label, str):
+                geom.label = end_or_label
+            elif end_or_label is not None:
+                mujoco.mjv_connector(geom, kind, size, start, np.asarray(end_or_label, float))
             scene.ngeom += 1
 
     @property
@@ -103,10 +103,10 @@ class Overlays:
         """True if a corner has text."""
         return bool(self._texts)
 
-    def write_text(self, pixels: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
-        """Draw the text of the corners over an image that has been drawn."""
+    def write_text(self, rectangle: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
+        """Draw the text of the corners over an image that has been drawn in a rectangle, pixels."""
         for corner, text in self._texts.items():
-            mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, IMAGE_CORNERS[corner], pixels, text, "", context)
+            mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, IMAGE_CORNERS[corner], rectangle, text, "", context)
 
     def clear(self) -> None:
         """Remove all geoms and text."""

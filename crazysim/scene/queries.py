@@ -34,6 +34,7 @@ class SceneQueries:
     def __init__(self, scene: Scene):
         self._scene = scene
         self._reported_messages: set[str] = set()
+        # The compiled queries, by name and settings, and the model for which they were compiled.
         self._compiled: tuple[mujoco.MjModel | None, dict[tuple[Any, ...], Callable[..., Any]]] = None, {}
 
     def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:

@@ -53,13 +53,13 @@ class Hits(PyTree):
     """First surfaces that rays meet."""
 
     distance: Array
-    """Length of the ray, m; infinite where it meets nothing."""
+    """Length of the ray, m; infinite where it meets nothing. (...)"""
     normal: Array
     """Unit normal of the surface, world frame; zero where the ray meets nothing. (..., 3)"""
     point: Array
     """Point of the surface, world frame, m; zero where the ray meets nothing. (..., 3)"""
     body_index: Array
-    """Index of the body in ``names``; -1 where the ray meets nothing."""
+    """Index of the body in ``names``; -1 where the ray meets nothing. (...)"""
     names: tuple[str, ...] = static()
     """Names of floor, objects and drones, in the order of ``body_index``."""
 

@@ -27,6 +27,7 @@ class SceneRenderer:
         self._device = device
         self.overlays = Overlays()
         self.viewer = None
+        # Arguments and renderer of the last call of ``render_worlds``.
         self._batch: tuple[tuple[int | str, ...], BatchRenderer] | None = None
 
     def render(

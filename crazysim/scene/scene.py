@@ -444,7 +444,10 @@ class Scene:
     # Contact slots and images -----------------------------------------------------------------------------------------
 
     def contacts(self, body: str | None = None) -> Array:
-        """Return True for every contact slot, of one body or of all, that touched at the last sync.
+        """Return True for every contact slot of MJX that touched at the last sync.
+
+        Args:
+            body: Name of the body whose slots are returned; None for all bodies.
 
         Returns:
             (n_worlds, n_slots), bool

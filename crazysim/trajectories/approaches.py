@@ -51,7 +51,7 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     first, second = np.triu_indices(n, 1)
     if not len(first):
         return []
-    min_distance, best_time = np.full(len(first), np.inf), np.zeros(len(first))
+    min_distances, closest_times = np.full(len(first), np.inf), np.zeros(len(first))
     n_cells = int(np.ceil(pieces.duration / CELL_DURATION))
     dt, motion = pieces.duration / n_cells, _Motion(pieces)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
@@ -64,16 +64,16 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
             i, j = first[pair[part]], second[pair[part]]
             motion_i, motion_j = (motion.motion_in_cells(drone, cell[part], dt, motion_table) for drone in (i, j))
             lower_bound = _lower_bounds(
-                pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distance, best_time
+                pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, min_distances, closest_times
             )
-            is_kept[part] = lower_bound < min_distance[pair[part]] - tolerance
+            is_kept[part] = lower_bound < min_distances[pair[part]] - tolerance
         pair, cell = (
             np.repeat(pair[is_kept], N_SPLITS),
             (cell[is_kept][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel(),
         )
         dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
-    order = np.argsort(min_distance, kind="stable")
-    return [Approach((int(first[k]), int(second[k])), float(min_distance[k]), float(best_time[k])) for k in order]
+    order = np.argsort(min_distances, kind="stable")
+    return [Approach((int(first[k]), int(second[k])), float(min_distances[k]), float(closest_times[k])) for k in order]
 
 
 class _Motion:
@@ -83,7 +83,7 @@ class _Motion:
         self.pieces = pieces
         snap = pieces.derivative_coefficients(4)[:, :3]
         control_points = snap @ bernstein_matrix(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
-        # Sum over each piece and all before it of the largest snap in a piece.
+        # Cumulative sum over the pieces of an upper bound of the snap in each piece.
         self.summed_snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
         # Jumps of the derivatives of orders 0 to 3 from the previous piece to each piece.
         jumps = np.zeros((4, len(pieces.drone)))
@@ -128,7 +128,7 @@ def _lower_bounds(
     cell: Ints,
     dt: float,
     min_distances: Floats,
-    best_time: Floats,
+    closest_times: Floats,
 ) -> Floats:
     """Return a lower bound of the distance in each cell; update the least distance and time of each pair in place."""
     start, end, acc, jerk = (a - b for a, b in zip(motion_i[:4], motion_j[:4], strict=True))
@@ -144,7 +144,7 @@ def _lower_bounds(
     t = (cell[k] + u[k]) * dt
     distance = _norm((pieces.evaluate(drones[0][k], t) - pieces.evaluate(drones[1][k], t))[:, :3])
     is_closer = distance < min_distances[pair[k]]
-    min_distances[pair[k[is_closer]]], best_time[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
+    min_distances[pair[k[is_closer]]], closest_times[pair[k[is_closer]]] = distance[is_closer], t[is_closer]
     return chord_distance - deviation
 
 

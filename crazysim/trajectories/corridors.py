@@ -162,6 +162,7 @@ class _QuadraticProgram:
             part = slice(p * self.order, (p + 2) * self.order)
             matrix[part, part] += block
         free_masks = [self.is_free[..., axis].ravel() for axis in range(3)]
+        # Cholesky factor of the cost matrix of the free derivatives of each axis.
         self.factors = [np.linalg.cholesky(matrix[np.ix_(mask, mask)]) for mask in free_masks]
         # Half-spaces ``row . x <= slack``; a step x from the minimum adds |x|^2 to the cost.
         self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_masks)))), np.zeros(0)

@@ -142,12 +142,12 @@ class Trajectory(PyTree):
         inverse = _inverse_length(jnp, _clipped_entry(ends, index, piece) - start)
         u, piece_coefficients = (local_time - start) * inverse, _clipped_entry(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
-        rows: dict[int, list[Array]] = {}
+        derivatives_by_axis: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
             axes = [k for k, d in enumerate(degrees) if d == degree]
             derivatives = _polynomial_derivatives(piece_coefficients[np.array(axes), : degree + 1], u, N_DERIVATIVES)
-            rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
-        values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
+            derivatives_by_axis.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
+        values = [jnp.stack([derivatives_by_axis[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
         return _build_setpoint(_scale_derivatives(values, jnp.where(is_active, inverse * rate, 0.0)))
 
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:

@@ -70,7 +70,7 @@ def require_version_one(value: dict[str, Any], location: str) -> None:
 
 
 def require_number(value: object, location: str, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a value that must be a finite number in a range."""
+    """Return a value that must be a number from ``low`` to ``high``, as a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
         raise_error(
             "a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}",
