@@ -57,11 +57,11 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             "Convert the log with blackbox_decode or the Blackbox Explorer."
         )
     start, names, settings = header
-    unit = {}
+    units = {}
     for name in names:
         key, _, unit_text = name.partition(" (")
-        unit[key] = unit_text.rstrip(")")
-    keys = list(unit)
+        units[key] = unit_text.rstrip(")")
+    keys = list(units)
     if len(keys) != len(names):
         raise ConfigError(f"{path.name}: expected columns of different names, got some twice. Export the log again.")
     names_read = [
@@ -79,23 +79,23 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         )
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [*file][start + 1 :]
-    cells = split_rows(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
+    text_rows = split_rows(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
     indices = [keys.index(key) for key in names_read]
-    rows = [[parse_number(row[k]) for k in indices] for row in cells]
+    rows = [[parse_number(row[k]) for k in indices] for row in text_rows]
     data = dict(zip(names_read, without_huge_numbers(np.array(rows)).T, strict=True))
 
     resolution_factor = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
-    gyro_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / resolution_factor)
+    gyro_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(units["gyroADC[0]"], math.pi / 180 / resolution_factor)
     poles = parse_number(settings.get("motor_poles", str(MOTOR_POLES)))
     if not 2 <= poles < math.inf:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
-    table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
+    table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(units["time"], 1e-6)}
     table |= {f"w{axis}": gyro_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
     table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}
     rotors = [k for k in range(n_rotors) if f"eRPM[{k}]" in data]
     table |= {f"rpm{k + 1}": 200 / poles * data[f"eRPM[{k}]"] for k in rotors}
     if "vbatLatest" in data:
-        table["voltage"] = data["vbatLatest"] * (1.0 if unit["vbatLatest"] == "V" else 0.01)
+        table["voltage"] = data["vbatLatest"] * (1.0 if units["vbatLatest"] == "V" else 0.01)
     if "imuQuaternion[0]" in data:
         vector = np.stack([data[f"imuQuaternion[{k}]"] for k in range(3)]) / 32767
         scalar = np.sqrt(np.clip(1 - np.sum(vector**2, axis=0), 0, 1))

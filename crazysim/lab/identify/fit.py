@@ -160,33 +160,35 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     logs = [with_speeds(log, base) for log in logs]
     _check_logs(logs, base)
-    cut_windows(logs, WINDOW_DURATION, WINDOW_DURATION)
+    cut_windows(logs, WINDOW_DURATION, WINDOW_DURATION)  # an error if no log is long enough
     check_turning(logs)
     if base.n_rotors <= 4:
         _check_rotor_order(logs, base)
     flight_mass = float(base.value("rigid_body.mass")) if mass is None else float(mass)
     params = Model.create(base, flight_mass).params
-    rotation_fit = fast_rotation(logs, params, float(_fit_forces(logs, params)[0][0]))
+    thrust_factor = float(_fit_forces(logs, params)[0][0])
+    rotation_fit = fast_rotation(logs, params, thrust_factor)
     logs = [aligned(log, delay) for log, delay in zip(logs, rotation_fit.delays, strict=True)]
-    force, force_spread = _fit_forces(logs, params)
-    force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force[0])
-    torque, torque_spread = _fit_torques(logs, params, float(force[0]), rotation_fit.values)
+    force_values, force_spread = _fit_forces(logs, params)
+    thrust_factor = float(force_values[0])
+    force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force_values[0])
+    torque_values, torque_spread = _fit_torques(logs, params, thrust_factor, rotation_fit.values)
     delayed_logs = [aligned(log, SLOW_TORQUE_DELAY_STD * log.dt) for log in logs]
     torque_spread = np.hypot(
-        torque_spread, _fit_torques(delayed_logs, params, float(force[0]), rotation_fit.values)[0] - torque
+        torque_spread, _fit_torques(delayed_logs, params, thrust_factor, rotation_fit.values)[0] - torque_values
     )
     for k, deviation in enumerate(rotation_fit.deviations):
         if math.isfinite(deviation):
-            shifted_torque = _fit_torques(
-                logs, params, float(force[0]), rotation_fit.values + deviation * (np.arange(5) == k)
+            shifted_values = _fit_torques(
+                logs, params, thrust_factor, rotation_fit.values + deviation * (np.arange(5) == k)
             )[0]
-            torque_spread = np.hypot(torque_spread, shifted_torque - torque)
+            torque_spread = np.hypot(torque_spread, shifted_values - torque_values)
 
-    def name_parameters(force: NDArray, torque: NDArray, rotation_factors: NDArray) -> dict[str, float]:
-        numbers = [*force, *torque, *rotation_factors]
+    def name_parameters(force_numbers: NDArray, torque_numbers: NDArray, rotation_numbers: NDArray) -> dict[str, float]:
+        numbers = [*force_numbers, *torque_numbers, *rotation_numbers]
         return dict(zip((*FORCE_TERMS, *TORQUE_TERMS, *FACTOR_NAMES[1:]), map(float, numbers), strict=True))
 
-    values = name_parameters(force, torque, rotation_fit.values)
+    values = name_parameters(force_values, torque_values, rotation_fit.values)
     deviations = name_parameters(force_spread, torque_spread, rotation_fit.deviations)
     if unphysical := [
         f"{name} {values[name]:.3g}"
@@ -227,10 +229,12 @@ def _fit_forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[N
         thrust = np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
         vel, speed = _to_body_frame(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
         axes = np.eye(3)
-        body = [thrust.sum(-1, keepdims=True) * axes[2]]
-        body += [(x[:, k : k + 1] * axes[k]) for x in (vel, vel * speed) for k in range(3)]
-        world = np.stack([np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body], axis=-1)
-        return world, mass * (log.vel - gravity * log.t[:, None])
+        body_forces = [thrust.sum(-1, keepdims=True) * axes[2]]
+        body_forces += [(x[:, k : k + 1] * axes[k]) for x in (vel, vel * speed) for k in range(3)]
+        world_forces = np.stack(
+            [np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body_forces], axis=-1
+        )
+        return world_forces, mass * (log.vel - gravity * log.t[:, None])
 
     return _fit_regression(logs, terms, np.arange(7) > 0)
 

@@ -88,9 +88,10 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
                 "expected rotors that turn the drone in the direction of their torque, got the opposite. "
                 "Check the order of the rotors and the frames of attitude and angular velocity."
             )
-        x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
-        z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
-        values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
+        x_factor, y_factor = 1 / roll / moments[0], 1 / pitch / moments[1]
+        z_factor = (x_factor * moments[0] + y_factor * moments[1]) / (moments[0] + moments[1])
+        rotor_factors = (max(c, 0.0) * moments[2] * z_factor for c in (drag, reaction))
+        values = np.array([x_factor, y_factor, z_factor, *rotor_factors])
     delayed_estimates = np.concatenate(
         [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
     )
@@ -101,7 +102,11 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     relative_deviations = np.array(deviations[:2]) / [roll, pitch]
     mean_tilt_deviation = np.hypot(*(relative_deviations * inertia[:2])) / np.sum(inertia[:2])
     deviation = np.hypot(
-        [*relative_deviations * [x, y], mean_tilt_deviation * z, *inertia[2] * np.hypot(deviations[2:], yaw_changes)],
+        [
+            *relative_deviations * [x_factor, y_factor],
+            mean_tilt_deviation * z_factor,
+            *inertia[2] * np.hypot(deviations[2:], yaw_changes),
+        ],
         SAMPLING_ERROR * values,
     )
     overall_delay = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]

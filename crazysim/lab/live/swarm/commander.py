@@ -81,7 +81,7 @@ class Commander:
         return self._planned_motion is None or self._planned_motion.has_ended(self.now)
 
     def goal(self) -> NDArray:
-        """Return position, yaw and their derivatives of the active setpoint, or else of the drone. (3, 4)"""
+        """Return position and yaw, and their first two derivatives, of the active setpoint or the drone. (3, 4)"""
         if self._stream is not None:
             return self._last_goal
         if self._planned_motion is not None:
