@@ -291,9 +291,9 @@ def rpy_from_axes(x: Array, y: Array, z: Array) -> Array:
 def quat_from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return the quaternion of the frame with these orthonormal axes in the world frame. (..., 3) -> (..., 4)
 
-    The products ``4 q_i q`` are linear in the axes. A product with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
-    there is no division by small numbers, and value and gradient are accurate at every attitude. The sign of the
-    quaternion is arbitrary.
+    The four products ``4 q_i q``, ``by_x`` to ``by_w``, are linear in the axes. A product with ``q_i^2 >= 1 / 4`` is
+    scaled to length one, so that there is no division by small numbers, and value and gradient are accurate at every
+    attitude. The sign of the quaternion is arbitrary.
     """
     xx, yy, zz = x[..., 0], y[..., 1], z[..., 2]
     xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]

@@ -86,7 +86,7 @@ def _provenance(selected_sections: Sequence[Section]) -> str:
         commit = f", commit {result.stdout.strip()}" if result.returncode == 0 else ""
     except OSError:
         commit = ""
-    packages: dict[str, str] = {}
+    packages: dict[str, str] = {}  # requirements by name of import
     for section in selected_sections:
         if not section.problem:
             packages |= section.packages

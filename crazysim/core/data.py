@@ -22,6 +22,7 @@ from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, host_array, leaf, static
 
 SimParams = first_principles.Params | fitted.Params
+"""Parameters of a dynamics model."""
 
 MAX_STEPS = 2**31 - 1
 """Largest number of steps since a reset, the largest int32: 24.9 days at 1000 Hz."""

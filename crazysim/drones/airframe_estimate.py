@@ -297,23 +297,27 @@ def _estimate_inertia(mass: float, rotor_pos: NDArray) -> NDArray:
 def _add_thrust(
     file: _AirframeFile,
     mass: float,
-    n: int,
+    n_rotors: int,
     diameter: float,
-    ratio: Any,
-    table: MotorTable | None,
+    thrust_to_weight: Any,
+    motor_table: MotorTable | None,
     pitch: float | None,
 ) -> float:
     """Add the largest thrust and the curves of thrust and torque; return the largest thrust of one rotor, N."""
-    if (ratio is None) == (table is None):
+    if (thrust_to_weight is None) == (motor_table is None):
         raise ConfigError(
             "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
             "4 for an agile one."
         )
-    motor_data = {} if table is None else _parse_motor_table(table)
-    table_name = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
-    if table is None:
-        thrust = ratio * mass * GRAVITY_MAGNITUDE / n
-        file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=ratio)
+    motor_data = {} if motor_table is None else _parse_motor_table(motor_table)
+    table_name = (
+        f"motor table {Path(motor_table).name}"
+        if isinstance(motor_table, (str, Path))
+        else "motor table that was given"
+    )
+    if motor_table is None:
+        thrust = thrust_to_weight * mass * GRAVITY_MAGNITUDE / n_rotors
+        file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=thrust_to_weight)
     else:
         thrust = float(np.max(motor_data["thrust"]))
         file.describe("motor_thrust", f"Largest thrust of the {table_name}")

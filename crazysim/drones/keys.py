@@ -108,7 +108,7 @@ TABLES: dict[str, dict[str, Key]] = {
         "track_camera": Key(_VECTOR, COORDINATE),
     },
 }
-"""All tables by dotted path, with the keys of each."""
+"""All tables by dotted path, with the keys of each; ``Shapes`` defines ``"n"`` and ``"any"``."""
 
 LAYOUT = Layout(
     {f"{table}.{key}": entry for table, keys in TABLES.items() for key, entry in keys.items()},

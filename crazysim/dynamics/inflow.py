@@ -91,6 +91,7 @@ def thrust_in_flight(
     disc, loss = disc_factor(radius, air_density), blade * ang_vel
     tip_speed = radius * ang_vel
     advance_squared = in_plane_square / (tip_speed * tip_speed + in_plane_square + MIN_AIR_SPEED**2)
+    # The first expression for the thrust at an inflow w is ``lift - loss * w``.
     lift = (hover_thrust + loss * safe_sqrt(hover_thrust / disc)) * (1 + 1.5 * advance_squared)
 
     disc = disc * ceiling * ceiling

@@ -114,7 +114,7 @@ def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
 
 
 def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return the three corners of both triangles of every cell, concatenated. 3 of (..., n_triangles)"""
+    """Return the three corners of both triangles of every cell, concatenated. (..., n_triangles) each"""
 
     def take_corners(rows: slice, columns: slice) -> list[Array]:
         return [v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)]
@@ -129,7 +129,7 @@ def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def edges(grid: Vector) -> tuple[Vector, Vector]:
-    """Return the ends of all edges along x, y and the diagonals of cells, concatenated. 2 of (..., n_edges)"""
+    """Return the ends of all edges along x, y and the diagonals of cells, concatenated. (..., n_edges) each"""
     all_nodes, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
 
     def concatenate(*parts: tuple[slice, slice]) -> Vector:

@@ -162,6 +162,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     other_corners = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     edges = jnp.roll(other_corners, -1, axis=0) - other_corners
     limit = half[1:] * (2 - FACE_SHARE)
+    # Part of each edge within the limits, as fractions of the edge.
     start, end = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
     for k in range(2):
         rate = edges[:, k]

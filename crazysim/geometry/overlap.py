@@ -33,7 +33,7 @@ N_ARC_STEPS = 6
 """Refinement steps within the best arc."""
 
 PlaneVector = tuple[Array, Array]
-"""Vector in the plane of a circle. 2 of (...)"""
+"""Two components of a vector in the plane of a circle. (...) each"""
 
 
 def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:

@@ -58,8 +58,8 @@ def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Comp
 
     Args:
         shape: Shape, or shapes of one kind; not a height field.
-        origin: Origin of each ray, in the frame of the shape, m. 3 of (...)
-        direction: Unit direction of each ray, in the frame of the shape. 3 of (...)
+        origin: Components of the origins of rays, in the frame of the shape, m. (...) each
+        direction: Components of the unit directions of rays, in the frame of the shape. (...) each
     """
     if shape.kind != "plane":
         return first_distance(LINE_INTERVALS[shape.kind](shape, origin, direction))

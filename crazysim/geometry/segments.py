@@ -19,8 +19,8 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
     nearest points does not change the distance.
 
     Args:
-        middle: Centre of the segment, m. 3 of (...)
-        axis: Unit direction of the segment. 3 of (...)
+        middle: Components of the centre of the segment, m. (...) each
+        axis: Components of the unit direction of the segment. (...) each
         half: Half length of the segment, m.
         other_half: Half length of the other segment, m.
     """
@@ -44,8 +44,8 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     or a cross product of one of its edges and the segment (Gottschalk 1996).
 
     Args:
-        middle: Centre of the segment in the frame of the box, m. 3 of (...)
-        axis: Unit direction of the segment. 3 of (...)
+        middle: Components of the centre of the segment, in the frame of the box, m. (...) each
+        axis: Components of the unit direction of the segment. (...) each
         half: Half length of the segment, m.
         box: Half lengths of the box, m.
     """
@@ -89,6 +89,6 @@ def _largest_gap(middle: Components, axis: Components, half: Array | float, box:
 
 
 def _stop_gradient(vector: Components) -> Components:
-    """Return a vector without its derivatives. 3 of (...)"""
+    """Return the components of a vector without their derivatives. (...) each"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

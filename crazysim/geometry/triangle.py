@@ -12,7 +12,7 @@ MIN_SQUARED_SINE = 1e-10
 
 
 Barycentric = tuple[Array, Array, Array]
-"""Barycentric coordinates of a point of a triangle; they add up to one. 3 of (...)"""
+"""Barycentric coordinates of a point of a triangle; they add up to one. (...) each"""
 
 
 def from_barycentric(weights: Barycentric, a: Vector, b: Vector, c: Vector) -> Vector:

@@ -72,7 +72,7 @@ class Configuration:
     engine: str
     """Engine that executes steps, one of ``crazysim.engine.ENGINES``."""
     strict: bool
-    """True to raise an error where a slower engine would be used with a warning."""
+    """True to raise an error instead of using a slower engine with a warning."""
 
     def check(self, data: Any, reference: SimData) -> None:
         """Check that data belong to a simulation with these settings; takes some tens of microseconds.

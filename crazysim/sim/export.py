@@ -107,6 +107,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         )
     if len(staged_leaves(data)) > 1 and FEEDFORWARD not in parameters:
         stages = [stage("drone")(_stage_default_feedforward), *stages]
+    # Below, a leaf is an index into ``program.leaves``, and a slot is a leaf with the index of one of its elements.
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [x.name for x in program.leaves]
     command = _command_field(data)

@@ -53,6 +53,7 @@ class Member:
     """Name of its population; ``"drone"`` for a drone."""
 
     def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage_command: StageCommand):
+        """Create the view; ``index`` is the row in the arrays of drones or members, ``plugin`` is None for a drone."""
         self._sim, self.name, self.index, self._plugin, self._stage_command = sim, name, index, plugin, stage_command
         self.population, self.lock = DRONE_POPULATION if plugin is None else plugin.name, sim.lock
 

@@ -130,7 +130,7 @@ class Sim:
             mesh: Devices over which the worlds are distributed, from ``crazysim.core.sharding.world_mesh``.
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` selects the fastest that
                 can run the step pipeline here, which ``explain`` names.
-            strict: True to raise an error where a slower engine would be used with an ``EngineWarning``.
+            strict: True to raise an error instead of using a slower engine with a warning.
             controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
                 ``crazysim.control.controllers.CONTROLLERS``, such as ``"crazyflow"`` for the cascade of Crazyflow, or a
                 ``crazysim.control.Controller``; or a list of several. The rates above replace the controller's rates.

@@ -81,7 +81,7 @@ class StandingObstacles(Scenery):
 
         Args:
             obstacles: The obstacles.
-            offset: Components of the vectors from the middles of the obstacles to a point, world frame, m. 3 of (...)
+            offset: Components of the vectors from the middles of the obstacles to a point, world frame, m. (...) each
         """
         raise NotImplementedError
 
