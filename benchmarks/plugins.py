@@ -84,8 +84,10 @@ def _all_aids() -> list[Plugin]:
 
 def _all_plugins() -> list[Plugin]:
     aids = [*SENSORS["imu"](), *SENSORS["motion_capture"]()]
-    others = [plugin for name in (*SENSORS, *EFFECTS) if name not in NOT_IN_EVERYTHING for plugin in CASES[name]()]
-    return [*others, *aids, Kalman(aids)]  # type: ignore[arg-type]
+    other_plugins = [
+        plugin for name in (*SENSORS, *EFFECTS) if name not in NOT_IN_EVERYTHING for plugin in CASES[name]()
+    ]
+    return [*other_plugins, *aids, Kalman(aids)]  # type: ignore[arg-type]
 
 
 OUTDOOR_SENSORS = ("imu", "gps", "barometer", "magnetometer")

@@ -109,8 +109,8 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
     lowering = Lowering()
     index = as_elements([lowering.builder.input(np.int32)], ())
     rows: list[Any] = [TableRows(lowering.builder, x) for x in avals]
-    traced = jax.make_jaxpr(lambda i, *tables: list(fn(i, *tables)))(jax.ShapeDtypeStruct((), np.int32), *avals)
-    return prune(lowering.finish(lowering.lower(traced, [index, *rows])))
+    jaxpr = jax.make_jaxpr(lambda i, *tables: list(fn(i, *tables)))(jax.ShapeDtypeStruct((), np.int32), *avals)
+    return prune(lowering.finish(lowering.lower(jaxpr, [index, *rows])))
 
 
 def write_map(block: Block, target: str) -> Kernel:

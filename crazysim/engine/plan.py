@@ -176,7 +176,7 @@ class Planner(NamedTuple):
         select_rows = None
         if separate is not None and has_one_kernel:
             separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
-            select_rows = lambda written: [i for i in written if i not in separate_leaves]  # noqa: E731
+            select_rows = lambda written_leaves: [i for i in written_leaves if i not in separate_leaves]  # noqa: E731
         programs = tuple([optimise(program, select_rows, pack=k == 0) for k, program in enumerate(lowered_programs)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.explanation}" for s in unfused if not isinstance(s.error, LimitError)]
@@ -198,13 +198,13 @@ class Planner(NamedTuple):
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {reason}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
         inputs = {i for program in programs for i in _input_leaves(program)}
-        run, written = _join_runs(groups, programs, runs)
-        plan = self._make_plan(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
+        run, written_leaves = _join_runs(groups, programs, runs)
+        plan = self._make_plan(engine, reason, data, programs, inputs, written_leaves, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         is_on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if is_on_host and is_host_call_possible(kernels):
-            owned = [group.owned_leaves for group in groups]
-            host_call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
+            owned_by_group = [group.owned_leaves for group in groups]
+            host_call = HostCall(kernels, owned_by_group, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
             plan = dataclasses.replace(plan, host_call=host_call)
         return plan, problems
 
@@ -220,10 +220,10 @@ class Planner(NamedTuple):
         return f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.unfused_reason}"
 
     def _plan_plain(self, data: SimData, reason: str) -> Plan:
-        run, written = plain.build(self.stages, data)
+        run, written_leaves = plain.build(self.stages, data)
         all_leaves = tuple(range(len(jax.tree.leaves(data))))
         # XLA itself distributes the computation of ``plain`` over the devices.
-        return self._make_plan("plain", reason, data, (), all_leaves, tuple(written), run, len(all_leaves))
+        return self._make_plan("plain", reason, data, (), all_leaves, tuple(written_leaves), run, len(all_leaves))
 
     @property
     def _has_kernels(self) -> bool:
@@ -352,13 +352,13 @@ def _join_runs(
     runs = [adapt_to_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written_leaves)
-    owned = [group.owned_leaves for group in groups]
-    written = sorted({i for program in programs for i in program.written_leaves})
+    owned_by_group = [group.owned_leaves for group in groups]
+    written_leaves = sorted({i for program in programs for i in program.written_leaves})
 
     def run_all(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         results: dict[int, Any] = {}
         flags = []
-        for program, owned_leaves, run in zip(programs, owned, runs, strict=True):
+        for program, owned_leaves, run in zip(programs, owned_by_group, runs, strict=True):
             outputs, flagged = run(leaves[: len(program.leaves)], n_steps)
             results |= {
                 i: x
@@ -366,9 +366,9 @@ def _join_runs(
                 if owned_leaves is None or i in owned_leaves
             }
             flags.append(flagged)
-        return [results[i] for i in written], functools.reduce(operator.or_, flags)
+        return [results[i] for i in written_leaves], functools.reduce(operator.or_, flags)
 
-    return run_all, tuple(written)
+    return run_all, tuple(written_leaves)
 
 
 def _watched_leaves(data: SimData) -> list[Any]:

@@ -66,8 +66,10 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     if program.unfused_stages:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([extended_leaves[i].ravel() for i in program.packed])] if program.packed else []
-    written, _ = adapt_to_data_leaves(program, fused.build(program, Location(platform)))([*extended_leaves, *packed], 0)
-    data_after = treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written))
+    written_arrays, _ = adapt_to_data_leaves(program, fused.build(program, Location(platform)))(
+        [*extended_leaves, *packed], 0
+    )
+    data_after = treedef.unflatten(replace_leaves(extended_leaves, program.written_leaves, written_arrays))
     arrays = data_after.plugins[RECORD_NAME].arrays
     return [
         query_treedef.unflatten(

@@ -197,15 +197,15 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old_values |= {"body_pos": objects.pos, "body_quat": objects.quat}
         new_values |= {name: poses[name][:, None, columns] for name in ("body_pos", "body_quat")}
-    updated = _replace_in_worlds(old_values, worlds, new_values)
-    states = data.states.replace(pos=updated["pos"], quat=updated["quat"])
-    core = data.core.replace(steps=updated["steps"])
+    updated_values = _replace_in_worlds(old_values, worlds, new_values)
+    states = data.states.replace(pos=updated_values["pos"], quat=updated_values["quat"])
+    core = data.core.replace(steps=updated_values["steps"])
     if objects is not None:
         recorded = any(plugin.moves_objects for plugin in sim.plugins.values())
-        objects = objects.replace(pos=updated["body_pos"], quat=updated["body_quat"], recorded=recorded)
+        objects = objects.replace(pos=updated_values["body_pos"], quat=updated_values["body_quat"], recorded=recorded)
     data = data.replace(states=states, core=core, objects=objects)
-    if "setpoint" in updated:
-        command, (_, *feedforward_leaves) = updated["setpoint"], staged_leaves(data)
+    if "setpoint" in updated_values:
+        command, (_, *feedforward_leaves) = updated_values["setpoint"], staged_leaves(data)
         # Other worlds keep their feedforward.
         feedforward = [x.at[worlds].set(default_feedforward(command)[worlds]) for x in feedforward_leaves]
         data = stage_command(data, command, *feedforward)

@@ -209,15 +209,15 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     n = op.param("n_members")
     member_number = np.arange(shape[0]) % n
     combining_functions: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
-    reduced = [
+    reduced_results = [
         np.full(shape, ops.neutral_number(name, x.dtype))
         for name, x in zip(op.param("reduce"), op.results, strict=True)
     ]
     for j in range(n):
         other_numbers = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
         results = run([*other_numbers, member_number == j])
-        reduced = [fn(x, y) for fn, x, y in zip(combining_functions, reduced, results, strict=True)]
-    return reduced
+        reduced_results = [fn(x, y) for fn, x, y in zip(combining_functions, reduced_results, results, strict=True)]
+    return reduced_results
 
 
 THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -267,8 +267,8 @@ def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu:
         return lanes.run_steps(program, leaves, n_steps, run_block_in_callback)
     n_worlds, _ = lanes.batch_counts(program, leaves)
     array_leaves = [i for i, x in enumerate(leaves) if x is not None]
-    written = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
-    flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
+    written_shapes = [lanes.leaf_shape(program, i, n_worlds) for i in program.written_leaves]
+    flag_shape = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def run_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
         arrays = replace_leaves([None] * len(leaves), array_leaves, [np.asarray(x) for x in values])
@@ -277,7 +277,9 @@ def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu:
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in array_leaves]
     if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
-        out, flags = jax.pure_callback(run_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+        out, flags = jax.pure_callback(
+            run_arrays, (written_shapes, flag_shape), n_steps, *values, vmap_method="sequential"
+        )
     else:
         out, flags = run_arrays(n_steps, *values)
     are_random_keys = [is_key(program.leaves[i]) for i in program.written_leaves]

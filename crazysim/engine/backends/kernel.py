@@ -69,16 +69,16 @@ class KernelBody:
                 lanes share where it is used. None for no limit.
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
-        written, slots = self._collect_slots()
+        written_slots, slots = self._collect_slots()
         is_read_at_use = registers is not None and len(slots) > registers
-        loaded, rank = _loaded_slots(program), program.ranks
-        deferred = set() if exchange.depth else _deferred_slots(program)
+        loaded_slots, rank = _loaded_slots(program), program.ranks
+        deferred_slots = set() if exchange.depth else _deferred_slots(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
         shared_slots = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
         for slot in shared_slots:
             if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
-            elif slot in self.stored_slots or not (is_read_at_use or slot in deferred):
+            elif slot in self.stored_slots or not (is_read_at_use or slot in deferred_slots):
                 writer.write_line(f"const auto {names[slot]} = {_load_expression(program, slot)};", 1)
             else:
                 names[slot] = (
@@ -86,7 +86,9 @@ class KernelBody:
                 )
         self._n_shared_lines = len(writer.lines)
         exchange.open_loop(writer, 1)
-        lane_slots = [slot for slot in slots if slot not in shared_slots and (slot not in written or slot in loaded)]
+        lane_slots = [
+            slot for slot in slots if slot not in shared_slots and (slot not in written_slots or slot in loaded_slots)
+        ]
         for i in dict.fromkeys(i for i, _ in lane_slots if i not in program.rows):
             size, n_sharing = program.leaves[i].size, _n_sharing_lanes(program, i)
             writer.write_line(rows_line(f"p{rank[i]}", _type_name(program, i), size, n_sharing), self._depth)
@@ -94,13 +96,13 @@ class KernelBody:
             ctype, load = _type_name(program, slot[0]), _load_expression(program, slot)
             if slot in shared_slots:
                 continue
-            if slot in written:
-                initial = load if slot in loaded else f"{ctype}(0)"
+            if slot in written_slots:
+                initial = load if slot in loaded_slots else f"{ctype}(0)"
                 self.initial_values[slot] = f"{ctype}_lanes({initial})"
                 names[slot] = exchange.define_variable(
                     writer, names[slot], ctype, self.initial_values[slot], self._depth
                 )
-            elif slot not in self.stored_slots and slot in deferred:
+            elif slot not in self.stored_slots and slot in deferred_slots:
                 names[slot] = load
             else:
                 names[slot] = exchange.define_constant(writer, names[slot], ctype, load, self._depth)
@@ -165,10 +167,12 @@ class KernelBody:
     def _collect_slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all numbers that the kernel uses, as ordered sets."""
         program, segments = self.program, self.program.fused_segments
-        written = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
-        read = dict.fromkeys(slot for s in segments for slot in [*program.drone_slots(s, s.reads), *s.hoisted_reads])
-        checked = program.check_segment.reads if program.check_segment else ()
-        return written, dict.fromkeys([*read, *written, *checked, *self.stored_slots])
+        written_slots = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
+        read_slots = dict.fromkeys(
+            slot for s in segments for slot in [*program.drone_slots(s, s.reads), *s.hoisted_reads]
+        )
+        checked_slots = program.check_segment.reads if program.check_segment else ()
+        return written_slots, dict.fromkeys([*read_slots, *written_slots, *checked_slots, *self.stored_slots])
 
     def _write_hoisted(self, segment: Segment) -> list[str]:
         """Write the hoisted block of a segment, and return the names of the results."""
@@ -209,11 +213,11 @@ def _written_slots(program: Program) -> list[Slot]:
 
 def _loaded_slots(program: Program) -> set[Slot]:
     """Return the slots to load: the kernel may use them before a stage has written them."""
-    loaded: set[Slot] = set()
-    written: set[Slot] = set()
+    loaded_slots: set[Slot] = set()
+    written_slots: set[Slot] = set()
 
     def use_slots(slots: Iterable[Slot]) -> None:
-        loaded.update(slot for slot in slots if slot not in written)
+        loaded_slots.update(slot for slot in slots if slot not in written_slots)
 
     def run_segment(segment: Segment) -> None:
         use_slots(program.drone_slots(segment, segment.reads))
@@ -221,7 +225,7 @@ def _loaded_slots(program: Program) -> set[Slot]:
         for (leaf, _), slot in zip(segment.writes, program.drone_slots(segment, segment.writes), strict=True):
             is_one_drone = segment.scope == "world" and program.leaves[leaf].scope == "drone"
             n_written[slot] = n_written.get(slot, 0) + (1 if is_one_drone else program.n_drones)
-        written.update(slot for slot, n in n_written.items() if n >= program.n_drones)
+        written_slots.update(slot for slot, n in n_written.items() if n >= program.n_drones)
 
     for segment in program.phase_segments("before"):
         run_segment(segment)
@@ -232,7 +236,7 @@ def _loaded_slots(program: Program) -> set[Slot]:
     for segment in program.phase_segments("after"):
         run_segment(segment)
     use_slots(_written_slots(program))
-    return loaded
+    return loaded_slots
 
 
 def write_segment(

@@ -185,15 +185,15 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
         return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE_INDEX else value
 
     outs = values.execute(segment.block, [get_world_value(slot) for slot in segment.reads], shape[:1])
-    written: dict[Slot, dict[int, Any]] = {}  # values by slot of a drone, and then by index of the drone
+    values_by_slot: dict[Slot, dict[int, Any]] = {}  # each: values by index of the drone
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
         value = library.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
-            written.setdefault((leaf, k), {})[drone] = value
+            values_by_slot.setdefault((leaf, k), {})[drone] = value
         else:
-            written[leaf, k] = dict.fromkeys(range(values.n_drones), value)
-    for slot, values_by_drone in written.items():
+            values_by_slot[leaf, k] = dict.fromkeys(range(values.n_drones), value)
+    for slot, values_by_drone in values_by_slot.items():
         old = library.broadcast_to(values.get(slot), values.shape).reshape(shape)
         columns = [values_by_drone.get(d, old[:, d]) for d in range(values.n_drones)]
         values.set(slot, library.stack(columns, axis=-1).reshape(values.shape))

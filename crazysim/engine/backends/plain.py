@@ -40,19 +40,21 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         for stage in [stage for stage in stages if stage.phase == phase]:
             with jax.named_scope(stage.__name__):
                 data_after = stage(axes.treedef.unflatten(leaves))
-                written = axes.written_leaves(leaves, data_after, stage)
+                written_leaves = axes.written_leaves(leaves, data_after, stage)
                 new_leaves = jax.tree.leaves(data_after)
                 # Without the barrier, XLA's CPU backend recomputes these values for each result of a later stage.
-                leaves = replace_leaves(leaves, written, jax.lax.optimization_barrier([new_leaves[i] for i in written]))
+                leaves = replace_leaves(
+                    leaves, written_leaves, jax.lax.optimization_barrier([new_leaves[i] for i in written_leaves])
+                )
         return leaves
 
     jaxprs = {phase: jax.make_jaxpr(run_phase, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
     run_jaxprs = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
-    written = {phase: _changed_leaves(jaxpr) for phase, jaxpr in jaxprs.items()}
+    written_by_phase = {phase: _changed_leaves(jaxpr) for phase, jaxpr in jaxprs.items()}
 
     def run_steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         leaves = run_jaxprs["before"](*leaves)
-        loop_leaves = written["each"]
+        loop_leaves = written_by_phase["each"]
 
         def advance(values: list[Any]) -> list[Any]:
             leaves_after = run_jaxprs["each"](*replace_leaves(leaves, loop_leaves, values))
@@ -69,7 +71,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         return [leaves[i] for i in written_leaves], flagged
 
     scratch = {i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x}
-    written_leaves = sorted({i for leaves_of_phase in written.values() for i in leaves_of_phase} - scratch)
+    written_leaves = sorted({i for leaves_of_phase in written_by_phase.values() for i in leaves_of_phase} - scratch)
     return run_steps, written_leaves
 
 

@@ -160,10 +160,10 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
                 run_block(block, [*other_numbers, drone_number == j], (n_worlds, n), shared_values | own_values)
             )
         combining_functions = [COMBINING_FUNCTIONS[name] for name in op.param("reduce")]
-        reduced = [functools.reduce(fn, [jnp.broadcast_to(x, (n_worlds, n)) for x in results])
+        reduced_results = [functools.reduce(fn, [jnp.broadcast_to(x, (n_worlds, n)) for x in results])
                    for fn, results in zip(combining_functions, zip(*results_by_drone, strict=True), strict=True)
                    ]  # fmt: skip
-        return [jnp.reshape(x, shape) for x in reduced]
+        return [jnp.reshape(x, shape) for x in reduced_results]
     columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in lane_values.values()]  # (n, n_worlds, 1)
 
     def reduce_for_drone(xs: tuple[Array, list[Array]]) -> list[Array]:
@@ -177,11 +177,11 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
 
     drone_indices = jnp.arange(n)
     if n_worlds * n * n <= MAX_PAIRS:
-        reduced = jax.vmap(reduce_for_drone)((drone_indices, columns))
+        reduced_results = jax.vmap(reduce_for_drone)((drone_indices, columns))
     else:
         batch_size = max(1, MAX_PAIRS // (n_worlds * n))
-        reduced = lax.map(jax.checkpoint(reduce_for_drone), (drone_indices, columns), batch_size=batch_size)
-    return [x.T.reshape(shape) for x in reduced]
+        reduced_results = lax.map(jax.checkpoint(reduce_for_drone), (drone_indices, columns), batch_size=batch_size)
+    return [x.T.reshape(shape) for x in reduced_results]
 
 
 COMBINING_FUNCTIONS: dict[str, Callable[..., Array]] = {

@@ -64,10 +64,12 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     components = [(drone_stages | clocks, drone_populations), *other_components]  # the drones run all clocks
     groups, owned_leaves = [], frozenset()
     for indices, populations in components:
-        written = frozenset().union(*(accesses[k].written_leaves for k in indices))
+        written_leaves = frozenset().union(*(accesses[k].written_leaves for k in indices))
         main_population = "drone" if "drone" in populations else max(sorted(populations), key=n_members.__getitem__)
-        groups.append(Group(main_population, tuple([stages[k] for k in sorted(indices)]), written - owned_leaves))
-        owned_leaves |= written
+        groups.append(
+            Group(main_population, tuple([stages[k] for k in sorted(indices)]), written_leaves - owned_leaves)
+        )
+        owned_leaves |= written_leaves
     return groups
 
 

@@ -69,17 +69,17 @@ def lower_stages(
     ])  # fmt: skip
     scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x)
     program = Program(program_leaves, n_drones, tuple(segments), None, scratch, (), population, axes.views)
-    changed = known_zeros.keys() & set(program.written_leaves)
-    if changed:  # an element is only known to be zero while no stage writes it
-        zeros = tuple([(i, indices) for i, indices in zeros if i not in changed])
+    changed_leaves = known_zeros.keys() & set(program.written_leaves)
+    if changed_leaves:  # an element is only known to be zero while no stage writes it
+        zeros = tuple([(i, indices) for i, indices in zeros if i not in changed_leaves])
         return lower_stages(stages, data, zeros, watched, population, tracer)
     core = axes.leaf_indices.core
     if watched is None or core.nonfinite in program.written_leaves:
         return program
     lane_leaves = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked = sorted((lane_leaves | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
+    checked_leaves = sorted((lane_leaves | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
     return dataclasses.replace(
-        program, check_segment=_make_finite_check(axes, leaves, core.nonfinite, core.steps, checked)
+        program, check_segment=_make_finite_check(axes, leaves, core.nonfinite, core.steps, checked_leaves)
     )
 
 
@@ -97,8 +97,8 @@ def _move_before_steps(
         stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)
     ]
     n_moved = (*acts_at_first_step, False).index(False)
-    moved = [dataclasses.replace(s, phase="before") for s in segments[:n_moved] if isinstance(s, Segment)]
-    return [*moved, *segments[n_moved:]]
+    moved_segments = [dataclasses.replace(s, phase="before") for s in segments[:n_moved] if isinstance(s, Segment)]
+    return [*moved_segments, *segments[n_moved:]]
 
 
 def _lower_stage(
@@ -124,12 +124,12 @@ def _lower_stage(
         ]
         if max(population_sizes, default=0) > MAX_UNROLLED_DRONES:
             raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
-        shared = [i for i in traced.input_leaves if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
+        shared_leaves = [i for i in traced.input_leaves if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
         known_zeros = {i: zeros[i] for i in traced.input_leaves if i in zeros}
         n_members = n_drones if scope == "drone" else 0
         key = (stage.__name__, scope, phase, n_members, frozenset(known_zeros.items()))
         if key not in traced.segments:
-            traced.segments[key] = _make_segment(stage, scope, phase, traced, known_zeros, shared, n_members)
+            traced.segments[key] = _make_segment(stage, scope, phase, traced, known_zeros, shared_leaves, n_members)
         return traced.segments[key]
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
@@ -146,7 +146,7 @@ def _make_segment(
     phase: Phase,
     traced: TracedStage,
     zeros: Mapping[int, frozenset[int]],
-    shared: Sequence[int],
+    shared_leaves: Sequence[int],
     n_members: int,
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
@@ -155,10 +155,10 @@ def _make_segment(
     }
     tables = {
         _add_table(lowering, elements_before[i]): (i, TABLE_INDEX)
-        for i in shared
+        for i in shared_leaves
         if i in elements_before and elements_before[i].size > 1
     }
-    lowering.shared.update(x for i in shared for x in scalars(elements_before[i]) if isinstance(x, Value))
+    lowering.shared.update(x for i in shared_leaves for x in scalars(elements_before[i]) if isinstance(x, Value))
     args = [elements_before[i] for i in traced.input_leaves]
     if traced.when is None:
         elements_after = lowering.lower(traced.fn, args)
@@ -207,9 +207,9 @@ def _lower_guarded(
     if reads_other_drones:
         results = iter([old if old is new else lowering.scalar("select_n", mask, old, new) for old, new in pairs])
         return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old_arrays]
-    changed = [(old, new) for old, new in pairs if old is not new]
-    block = inner.builder.finish([new for _, new in changed])
-    old_elements = [old for old, _ in changed]
+    changed_pairs = [(old, new) for old, new in pairs if old is not new]
+    block = inner.builder.finish([new for _, new in changed_pairs])
+    old_elements = [old for old, _ in changed_pairs]
     results = iter(
         lowering.builder.add_many("when", (mask, *old_elements), [a.dtype for a in old_elements], (), (block,))
     )
@@ -224,8 +224,10 @@ def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> Elemen
     return as_elements(elements, template.shape)
 
 
-def _make_finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
-    """Return a segment that flags a drone if its world was flagged or one of its watched numbers is not finite.
+def _make_finite_check(
+    axes: Axes, leaves: Sequence[Any], flag: int, steps: int, checked_leaves: Sequence[int]
+) -> Segment:
+    """Return a segment that flags a drone if its world was flagged or one of its checked numbers is not finite.
 
     It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
     count has overflowed and is negative.
@@ -234,7 +236,7 @@ def _make_finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int,
     reads: list[Slot] = []
     is_finite: Element = constant(True, bool)
     avals = axes.unbatched_shapes(list(leaves), "drone")
-    for i in watched:
+    for i in checked_leaves:
         if avals[i].dtype.kind == "f":
             for k, item in enumerate(scalars(inputs(builder, avals[i]))):
                 reads.append((i, k))

@@ -21,23 +21,23 @@ def pack_shared(program: Program) -> Program:
     """
     leaves = program.leaves
     separate_leaves = {leaf for stage in program.unfused_stages for leaf in stage.input_leaves} | program.tables
-    shared = [
+    shared_leaves = [
         i
         for i in program.read_leaves
         if leaves[i].scope == "shared" and i not in separate_leaves and i not in program.written_leaves
     ]
-    shared = [i for i in shared if leaves[i].dtype == leaves[0].dtype]
-    if not shared:
+    shared_leaves = [i for i in shared_leaves if leaves[i].dtype == leaves[0].dtype]
+    if not shared_leaves:
         return program
     starts, size = {}, 0
-    for i in shared:
+    for i in shared_leaves:
         starts[i] = size
         size += leaves[i].size
     packed_leaf = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
     moved_program = _move_slots(
         program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot
     )
-    return dataclasses.replace(moved_program, leaves=(*leaves, packed_leaf), packed=tuple(shared))
+    return dataclasses.replace(moved_program, leaves=(*leaves, packed_leaf), packed=tuple(shared_leaves))
 
 
 def pack_rows(program: Program, select_rows: Callable[[list[int]], list[int]]) -> Program:

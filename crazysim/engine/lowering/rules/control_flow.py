@@ -75,10 +75,10 @@ def _lower_with_derivative(
         """Return the block from operands and their tangents to the tangents of the results."""
         call_fn = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(call_fn, x, dx)[1])(avals, avals)
+        tangent_jaxpr = jax.make_jaxpr(lambda x, dx: jax.jvp(call_fn, x, dx)[1])(avals, avals)
         tangents = Lowering()
         inputs = [_add_inputs(tangents, x) for x in (*args, *args)]
-        return tangents.finish(tangents.lower(traced, inputs))
+        return tangents.finish(tangents.lower(tangent_jaxpr, inputs))
 
     return _add_operation(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("derivative", derivative),))
 

@@ -27,9 +27,9 @@ def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) 
     if n == 1:
         return ctx.lower(eqn.params["jaxpr"], [*args, as_elements([constant(True, bool)], ())])
     published = [x for x in scalars(*args[n_captured:]) if not is_constant(x)]
-    shared = _shared_numbers(ctx)
+    shared_numbers = _shared_numbers(ctx)
     inner = ctx.make_inner()
-    other_inputs = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared}
+    other_inputs = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared_numbers}
     is_self = inner.builder.input(bool)
     other_elements = [_replace_elements(x, other_inputs) for x in args[n_captured:]]
     results = inner.lower(eqn.params["jaxpr"], [*args[:n_captured], *other_elements, as_elements([is_self], ())])

@@ -51,10 +51,10 @@ def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[E
     rows = [x.reshape(math.prod(x.shape[: len(axes)]), *result_shape) for x in arrays]
     results = [np.empty(result_shape, object) for _ in arrays]
     for result_index in np.ndindex(result_shape):
-        reduced = args[n:]
+        accumulators = args[n:]
         for k in range(len(rows[0])):
-            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *result_index, ...)] for x in rows)])
-        for result, value in zip(results, reduced, strict=True):
+            accumulators = ctx.lower(eqn.params["jaxpr"], [*accumulators, *(x[(k, *result_index, ...)] for x in rows)])
+        for result, value in zip(results, accumulators, strict=True):
             result[result_index] = value[()]
     return results
 
