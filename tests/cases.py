@@ -112,15 +112,17 @@ def with_params(data, **changes):
 def with_airframes(sim, airframes):
     """Return the data with the parameters and gains of an airframe for each world; numbers of rotors must be equal."""
 
-    kinds = list(dict.fromkeys(airframes))
-    kind_indices = [kinds.index(airframe) for airframe in airframes]
+    distinct_airframes = list(dict.fromkeys(airframes))
+    kind_indices = [distinct_airframes.index(airframe) for airframe in airframes]
 
     def stacked(shared):
         return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[kind_indices][:, None]), *shared)
 
-    params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
+    params = stacked([create_params(sim.dynamics, airframe) for airframe in distinct_airframes])
     settings = sim.configuration.control_freqs, sim.configuration.controller
-    per_airframe = [SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in kinds]
+    per_airframe = [
+        SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in distinct_airframes
+    ]
     controls = sim.data.controls
     for name in ("state", "attitude", "body_rate", "force_torque"):
         ctrl = getattr(controls, name)
@@ -177,7 +179,7 @@ def repeat_command(data, command):
 
 
 def trees_equal(a, b):
-    """Return whether two trees hold equal values; NaN equals NaN."""
+    """Return True if two trees hold equal values; NaN equals NaN."""
     leaves_a, leaves_b = (jax.tree.leaves(jax.tree.map(leaf_on_host, tree)) for tree in (a, b))
     return jax.tree.structure(a) == jax.tree.structure(b) and all(
         np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.floating))

@@ -143,7 +143,7 @@ def chromium(_chromium, viser, monkeypatch):
 
 
 def can_render():
-    """Return whether this machine can make an OpenGL context."""
+    """Return True if this machine can make an OpenGL context."""
     import mujoco
 
     try:

@@ -11,7 +11,7 @@ from crazysim.lab.live import Live
 
 
 class CompilationLog:
-    """A process that makes JAX log what it compiles once the processes before it have compiled."""
+    """A process of a live loop that makes JAX log compilations once the processes before it have compiled."""
 
     def compile(self, live: Live) -> None:
         jax.config.update("jax_log_compiles", True)

@@ -14,16 +14,22 @@ from crazysim.core.stage import stage
 from crazysim.pytree import Members, leaf
 
 STIFFNESS = 40.0
+"""Stiffness of the springs, N/m."""
 
 
 class Masses(Members):
     """Point masses."""
 
     pos: jax.Array = leaf("member", 1)
+    """Position, world frame, m. (3,)"""
     vel: jax.Array = leaf("member", 1)
+    """Velocity, world frame, m/s. (3,)"""
     cmd: jax.Array = leaf("member", 1)
+    """Position to which the spring pulls, world frame, m. (3,)"""
     ticks: jax.Array = leaf("member")
+    """Number of ticks of the controller. ()"""
     stiffness: jax.Array = leaf("parameter", 1, (1,))
+    """Stiffness of the spring, N/m. (1,)"""
 
 
 class Springs(Population):
@@ -91,9 +97,9 @@ class Tying(Springs):
         @stage("world")
         def exchange(data):
             record, states = self.read(data), data.states
-            swapped = 0.01 * (states.vel[0] - record.vel[-1])
-            data = data.replace(states=states.replace(vel=states.vel.at[0].add(-swapped)))
-            return self.write(data, record.replace(vel=record.vel.at[-1].add(swapped)))
+            vel_change = 0.01 * (states.vel[0] - record.vel[-1])
+            data = data.replace(states=states.replace(vel=states.vel.at[0].add(-vel_change)))
+            return self.write(data, record.replace(vel=record.vel.at[-1].add(vel_change)))
 
         placements = [
             StagePlacement(pull, name=f"{self.name}_pull"),
@@ -103,6 +109,7 @@ class Tying(Springs):
 
 
 KINDS = (Springs, Crowd, Tied, Tying)
+"""All populations of this module."""
 
 
 def build_springs(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):

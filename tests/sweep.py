@@ -185,6 +185,7 @@ def triad_errors(size):
 
 
 OFFSET, TURN = (0.01, 0.0, -0.02), (0.1, 0.2, 0.3)
+"""Position, m, and roll, pitch and yaw, rad, at which sensors are mounted."""
 ANCHORS = [(2.0, 2.0, 2.0), (-2.0, -2.0, 2.5)]
 STATIONS = [(0, 0, -2.4), (0, 0.6, 0.8)]
 DELAY_SETTINGS = {"delay": 0.004, "jitter": 0.004, "dropout": 0.1}
@@ -314,17 +315,17 @@ def select_controller(state, setpoint, time):
 def make_builder(plugins=list, **settings):
     """Return a function that builds a simulation from these and further settings."""
 
-    def build(**more):
-        return make_flying_sim(plugins=plugins(), **settings | more)
+    def build(**options):
+        return make_flying_sim(plugins=plugins(), **settings | options)
 
     build.plugins = plugins
     return build
 
 
-def build_tracking_sim(**more):
+def build_tracking_sim(**options):
     t = np.linspace(0, 1, 11)
     controller = TrackingLQR(setpoints=jax.vmap(FIGURE_EIGHT.evaluate)(t), dt=0.1)
-    return make_flying_sim(plugins=follow(), control="state", controller=controller, **more)
+    return make_flying_sim(plugins=follow(), control="state", controller=controller, **options)
 
 
 def follow():
@@ -334,9 +335,9 @@ def follow():
 build_tracking_sim.plugins = follow
 
 
-def build_fleet(**more):
+def build_fleet(**options):
     """Return a simulation of drones of several airframes, one of which has six rotors."""
-    sim = Sim(3, drone=FLEET, control="attitude", integrator="rk4", **more)
+    sim = Sim(3, drone=FLEET, control="attitude", integrator="rk4", **options)
     rng = np.random.default_rng(0)
     sim.data = with_states(sim.data, pos=rng.uniform(0.9, 1.1, (3, 4, 3)), vel=[0.1, 0.1, 0.1])
     sim.attitude_control(rng.uniform([0, 0, 0, 0.3], [0.2, 0.1, 0.2, 0.4], (3, 4, 4)))
@@ -395,9 +396,9 @@ CASES |= {
     "objects": make_builder(control="attitude", prepare=add_drifting_pad),
     "distances": make_builder(height=0.0, control="rotor_vel", prepare=replace_stages(distances=distances)),
     "fleet": build_fleet,
-    "populations": lambda **more: build_springs(KINDS, 3, 2, 4, **more),
-    "populations of equal sizes": lambda **more: build_springs(KINDS, 2, 2, 2, **more),
-    "many members": lambda **more: build_springs(Tied, 2, 2, 9, **more),
+    "populations": lambda **options: build_springs(KINDS, 3, 2, 4, **options),
+    "populations of equal sizes": lambda **options: build_springs(KINDS, 2, 2, 2, **options),
+    "many members": lambda **options: build_springs(Tied, 2, 2, 9, **options),
     "stages of all scopes": make_builder(
         n_drones=4, control="attitude", prepare=insert_before_integration(repulsion, centre, mean_torque)
     ),

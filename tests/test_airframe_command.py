@@ -10,7 +10,7 @@ from crazysim import load_airframe
 from crazysim.__main__ import main
 from crazysim.commands.airframe_check import describe_airframe
 
-NUMBERS = ("--mass", "1.2", "--propeller", "0.127", "--thrust-to-weight", "4")
+REQUIRED_OPTIONS = ("--mass", "1.2", "--propeller", "0.127", "--thrust-to-weight", "4")
 
 
 def rows(text):
@@ -20,7 +20,7 @@ def rows(text):
 
 def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
     path, picture = tmp_path / "mine.toml", tmp_path / "mine.png"
-    assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12", "--cells", "6"]) == 0
+    assert main(["airframe", "new", str(path), *REQUIRED_OPTIONS, "--arm", "0.12", "--cells", "6"]) == 0
     out = capsys.readouterr().out
     assert f"wrote {path}; estimated: inertia" in out
     assert f"crazysim airframe check {path}" in out
@@ -64,7 +64,18 @@ def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
 def test_new_takes_rotors_one_by_one(tmp_path):
     path = tmp_path / "tri.toml"
     places = "0.2,0.2 -0.3,0,0.01 0.2,-0.2,0"
-    arguments = [str(path), *NUMBERS, "--spins", "ccw", "cw", "CCW", "--name", "tri copter", "--positions", places]
+    arguments = [
+        str(path),
+        *REQUIRED_OPTIONS,
+        "--spins",
+        "ccw",
+        "cw",
+        "CCW",
+        "--name",
+        "tri copter",
+        "--positions",
+        places,
+    ]
     assert main(["airframe", "new", *arguments]) == 0
     airframe = load_airframe(path)
     assert airframe.name == "tri copter"
@@ -79,14 +90,17 @@ def test_new_takes_rotors_one_by_one(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["mine.txt", *NUMBERS], "expected the name of a file that ends with .toml"),
-        (["none/mine.toml", *NUMBERS], "expected an existing folder"),
-        (["mine.toml", *NUMBERS], "expected either arm"),
-        (["mine.toml", *NUMBERS, "--arm", "0.12", "--rotors", "100000"], "rotors from 4 to 64, which alternate"),
-        (["mine.toml", *NUMBERS, "--arm", "0.12", "--spins", "left"], "--spins of ccw and cw, got 'left'"),
-        (["mine.toml", *NUMBERS, "--positions", "a,b"], "--positions such as"),
-        (["there.toml", *NUMBERS, "--arm", "0.12"], "expected a new file"),
-        (["mine.toml", *NUMBERS[:-1], "0.5", "--arm", "0.12"], "expected rotors that lift"),
+        (["mine.txt", *REQUIRED_OPTIONS], "expected the name of a file that ends with .toml"),
+        (["none/mine.toml", *REQUIRED_OPTIONS], "expected an existing folder"),
+        (["mine.toml", *REQUIRED_OPTIONS], "expected either arm"),
+        (
+            ["mine.toml", *REQUIRED_OPTIONS, "--arm", "0.12", "--rotors", "100000"],
+            "rotors from 4 to 64, which alternate",
+        ),
+        (["mine.toml", *REQUIRED_OPTIONS, "--arm", "0.12", "--spins", "left"], "--spins of ccw and cw, got 'left'"),
+        (["mine.toml", *REQUIRED_OPTIONS, "--positions", "a,b"], "--positions such as"),
+        (["there.toml", *REQUIRED_OPTIONS, "--arm", "0.12"], "expected a new file"),
+        (["mine.toml", *REQUIRED_OPTIONS[:-1], "0.5", "--arm", "0.12"], "expected rotors that lift"),
     ],
 )
 def test_wrong_arguments_are_one_line_and_write_nothing(arguments, message, tmp_path, capsys, monkeypatch):
@@ -102,7 +116,7 @@ def test_wrong_arguments_are_one_line_and_write_nothing(arguments, message, tmp_
 def test_a_full_disk_leaves_nothing(tmp_path, capsys):
     path = tmp_path / "mine.toml"
     with full_disk():
-        assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 2
+        assert main(["airframe", "new", str(path), *REQUIRED_OPTIONS, "--arm", "0.12"]) == 2
     error = capsys.readouterr().err.strip()
     assert "expected a file that can be written" in error
     assert "\n" not in error
@@ -131,7 +145,7 @@ def test_a_drone_is_checked_by_hand():
 
 def test_the_file_states_the_assumptions_of_its_estimates(tmp_path):
     path = tmp_path / "mine.toml"
-    assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 0
+    assert main(["airframe", "new", str(path), *REQUIRED_OPTIONS, "--arm", "0.12"]) == 0
     sources = tomllib.loads(path.read_text(encoding="utf-8"))["sources"]
     assert "figure of merit of 0.44" in sources["torque_curve"]
 

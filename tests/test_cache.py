@@ -163,6 +163,7 @@ step = sim.build_step_fn()
 print(jax.grad(lambda z: step(F.state_control(sim.data, pos=z * np.eye(3)[2]), 10).states.pos[..., 2].mean())(1.0))
 print(jax.config.jax_compilation_cache_dir)
 """
+"""A script that compiles a step, a sync, observations and a gradient."""
 
 
 @pytest.mark.long("two processes import JAX and compile")
@@ -255,13 +256,13 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
         (tmp_path / name).write_bytes(bytes(10))
         os.utime(tmp_path / name, (time.time() - 1000 * age,) * 2)
 
-    def left():
+    def remaining():
         return {name for name in names if (tmp_path / name).exists()}
 
     trim(tmp_path, 50)
-    assert left() == set(names)
+    assert remaining() == set(names)
     trim(tmp_path, 49)  # down to 0.8 of it: 39 bytes, three programs
-    assert left() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
+    assert remaining() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
 
 
 @pytest.mark.long("three processes import JAX")

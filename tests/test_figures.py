@@ -72,8 +72,8 @@ def test_each_figure_has_a_script_and_a_place_on_its_page(figures):
         for path in figure.tracked_paths():
             assert (ROOT / path.removeprefix(":(exclude)")).exists(), f"{name}: {path} does not exist"
     places = [(name, str(page.relative_to(ROOT))) for page in PAGES for name in figures.figure_names(page.read_text())]
-    wanted = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]
-    assert sorted(places) == sorted([*wanted, ("readme", "README.md")])
+    expected = [(name, figure.page) for name, figure in figures.FIGURES.items() if figure.table]
+    assert sorted(places) == sorted([*expected, ("readme", "README.md")])
 
 
 def test_pages_show_the_records(figures):

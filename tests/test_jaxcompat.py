@@ -33,7 +33,7 @@ def test_a_jaxpr_is_closed_once():
     assert jaxcompat.jaxpr_as_fun(opened)(2.0)[0] == 3.0
 
 
-def test_literals_are_told_from_variables():
+def test_literals_are_distinguished_from_variables():
     eqn = equation(lambda x: x * 2.0, 1.0)
     kinds = [isinstance(v, jaxcompat.Literal) for v in eqn.invars]
     assert sorted(kinds) == [False, True]
@@ -42,15 +42,15 @@ def test_literals_are_told_from_variables():
 
 def test_a_jaxpr_drops_inputs_that_it_does_not_use():
     jaxpr = jax.make_jaxpr(lambda a, b, c: (a - c,))(1.0, 2.0, 3.0)
-    some = jaxcompat.select_inputs(jaxpr, [0, 2])
-    assert len(some.jaxpr.invars) == 2
-    assert jaxcompat.jaxpr_as_fun(some)(5.0, 3.0)[0] == 2.0
+    selected = jaxcompat.select_inputs(jaxpr, [0, 2])
+    assert len(selected.jaxpr.invars) == 2
+    assert jaxcompat.jaxpr_as_fun(selected)(5.0, 3.0)[0] == 2.0
 
 
 def test_an_input_that_is_dropped_may_be_a_random_key():
     jaxpr = jax.make_jaxpr(lambda key, x: (x + 1.0,))(jax.random.key(0), jnp.ones(3))
-    some = jaxcompat.select_inputs(jaxpr, [1])
-    np.testing.assert_array_equal(jaxcompat.jaxpr_as_fun(some)(jnp.zeros(3))[0], np.ones(3))
+    selected = jaxcompat.select_inputs(jaxpr, [1])
+    np.testing.assert_array_equal(jaxcompat.jaxpr_as_fun(selected)(jnp.zeros(3))[0], np.ones(3))
 
 
 def test_parameters_and_operands_of_an_equation_are_read():
@@ -152,12 +152,12 @@ def test_a_primitive_is_lowered_as_the_function_of_its_platform():
         traced.append(factor)
         return [factor * x**power]
 
-    on = {"cpu": functools.partial(times, 3.0), "cuda": functools.partial(times, 7.0)}
-    p = jaxcompat.primitive_by_platform("times", lambda x, power: [jax.ShapeDtypeStruct(x.shape, x.dtype)], on)
-    of = lambda x: p.bind(x, power=2)[0]  # noqa: E731
-    assert of(jnp.float32(2)) == jax.jit(of)(2.0) == 12.0
+    functions = {"cpu": functools.partial(times, 3.0), "cuda": functools.partial(times, 7.0)}
+    p = jaxcompat.primitive_by_platform("times", lambda x, power: [jax.ShapeDtypeStruct(x.shape, x.dtype)], functions)
+    apply = lambda x: p.bind(x, power=2)[0]  # noqa: E731
+    assert apply(jnp.float32(2)) == jax.jit(apply)(2.0) == 12.0
     traced.clear()
-    text = jax.jit(of).trace(2.0).lower(lowering_platforms=("cuda",)).as_text()
+    text = jax.jit(apply).trace(2.0).lower(lowering_platforms=("cuda",)).as_text()
     assert "7.0" in text
     assert traced == [7.0]
 
@@ -171,12 +171,12 @@ def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
         transpose_rule=lambda fixed, seeds, n_nonlinear: [7.0 * fixed[0] * seeds[0]],
         batching_rule=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
     )
-    of = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
+    apply = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
     two, three = jnp.float32(2), jnp.float32(3)
-    assert jax.jit(of)(two, three) == 6.0
-    assert jax.jvp(of, (two, three), (1.0, 0.0))[1] == 15.0
-    assert jax.linear_transpose(lambda y: of(two, y), three)(jnp.float32(1)) == (14.0,)
-    np.testing.assert_array_equal(jax.vmap(of, (None, 0))(two, jnp.arange(3.0)), [1.0, 3.0, 5.0])
+    assert jax.jit(apply)(two, three) == 6.0
+    assert jax.jvp(apply, (two, three), (1.0, 0.0))[1] == 15.0
+    assert jax.linear_transpose(lambda y: apply(two, y), three)(jnp.float32(1)) == (14.0,)
+    np.testing.assert_array_equal(jax.vmap(apply, (None, 0))(two, jnp.arange(3.0)), [1.0, 3.0, 5.0])
 
 
 def test_a_jaxpr_takes_what_it_closes_over():
@@ -351,10 +351,10 @@ def test_only_one_module_goes_beyond_the_public_interface():
 def test_the_engine_runs_without_functions_that_jax_may_remove():
     """Every fallback, and steps on them: in a kernel, split by a stage, of all engines, and with commands."""
     tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/engine/test_stepper.py"]
-    some = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
+    chosen = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
             " or commands_to_flattened")  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *tests, "-k", some, "-n", "0"],
+        [sys.executable, "-m", "pytest", *tests, "-k", chosen, "-n", "0"],
         cwd=Path(__file__).parents[1],
         env={k: v for k, v in os.environ.items() if "PYTEST" not in k} | {"CRAZYSIM_JAX_FALLBACKS": "1"},
         capture_output=True,

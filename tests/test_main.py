@@ -40,10 +40,10 @@ def test_a_closed_pipe_is_no_traceback():
 
 
 def test_an_error_of_the_system_is_a_line(monkeypatch, capsys):
-    def full(_):
+    def raise_no_space(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out")
 
-    monkeypatch.setattr("crazysim.commands.info.run", full)
+    monkeypatch.setattr("crazysim.commands.info.run", raise_no_space)
     assert main(["info"]) == 2
     assert capsys.readouterr().err == "crazysim: [Errno 28] No space left on device: 'out'\n"
 
@@ -63,7 +63,7 @@ def test_the_help_of_a_command_states_defaults_once(command, capsys):
 
 def test_the_demo_has_the_defaults_of_its_function(monkeypatch):
     settings = []
-    monkeypatch.setattr(demo_flight, "run_demo_flight", lambda **given: settings.append(given))
+    monkeypatch.setattr(demo_flight, "run_demo_flight", lambda **options: settings.append(options))
     assert main(["demo"]) == main(["demo", "--worlds", "8", "--no-film"]) == 0
     assert settings == [{}, {"n_worlds": 8, "film": False}]
 
@@ -88,10 +88,10 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
 
 
 def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
-    def no_picture(*args, **kwargs):
+    def raise_render_error(*args, **kwargs):
         raise demo_flight.RenderError("no OpenGL context could be made")
 
-    monkeypatch.setattr(demo_flight.Sim, "render", no_picture)
+    monkeypatch.setattr(demo_flight.Sim, "render", raise_render_error)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1
@@ -130,7 +130,7 @@ def test_the_poles_are_where_drones_can_hit_them():
     assert 0 < touched.sum() < 64
 
 
-BASE = """
+PROGRAM_WITHOUT_PACKAGES = """
 import sys
 
 class Missing:
@@ -163,7 +163,7 @@ def test_a_command_names_the_extra_that_it_lacks(arguments, extra, tmp_path):
         recorder.add()
         recorder.flight().save(tmp_path / "flight.npz")
     packages = ",".join({*EXTRAS, "trimesh"})
-    command = [sys.executable, "-c", BASE, packages, *arguments.format(tmp_path).split()]
+    command = [sys.executable, "-c", PROGRAM_WITHOUT_PACKAGES, packages, *arguments.format(tmp_path).split()]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
     assert f"pip install 'crazysim[{extra}]'" in text

@@ -57,7 +57,7 @@ ALIASES = {
 
 
 def is_alias(statement):
-    """Return whether a statement is a docstring, an import, or the list of public names."""
+    """Return True for a docstring, an import, or the list of public names."""
     if isinstance(statement, ast.Assign):
         return [ast.unparse(target) for target in statement.targets] == ["__all__"]
     is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
@@ -68,13 +68,13 @@ def test_import_paths_of_crazyflow_are_aliases_without_logic():
     aliases = {}
     for source in SOURCES:
         statements = ast.parse(source.read_text()).body
-        homes = {x.module.removeprefix("crazysim.") for x in statements if isinstance(x, ast.ImportFrom)}
+        origins = {x.module.removeprefix("crazysim.") for x in statements if isinstance(x, ast.ImportFrom)}
         if source.name != "__init__.py" and all(map(is_alias, statements)):
-            aliases[".".join(source.relative_to(ROOT / "crazysim").with_suffix("").parts)] = sorted(homes)
+            aliases[".".join(source.relative_to(ROOT / "crazysim").with_suffix("").parts)] = sorted(origins)
     assert aliases == ALIASES
-    for path, homes in ALIASES.items():
+    for path, origins in ALIASES.items():
         module = importlib.import_module(f"crazysim.{path}")
-        defined = [x for home in homes for x in vars(importlib.import_module(f"crazysim.{home}")).values()]
+        defined = [x for origin in origins for x in vars(importlib.import_module(f"crazysim.{origin}")).values()]
         assert all(any(getattr(module, name) is x for x in defined) for name in module.__all__), path
 
 

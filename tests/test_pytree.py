@@ -100,9 +100,9 @@ def test_map_batched_changes_leaves_of_drones_and_worlds_only():
     old = fleet(curve=jnp.ones((3, 2, 3)))
     new = map_batched(lambda x: x + 5, old)
     changed = [bool(jnp.any(a != b)) for a, b in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True)]
-    owned = [scope in ("drone", "world") for scope in jax.tree.leaves(scopes(old))]
-    assert changed == owned
-    assert sum(owned) == 4
+    is_batched = [scope in ("drone", "world") for scope in jax.tree.leaves(scopes(old))]
+    assert changed == is_batched
+    assert sum(is_batched) == 4
 
 
 @given(n_worlds=st.integers(1, 4), n_drones=st.integers(1, 4), data=st.data())

@@ -117,7 +117,17 @@ def random_directions(rng, *shape):
 
 
 def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
-    """Throw all drones up to ``away`` m off: with a tilt, rad, about a random axis, a rate, rad/s, and a speed, m/s."""
+    """Start all drones in flight, with random directions of all motions.
+
+    Args:
+        sim: Simulation.
+        seed: Seed of the directions, distances and yaws.
+        tilt: Angle between the z axes of drone and world, rad.
+        rate: Body rate, rad/s.
+        speed: Speed, m/s.
+        away: Maximum distance from the origin, m.
+        heading: Maximum yaw, rad.
+    """
     rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
     axes = random_directions(rng, *shape) * [1, 1, 0]
     axes *= tilt / np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -128,7 +138,7 @@ def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, headi
 
 
 def alternation(sim):
-    """Return the largest change of direction of a rotor's command in two ticks, over its speed in hover. (n_drones,)"""
+    """Return the largest second difference of a rotor's commands at 12 ticks, over its speed in hover. (n_drones,)"""
     commands = []
     for _ in range(12):
         sim.step()

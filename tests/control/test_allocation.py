@@ -47,6 +47,7 @@ def test_law_09_every_rotor_stays_within_its_limits_or_stops(cmd):
 
 @pytest.mark.parametrize("thrust", [0.0, -0.1])
 def test_fault_06_zero_thrust_stops_the_motors_whatever_the_torque(thrust):
+    """Fault 6 of ``tests/laws/test_faults.py``."""
     _, params = setup()
     np.testing.assert_array_equal(allocate(np.array([thrust, 1e-3, 1e-3, 1e-3]), params=params), np.zeros(4))
 

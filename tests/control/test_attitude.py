@@ -123,6 +123,7 @@ def test_torque_commands_saturate_one_by_one():
 
 @pytest.mark.parametrize("thrust", [0.0, -1.0])
 def test_fault_06_no_thrust_means_no_torque_either(thrust):
+    """Fault 6 of ``tests/laws/test_faults.py``."""
     wrench, _ = run_controller([1.0, 1.0, 1.0, thrust], rates=np.ones(3))
     np.testing.assert_array_equal(wrench, np.zeros(4))
 

@@ -24,6 +24,7 @@ from crazysim.trajectories import hover, line
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 HIGH = 50.0
+"""Height of flights far from the floor, m."""
 
 
 @functools.cache
@@ -81,11 +82,11 @@ def hovering_sim(level, worlds, controller="auto", **settings):
 @pytest.mark.parametrize("level", ["attitude", "body_rate"])
 def test_steps_of_the_command_settle_with_little_overshoot(level):
     """Overshoot is at most 10%, the error 2% after 2 s, and half of a step takes 0.3 s, for yaw 0.6 s."""
-    y = benchmark().step_responses("auto", airframes(), level)
-    assert y.max() < 1.1
-    np.testing.assert_allclose(y[100:], 1.0, atol=0.02)
-    assert np.all(y[15, :3] > 0.5)
-    assert np.all(y[30] > 0.5)
+    responses = benchmark().step_responses("auto", airframes(), level)
+    assert responses.max() < 1.1
+    np.testing.assert_allclose(responses[100:], 1.0, atol=0.02)
+    assert np.all(responses[15, :3] > 0.5)
+    assert np.all(responses[30] > 0.5)
 
 
 def test_body_rates_are_followed_and_nothing_levels_the_drone():
@@ -123,11 +124,11 @@ def test_an_unknown_torque_leaves_no_error():
     sim.data = sim.data.replace(states=sim.data.states.replace(torque=jnp.asarray(torque * [1.0, -1.0, 0.0])))
     sim.attitude_control(np.stack([np.array([0, 0, 0, w], np.float32) for w in weights])[None])
     sim.step(150)
-    middle = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
+    early_error = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
     sim.step(1850)
-    end = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
-    assert middle > 0.01
-    assert end < 1e-3
+    late_error = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
+    assert early_error > 0.01
+    assert late_error < 1e-3
 
 
 @pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor_drag"])
@@ -249,8 +250,10 @@ def test_authority_by_hand():
         "drag": {"coefficients": [-0.1, -0.1, -0.1]},
     }
     hover = 9.81 / 4
-    least = hover - 0.1
-    np.testing.assert_allclose(max_ang_acc(load_airframe(quad)), [40 * least, 40 * least, 4 * least], rtol=1e-6)
+    thrust_margin = hover - 0.1
+    np.testing.assert_allclose(
+        max_ang_acc(load_airframe(quad)), [40 * thrust_margin, 40 * thrust_margin, 4 * thrust_margin], rtol=1e-6
+    )
     quad["rotors"]["thrust_max"] = 3.0
     np.testing.assert_allclose(max_ang_acc(load_airframe(quad)), [40 * 1.45, 40 * 1.45, 4 * (3 - hover)], rtol=1e-6)
     # Quick rotors: the rate follows from the authority, so that the rotors can brake each turn.
@@ -311,7 +314,10 @@ def steps_of_levels():
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
 def test_gradients_equal_central_differences(level, rng):
-    """Of the height, place and attitude after 20 ms by state, command and estimates, in float64, in free flight."""
+    """The derivatives are those of a sum of position, attitude and body rates after 20 ms, by states and command.
+
+    They are computed in float64, in free flight.
+    """
     sim = Sim(control=level, controller="auto", engine="plain")
     command = getattr(F, f"{level}_control")
     step, s = build_stagewise_step(sim), sim.data.states

@@ -51,8 +51,9 @@ void crazysim_update(void *memory, enum crazysim_level level, const struct crazy
   for (int i = 0; i < 4; ++i) motors[i] = RPM;
 }
 """
+"""Controllers in C: one that climbs to a height, one that stores its input, and one with constant motor commands."""
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "crazyflie.c"
-STAND_IN = """
+STAND_IN_HEADER = """
 #pragma once
 #include <stdint.h>
 struct vec { float x, y, z; };
@@ -88,6 +89,7 @@ static inline int powerDistributionCap(const motors_thrust_uncapped_t *thrusts, 
   return 0;
 }
 """
+"""Header in place of the headers of the Crazyflie's firmware."""
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +101,8 @@ def library(tmp_path_factory):
         path = folder / f"{name}.so"
         if not path.exists():
             (folder / f"{name}.c").write_text(source)
-            words = ["g++", "-O2", "-shared", "-fPIC", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror"]
-            subprocess.run([*words, f"-I{CFirmware.include}", folder / f"{name}.c", "-o", path], check=True)
+            command = ["g++", "-O2", "-shared", "-fPIC", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror"]
+            subprocess.run([*command, f"-I{CFirmware.include}", folder / f"{name}.c", "-o", path], check=True)
         return path
 
     return compile_library
@@ -218,8 +220,8 @@ def test_a_new_controller_loads_a_library_that_was_compiled_again(tmp_path):
     sims = []
     for rpm in (9000, 12000):
         (tmp_path / "constant.c").write_text(CONSTANT.replace("RPM", f"{rpm}"))
-        words = ["cc", "-shared", "-fPIC", f"-I{CFirmware.include}", "constant.c", "-o", "constant.so"]
-        subprocess.run(words, cwd=tmp_path, check=True)
+        command = ["cc", "-shared", "-fPIC", f"-I{CFirmware.include}", "constant.c", "-o", "constant.so"]
+        subprocess.run(command, cwd=tmp_path, check=True)
         controller = CFirmware(tmp_path / "constant.so", motors="rpm")
         sims.append(Sim(control="attitude", controller=controller, engine="plain"))
     for sim, rpm in zip(sims, (9000, 12000), strict=True):
@@ -230,7 +232,7 @@ def test_a_new_controller_loads_a_library_that_was_compiled_again(tmp_path):
 def test_the_example_gives_the_firmware_its_inputs(tmp_path):
     """The types are those of the firmware's stabilizer_types.h; the controller returns sums of its inputs."""
     for name in ("math3d", "controller_lee", "controller_mellinger", "power_distribution"):
-        (tmp_path / f"{name}.h").write_text(STAND_IN if name == "math3d" else '#include "math3d.h"')
+        (tmp_path / f"{name}.h").write_text(STAND_IN_HEADER if name == "math3d" else '#include "math3d.h"')
     command_line = [
         "cc",
         "-shared",

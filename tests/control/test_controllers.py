@@ -240,15 +240,15 @@ def test_feedforward_reaches_the_controller():
     np.testing.assert_allclose(
         np.asarray(controller_memory(sim).feedforward)[0, 0], [0, 0, 0, 0, 0, 0, 0.7, 0], atol=1e-6
     )
-    forward = np.arange(8 * WORLDS * DRONES).reshape(WORLDS, DRONES, 8)
-    sim.state_control(cmd, feedforward=forward)
-    np.testing.assert_array_equal(sim.data.controls.state.staged_feedforward, forward)
+    feedforward = np.arange(8 * WORLDS * DRONES).reshape(WORLDS, DRONES, 8)
+    sim.state_control(cmd, feedforward=feedforward)
+    np.testing.assert_array_equal(sim.data.controls.state.staged_feedforward, feedforward)
     sim.step(5)
-    np.testing.assert_allclose(controller_memory(sim).feedforward, forward)
+    np.testing.assert_allclose(controller_memory(sim).feedforward, feedforward)
     with pytest.raises(ValueError, match=r"feedforward command has shape.*jerk"):
-        sim.state_control(cmd, feedforward=forward[0])
+        sim.state_control(cmd, feedforward=feedforward[0])
     with pytest.raises(ConfigError, match=r"no feedforward, which .* does not follow, got one. Use controller='auto'"):
-        Sim(control="state", controller="crazyflow").state_control(cmd[:1, :1], feedforward=forward[:1, :1])
+        Sim(control="state", controller="crazyflow").state_control(cmd[:1, :1], feedforward=feedforward[:1, :1])
 
 
 def test_latency_delays_setpoint_and_feedforward():
@@ -377,14 +377,14 @@ def test_a_switch_function_gets_state_and_setpoint():
     np.testing.assert_array_equal(controller_memory(sim).active, 1)
 
 
-@pytest.mark.parametrize("names, bump", [(["mellinger", "pid"], 200.0), (["pid", "mellinger"], 1500.0)])
-def test_a_switch_in_hover_is_bumpless(names, bump):
+@pytest.mark.parametrize("names, max_change", [(["mellinger", "pid"], 200.0), (["pid", "mellinger"], 1500.0)])
+def test_a_switch_in_hover_is_bumpless(names, max_change):
     """PID continues thrust and torque; Mellinger's integral is limited to 0.02 N about its nominal mass."""
     sim = take_off(names, 6000, switch=lambda state, setpoint, time: jnp.where(time < 12.0, 0, 1))
     before = np.asarray(sim.data.controls.rotor_vel)
     sim.step()
     np.testing.assert_array_equal(controller_memory(sim).active, 1)
-    assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < bump
+    assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < max_change
     sim.step(1000)
     assert np.max(np.abs(np.asarray(sim.data.states.vel))) < 0.1
 
@@ -397,12 +397,15 @@ EXTREME_ATTITUDES = {
     "straight up": [0.0, -np.sqrt(0.5), 0, np.sqrt(0.5)],
     "turned": [0.0, 0, 1, 0],
 }
+"""Quaternions, xyzw."""
 COMMANDS = {
     "state": np.r_[50.0, -50, 50, np.zeros(9), 1, 0, 0, 3],
     "attitude": [3.0, -3, 3, 0.4],
     "body_rate": [40.0, -40, 40, 0.4],
 }
+"""Commands far beyond all limits, by command level."""
 LEVELS = {"state": ["pid", "mellinger"], "attitude": ["pid", "mellinger"], "body_rate": ["pid"]}
+"""Controllers by the command level that they follow."""
 
 
 N_STEPS = 10

@@ -23,18 +23,19 @@ distribute = jax.jit(distribute_power, static_argnames="whole_numbers")
 def test_motor_commands_agree_with_the_firmware(name):
     """The compiled C sources (docs/guides/controllers.md) use integers, which differ by up to 5 PWM from real numbers.
 
-    Truncation of roll, pitch, yaw and motor loses less than one each. Where all motors are lowered by the excess of
-    the highest, the error is that of the difference of two motors: twice that of two torques, and less than one.
+    Truncation of roll, pitch, yaw and motor loses less than one each. If the highest motor exceeds its limit, all
+    motors are lowered by the excess. The error is then that of a difference of two motors: twice that of two torques,
+    and less than one.
     """
     expected = firmware_controllers.recorded_pwm(name)
     assert 0.05 < np.mean(expected == 0) < 0.5
     assert 0.05 < np.mean(expected == 65535) < 0.5
-    smooth = firmware_controllers.pwm_differences(name)
-    assert smooth.max() < firmware_controllers.MAX_TRUNCATION + firmware_controllers.MAX_ROUNDING
-    assert np.mean(smooth < 4) > 0.998
-    whole = firmware_controllers.pwm_differences(name, whole_numbers=True)
-    assert whole.max() < 1.0 + firmware_controllers.MAX_ROUNDING
-    assert np.mean(whole < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
+    real_differences = firmware_controllers.pwm_differences(name)
+    assert real_differences.max() < firmware_controllers.MAX_TRUNCATION + firmware_controllers.MAX_ROUNDING
+    assert np.mean(real_differences < 4) > 0.998
+    integer_differences = firmware_controllers.pwm_differences(name, whole_numbers=True)
+    assert integer_differences.max() < 1.0 + firmware_controllers.MAX_ROUNDING
+    assert np.mean(integer_differences < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
 
 
 @pytest.mark.usefixtures("x64")

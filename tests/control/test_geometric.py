@@ -49,7 +49,7 @@ def law(drone, gains="bandwidth", freq=500, feedforward=True):
 
 
 def lab_wrench(pos, matrix, vel, ang_vel, yaw, drone):
-    """Return the wrench by section 2.3 of the facts on AIMotionLab-Virtual, in NumPy, without the tested code."""
+    """Return the wrench of AIMotionLab-Virtual's geometric controller, in NumPy, without the tested code."""
     kr, kv, kR, kw = {"crazyflie": (0.15, 0.2, 0.007, 0.0015), "bumblebee_lab": (4.0, 2.0, 1.7, 0.2)}[drone]
     mass = {"crazyflie": 0.028, "bumblebee_lab": 0.605}[drone]
     inertia = np.diag({"crazyflie": [1.4e-5, 1.4e-5, 2.17e-5], "bumblebee_lab": [1.5e-3, 1.45e-3, 2.66e-3]}[drone])
@@ -83,9 +83,9 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
     from crazysim.control.flatness import attitude_of_thrust
 
     p, attitude = GeometricParams.create(load_airframe("bumblebee"), 500), jax.jit(attitude_of_thrust)
-    on_the_eight = jax.jit(functools.partial(path_setpoint, figure_eight))
+    setpoint_on_eight = jax.jit(functools.partial(path_setpoint, figure_eight))
     for t in (0.3, 1.0, 2.2):
-        sp = jax.tree.map(np.asarray, on_the_eight(t))
+        sp = jax.tree.map(np.asarray, setpoint_on_eight(t))
         gravity = np.array([0, 0, 9.81])
         now = jax.tree.map(np.asarray, attitude(sp.acc + gravity, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc))
         quat = Rotation.from_matrix(now.matrix).as_quat()
@@ -144,21 +144,21 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
     thrusts = thrusts_of(out, p)
     assert np.all(thrusts > low - 1e-12)
     assert np.all(thrusts < high + 1e-12)
-    still, yaw = thrusts_of(wrench * [1, 1, 1, 0], p), np.abs(thrusts_of(wrench * [0, 0, 0, 1], p))
-    if np.all((still - yaw >= low) & (still + yaw <= high)):
+    without_yaw, yaw = thrusts_of(wrench * [1, 1, 1, 0], p), np.abs(thrusts_of(wrench * [0, 0, 0, 1], p))
+    if np.all((without_yaw - yaw >= low) & (without_yaw + yaw <= high)):
         np.testing.assert_allclose(out, wrench, atol=1e-12)
     tilt = thrusts_of(np.array([0, *wrench[1:3], 0]), p)
     limit = max(wrench[0], float(p.weight[0]))
     assert out[0] <= limit + 1e-12  # a torque does not lift the drone
-    fits = min((high - low) / max(np.ptp(tilt), 1e-12), (limit / 4 - low) / max(-tilt.min(), 1e-12))
-    if fits >= 1:
+    feasible_scale = min((high - low) / max(np.ptp(tilt), 1e-12), (limit / 4 - low) / max(-tilt.min(), 1e-12))
+    if feasible_scale >= 1:
         np.testing.assert_allclose(out[1:3], wrench[1:3], atol=1e-12)  # thrust and yaw give way
     else:
         scale = out[1:3] @ wrench[1:3] / (wrench[1:3] @ wrench[1:3])
         np.testing.assert_allclose(out[1:3], scale * wrench[1:3], atol=1e-12)
-        assert fits / 2 < scale < fits + 1e-9
+        assert feasible_scale / 2 < scale < feasible_scale + 1e-9
         if limit >= 4 * high:
-            np.testing.assert_allclose(scale, fits)
+            np.testing.assert_allclose(scale, feasible_scale)
     assert out[3] * wrench[3] >= 0
     assert abs(out[3]) <= abs(wrench[3]) + 1e-15
 
@@ -292,12 +292,12 @@ def test_an_integral_does_not_wind_up():
     for distance, largest in ((0.5, 0.5 * 9.81), (10.0, 0.0)):
         sim = Sim(control="state", controller=Geometric(integral=1.0))
         start_on_path(sim, hover)
-        held, command = sim.data.states, np.zeros((1, 1, 16))
+        start_states, command = sim.data.states, np.zeros((1, 1, 16))
         command[..., :3] = [distance, 0, 1]
         sim.state_control(command)
         for _ in range(100):
             sim.step(50)
-            sim.data = sim.data.replace(states=held)
+            sim.data = sim.data.replace(states=start_states)
         acc = np.asarray(sim.data.controls.controller.memory.acc)[0, 0, 0]
         np.testing.assert_allclose(acc, largest, rtol=1e-6)
 

@@ -59,10 +59,10 @@ def test_a_return_to_the_controller_starts_its_filter_anew():
     state = {name: jnp.asarray(np.float32(value)) for name, value in state.items()}
     data = SimpleNamespace(states=SimpleNamespace(**state, rotor_vel=rotor_vel))
     stale = INDIMemory(*map(np.float32, ([-2.0, 0.0, 0.0], np.ones(3), np.full(24, 9.0), np.ones(1))))
-    back = jax.jit(lambda memory: controller.take_over(data, setpoint, memory, params, rotor_vel))(stale)
+    restarted = jax.jit(lambda memory: controller.take_over(data, setpoint, memory, params, rotor_vel))(stale)
     update = jax.jit(lambda memory: controller.update(data, setpoint, memory, params)[0])
     first = np.asarray(update(memory()))
-    np.testing.assert_array_equal(update(back), first)
+    np.testing.assert_array_equal(update(restarted), first)
     assert np.max(np.abs(np.asarray(update(stale)) - first)) > 100
 
 
@@ -107,15 +107,15 @@ def test_a_force_and_a_torque_are_compensated():
 @pytest.fixture(scope="module")
 def flown_sims():
     """Return simulations, by controller, after 6 s of flight from the floor to a point 1 m high and 1 m aside."""
-    ends = {}
+    sims = {}
     for name in ("geometric", "indi", "lqr"):
         sim = Sim(n_worlds=4, control="state", controller=name, strict=True)
         cmd = np.zeros((4, 1, 16), np.float32)
         cmd[..., :3], cmd[..., 12] = [1.0, 0.5, 1.0], 1.0
         sim.state_control(cmd)
         sim.step(3000)
-        ends[name] = sim
-    return ends
+        sims[name] = sim
+    return sims
 
 
 @pytest.mark.parametrize("name", ["geometric", "indi", "lqr"])

@@ -20,7 +20,7 @@ load = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, GRAVITY, LOAD, LENGTH
 rod = jax.jit(lambda angles, rates: jax.jvp(rod_direction, (angles,), (rates,)))
 angles_of_rod = jax.jit(rod_angles)
 slopes_of_rod = jax.jit(jax.jacrev(rod_angles, argnums=(0, 1)))
-linear = jax.jit(lambda x, u: linearize(load, x, u))
+linearize_load = jax.jit(lambda x, u: linearize(load, x, u))
 
 
 def integrate(f, x, u, dt, n):
@@ -92,15 +92,15 @@ def test_a_load_off_the_centre_keeps_energy_and_momentum():
 
 def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
     """Thrust equal to the weight: w^2 = (g / L)(m + m_L) / m, by hand from the linearised equations."""
-    A, _ = linear(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
+    A, _ = linearize_load(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
     frequency = np.sqrt(9.81 / 0.4 * 0.655 / 0.605)
     np.testing.assert_allclose(A[14, 12], -(frequency**2), rtol=1e-12)
     np.testing.assert_allclose(A[15, 13], -(frequency**2), rtol=1e-12)
 
 
 def test_the_linearisation_with_a_load_agrees_with_the_lab():
-    """Numbers of the facts on AIMotionLab-Virtual, section 2.4."""
-    A, B = (np.asarray(x) for x in linear(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0])))
+    """Elements of the matrices that AIMotionLab-Virtual computes."""
+    A, B = (np.asarray(x) for x in linearize_load(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0])))
     assert round(float(A[3, 7]), 4) == 10.6207
     assert round(float(A[3, 13]), 4) == -0.8107
     assert round(float(A[14, 6]), 4) == 26.5519

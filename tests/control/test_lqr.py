@@ -24,6 +24,7 @@ from crazysim.errors import ConfigError
 LAB_Q, LAB_R = [100] * 6 + [10] * 3 + [1] * 3, [50] * 4
 LAB_LOAD_Q = [10, 10, 100, 1, 1, 10, 0.1, 0.1, 1, 0.4, 0.4, 0.4, 0.1, 0.1, 0.05, 0.05]
 LAB_LOAD_R = [1, 80, 80, 80]
+"""Diagonals of the weights of AIMotionLab-Virtual, without and with a load."""
 GRAVITY = np.array([0, 0, -9.81])
 
 
@@ -36,7 +37,7 @@ def rounded(x):
 
 @pytest.mark.usefixtures("x64")
 def test_gains_about_hover_equal_those_of_the_lab():
-    """Numbers of the facts on AIMotionLab-Virtual, section 2.4, for the Bumblebee and the Crazyflie."""
+    """The gains are those that AIMotionLab-Virtual computes for the Bumblebee and the Crazyflie."""
     gain = np.asarray(LQRParams.create(load_airframe("bumblebee_lab"), 500, LAB_Q, LAB_R).gain)
     assert rounded(gain[0, [2, 5]]) == [1.4142, 1.9264]
     assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6341, 2.3243, 0.1635]
@@ -50,7 +51,7 @@ def test_gains_about_hover_equal_those_of_the_lab():
 
 @pytest.mark.usefixtures("x64")
 def test_gains_with_a_load_equal_those_of_the_lab():
-    """The gains are those of the facts on AIMotionLab-Virtual for 0.05 kg on a rod of 0.4 m, at 100 Hz."""
+    """The gains are those that AIMotionLab-Virtual computes for 0.05 kg on a rod of 0.4 m, at 100 Hz."""
     params = LoadLQRParams.create(load_airframe("bumblebee"), 100, 0.05, 0.4, LAB_LOAD_Q, LAB_LOAD_R)
     gain = np.asarray(params.gain)
     assert rounded(gain[0, [2, 5]]) == [9.6398, 4.7304]
@@ -63,8 +64,8 @@ def test_gains_with_a_load_equal_those_of_the_lab():
         return load_derivative(x, u, *args)
 
     A, B = jax.jit(lambda x, u: linearize(model, x, u))(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
-    closed = np.eye(16) + 0.01 * A - 0.01 * B @ gain
-    assert round(float(np.abs(np.linalg.eigvals(closed)).max()), 5) == 0.99168
+    closed_loop = np.eye(16) + 0.01 * A - 0.01 * B @ gain
+    assert round(float(np.abs(np.linalg.eigvals(closed_loop)).max()), 5) == 0.99168
 
 
 def test_gains_inside_jit_have_gradients():
@@ -150,8 +151,8 @@ def test_error_dynamics_agree_with_flights(knots):
     ang_acc = np.linalg.solve(p.J, reference.wrench[1:] - np.cross(w, p.J @ w))
     size, h = 1e-5, 1e-5
     rng = np.random.default_rng(4)
-    error, extra = size * rng.normal(size=12), size * rng.normal(size=4)
-    slope = jax.jit(error_derivative)(error, extra, reference, ang_acc, p.mass, p.J)
+    error, extra_wrench = size * rng.normal(size=12), size * rng.normal(size=4)
+    slope = jax.jit(error_derivative)(error, extra_wrench, reference, ang_acc, p.mass, p.J)
 
     def advance(matrix, ang_vel, vel, pos, wrench):
         turned = matrix @ Rotation.from_rotvec(h * np.array(ang_vel)).as_matrix()
@@ -161,7 +162,9 @@ def test_error_dynamics_agree_with_flights(knots):
     target = np.array(reference.matrix)
     matrix = target @ Rotation.from_rotvec(np.array(error[6:9])).as_matrix()
     ang_vel = error[9:] + matrix.T @ target @ w
-    after = advance(matrix, ang_vel, reference.vel + error[3:6], reference.pos + error[:3], reference.wrench + extra)
+    after = advance(
+        matrix, ang_vel, reference.vel + error[3:6], reference.pos + error[:3], reference.wrench + extra_wrench
+    )
     later = advance(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
     moved = reference._replace(pos=later[3], vel=later[2], matrix=later[0], ang_vel=later[1])
     quat = Rotation.from_matrix(np.array(after[0])).as_quat()
@@ -197,7 +200,7 @@ def state_of(data):
 
 @pytest.mark.parametrize(("drone", "bound"), [("cf21B_500", 0.04), ("bumblebee", 0.01)])
 def test_a_figure_eight_is_tracked(drone, bound, knots):
-    """The figure eight has 2 m and 2 m/s. Gains are those for hover, then those along the trajectory."""
+    """The figure eight is 2 m wide, at up to 2 m/s. Gains are those for hover, then those along the trajectory."""
     sim = make_sim(drone)
     p = LQRParams.create(load_airframe(drone), 500)
     start_on_path(sim, figure_eight)

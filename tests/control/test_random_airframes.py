@@ -26,13 +26,13 @@ STEPS = {
 }
 """Axes and sizes of the steps of the command at each level, rad or rad/s."""
 SLOW = pytest.mark.slow("many more airframes of the same kind")
-MANY = [pytest.param(n, seed, 150, marks=SLOW) for n in range(4, 13) for seed in (1, 2, 3)]
-FEW = [pytest.param(n, 0, 40) for n in (4, 5, 6, 8, 12)]
-LEVELS = [("attitude", n, 0, 40) for n in (5, 8)] + [("body_rate", n, 0, 40) for n in (4, 6)]
-LEVELS += [pytest.param(level, *each.values, marks=SLOW) for level in STEPS for each in MANY]
+MANY_DRAWS = [pytest.param(n, seed, 150, marks=SLOW) for n in range(4, 13) for seed in (1, 2, 3)]
+FEW_DRAWS = [pytest.param(n, 0, 40) for n in (4, 5, 6, 8, 12)]
+LEVEL_CASES = [("attitude", n, 0, 40) for n in (5, 8)] + [("body_rate", n, 0, 40) for n in (4, 6)]
+LEVEL_CASES += [pytest.param(level, *draw.values, marks=SLOW) for level in STEPS for draw in MANY_DRAWS]
 
 
-@pytest.mark.parametrize(("n", "seed", "count"), [*FEW, *MANY])
+@pytest.mark.parametrize(("n", "seed", "count"), [*FEW_DRAWS, *MANY_DRAWS])
 def test_setpoints_are_reached_from_any_throw(n, seed, count):
     """45 degrees, 2 rad/s, 2 m/s and up to 2 m off: within 2 mm after the time that the bandwidth promises.
 
@@ -52,7 +52,7 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
         assert alternating[k] < 1e-3, airframe.name
 
 
-@pytest.mark.parametrize(("level", "n", "seed", "count"), LEVELS)
+@pytest.mark.parametrize(("level", "n", "seed", "count"), LEVEL_CASES)
 def test_attitudes_and_body_rates_are_followed_with_little_overshoot(level, n, seed, count):
     """Steps overshoot by at most 10%, and thrown drones follow random commands after 36 s, which weak yaw needs."""
     airframes, steps, throws = draw_airframes(n, count, seed), STEPS[level], 4
@@ -85,9 +85,9 @@ def test_attitudes_and_body_rates_are_followed_with_little_overshoot(level, n, s
     sim.step(14000)
     assert highest.max() < 1.1, airframes[int(highest.max(0).argmax())].name
     if level == "attitude":
-        wanted = Rotation.from_euler("xyz", command[..., :3].reshape(-1, 3))
-        present = Rotation.from_quat(np.asarray(sim.data.states.quat).reshape(-1, 4))
-        error = (wanted.inv() * present).magnitude().reshape(sim.n_worlds, count)
+        expected = Rotation.from_euler("xyz", command[..., :3].reshape(-1, 3))
+        actual = Rotation.from_quat(np.asarray(sim.data.states.quat).reshape(-1, 4))
+        error = (expected.inv() * actual).magnitude().reshape(sim.n_worlds, count)
     else:
         error = np.linalg.norm(np.asarray(sim.data.states.ang_vel) - command[..., :3], axis=-1)
     assert error.max() < 0.02, airframes[int(error.max(0).argmax())].name
@@ -99,22 +99,22 @@ def angles(sim):
     return Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
 
 
-OTHERS = {
+CONTROLLER_THROWS = {
     "geometric": {},
     "indi": {},
     "lqr": {"tilt": 0.35, "rate": 1.0, "speed": 0.5, "away": 0.5, "heading": 0.5},
 }
-"""Throws that other controllers recover, where they differ from those of the default controller."""
+"""Settings of throws that other controllers recover from, if they differ from those of the default controller."""
 
 
-SLOW_CASES = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8)]
+SLOW_CASES = [pytest.param(name, n, marks=SLOW) for name in CONTROLLER_THROWS for n in (4, 5, 6, 8)]
 
 
 @pytest.mark.parametrize(("controller", "n"), [("geometric", 4), ("indi", 6), ("lqr", 4), *SLOW_CASES])
 def test_other_controllers_recover_thrown_drones(controller, n):
-    """99% of the flights end within 5 cm after 60 s, as position loops above slow rotors are slow; none alternates."""
+    """99% of the flights of 60 s end within 5 cm; slow rotors need slow position loops. No rotor alternates."""
     airframes = draw_airframes(n, 40, 0)
-    distances, heights, alternating = fly_airframes(airframes, controller, 4, 60, 0, **OTHERS[controller])
+    distances, heights, alternating = fly_airframes(airframes, controller, 4, 60, 0, **CONTROLLER_THROWS[controller])
     assert np.mean(distances[-10:].max(0) < 0.05) >= 0.99, controller
     assert heights.max() < 4.0
     assert alternating.max() < 0.01
@@ -166,7 +166,7 @@ def test_quick_and_heavy_rotors_hover_and_reach_far_setpoints(controller):
     sources = [
         HUMMINGBIRD,
         RACER,
-        *(heavy_drone(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25))),
+        *(heavy_drone(*factors) for factors in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25))),
     ]
     sim = Sim(3, drone=[load_airframe(source) for source in sources], control="state", controller=controller)
     set_flying_states(sim)

@@ -100,6 +100,7 @@ def test_only_the_yaw_of_a_commanded_quaternion_of_any_length_is_used(scale):
 
 
 def test_fault_02_a_zero_quaternion_means_yaw_zero():
+    """Fault 2 of ``tests/laws/test_faults.py``."""
     expected, _ = run_controller(setpoint(pos=(0.1, 0.2, 0.3)))
     np.testing.assert_array_equal(run_controller(setpoint(pos=(0.1, 0.2, 0.3), quat=(0, 0, 0, 0)))[0], expected)
 
