@@ -38,10 +38,11 @@ RECORDS_FILE = ROOT / "docs" / "concepts" / "figures.json"
 MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
 """Keys of lines that a record holds once for all lines."""
 
+# Sources that several figures measure, as Git's path specifications.
 ENGINE = ("crazysim/engine", ":(exclude)crazysim/engine/tools")
 BASE = ("crazysim/rotation.py", "crazysim/pytree.py", "crazysim/jaxcompat.py", "crazysim/drones")
 STEP = (*BASE, *ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control", "crazysim/sim/sim.py")
-"""Sources of a step, as Git's path specifications."""
+"""Sources of a step."""
 SCENE = ("crazysim/geometry", "crazysim/scene")
 ENVS = (*STEP, "crazysim/envs")
 PLUGINS = (*STEP, "crazysim/plugins")

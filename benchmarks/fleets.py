@@ -21,7 +21,9 @@ from crazysim import Sim, __version__
 from crazysim.plugins.vehicles import Cars
 
 LEVELS = ("state", "attitude", "body_rate", "force_torque")
+"""Command levels whose controllers have parameters."""
 AIRFRAMES = ("cf21B_500", "cf2x_L250")
+"""The two airframes of the mixed fleet."""
 
 
 def main() -> None:

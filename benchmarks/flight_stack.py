@@ -96,6 +96,7 @@ def load_adder(**settings: Any) -> Callable[[Sim], Any]:
 STATE_SETTINGS: dict[str, Any] = {"control": "state"}
 ROTOR_SETTINGS: dict[str, Any] = {"control": "rotor_vel"}
 REFERENCES = ("state", "rotor")
+"""Cases that the other cases are compared with."""
 CASES: dict[str, tuple[str, dict[str, Any], Callable[[Sim], Any] | None]] = {
     "state": ("state", STATE_SETTINGS, None),
     "follow": ("state", STATE_SETTINGS, follow_trajectory),

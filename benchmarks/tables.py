@@ -168,6 +168,7 @@ depths = columns(
     Rays_per_second=lambda x: si_text(x["rays_per_s"]),
     First_image=lambda x: duration_text(x["first_s"]),
 )
+"""Table of ``depth.py``."""
 sight = columns(
     Case=lambda x: {
         "policy": "`forest` with its convolution, environment steps a second",
@@ -178,12 +179,14 @@ sight = columns(
     Rays_per_second=lambda x: si_text(x["rays_per_s"]),
     First_call=lambda x: duration_text(x["first_s"]),
 )
+"""Table of ``sight.py``."""
 range_finders = columns(
     Poles=poles_text,
     Worlds=worlds_text,
     One_step=lambda x: duration_text(1e-6 * x["step_us"]),
     First_step=lambda x: duration_text(x["first_s"]),
 )
+"""Table of ``depth.py --range-finder``."""
 
 
 def costs(lines: list[Line]) -> str:
@@ -202,6 +205,7 @@ coupled = columns(
     with_downwash=lambda x: si_text(x["steps_per_s"]["downwash"]),
     without=lambda x: si_text(x["steps_per_s"]["uncoupled"]),
 )
+"""Table of ``coupled.py``."""
 fleets = columns(
     Fleet=lambda x: {
         "cars": "four drones and two cars, over the drones alone",
@@ -210,7 +214,9 @@ fleets = columns(
     Worlds=worlds_text,
     Rate_of_the_drones=lambda x: f"{round_digits(x['ratio'], 2):g}",
 )
+"""Table of ``fleets.py``."""
 vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si_text(x["steps_per_s"]))
+"""Table of ``vehicles.py``."""
 path_errors = columns(
     Controller=lambda x: f"`{x['controller']}`",
     **{
@@ -231,6 +237,7 @@ live = columns(
     Late_by_at_most_in_999_of_1000_steps=lambda x: f"{x['lateness_999_ms']:g} ms",
     worst=lambda x: f"{x['worst_ms']:g} ms",
 )
+"""Table of ``live.py``."""
 mocap = columns(
     Objects=lambda x: f"{x['n_objects']} at {x['freq']:g} Hz",
     Rules_of_a_frame=lambda x: f"{x['frame_ms']:g} ms",

@@ -13,6 +13,7 @@ from crazysim.engine.passes.layout import pack_rows, pack_shared
 from crazysim.engine.passes.schedule import fuse, hoist, join_ticks
 
 Pass = Callable[[Program], Program]
+"""Function from a program to an equivalent program."""
 
 VERIFY_VARIABLE = "CRAZYSIM_VERIFY"
 """Environment variable; if it is 1, every program is verified after every pass."""

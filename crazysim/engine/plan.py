@@ -240,6 +240,7 @@ class Planner(NamedTuple):
         run_programs: Run,
         n_leaves: int,
     ) -> Plan:
+        """Return a plan. Its step passes ``n_leaves`` leaves to ``run_programs``: None if not in ``read_leaves``."""
         indices, inputs = leaf_indices(data), tuple(sorted(read_leaves))
         # If a stage writes the flags itself, no check is added.
         has_check = (

@@ -291,6 +291,7 @@ class Step:
         n_steps: int | Array | None = None,
         separate: SeparateLeaves = None,
     ) -> Plan:
+        """Return the plan for data of this structure, from the cache if possible."""
         zeros = self._zeros_cache(data, leaves, treedef) if zeros is None else zeros
         other_location = self._find_other_location(data.states.pos)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)

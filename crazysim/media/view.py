@@ -77,6 +77,7 @@ class View:
     _trail: Trail | None = field(default=None, init=False, repr=False)
     _top_view: TopView | None = field(default=None, init=False, repr=False)
     _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
+    """Time of the last image, s, and aim of its camera: a point and for ``hold`` a distance, by index in ``worlds``."""
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""

@@ -116,6 +116,7 @@ def _launch_tangents(
     n_batches: int,
     result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
+    """Launch a kernel from ``tangent_kernel``, and return the tangents after the steps."""
     n_leaves = len(kernels.program.leaves)
     n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
 
@@ -145,6 +146,7 @@ def _launch_cotangents(
     n_steps: int,
     n_batches: int,
 ) -> Leaves:
+    """Launch a kernel from ``cotangent_kernel``, and return the cotangents before the steps."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, list(values))
 

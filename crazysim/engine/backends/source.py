@@ -100,6 +100,7 @@ class Writer(LineWriter):
         return self.names[x] if isinstance(x, Value) else literal(x)
 
     def _write_operation(self, op: Operation, depth: int) -> None:
+        """Write an operation, and name its results."""
         args = [self.element(a) for a in op.args]
         match op.name:
             case "barrier":

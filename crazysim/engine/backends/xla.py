@@ -230,3 +230,4 @@ STRUCTURED_RULES: dict[str, Callable[..., Any]] = {
     "threefry2x32": _threefry,
     "any_lane": _any_lane,
 }
+"""Functions that compute the results of structured operations, by name."""

@@ -44,6 +44,7 @@ def _selected_results(op: Operation) -> list[int]:
 def _add_selection(
     builder: Builder, op: Operation, indices: list[int], values: dict[Value, Element]
 ) -> tuple[Value, ...]:
+    """Add the two loops for some results of an operation, and return the selected numbers."""
     (body,) = op.blocks
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))

@@ -110,6 +110,7 @@ def _lower_stage(
     n_drones: int,
     tracer: Tracer,
 ) -> Segment | UnfusedStage:
+    """Return the segment of a stage, or the unfused stage with the reason if it cannot be lowered."""
     try:
         if stage.scope == "batch":
             raise LimitError(stage.unfused_reason)
@@ -149,6 +150,7 @@ def _make_segment(
     shared_leaves: Sequence[int],
     n_members: int,
 ) -> Segment:
+    """Return the segment of a traced stage, which may read ``shared_leaves`` as tables."""
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     elements_before = {
         i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves

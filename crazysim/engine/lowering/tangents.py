@@ -280,3 +280,4 @@ STRUCTURED_RULES: dict[str, Callable[[Builder, Operation, Values, Values], None]
     "while": _loop,
     "over_others": _over_others,
 }
+"""Functions that add structured operations together with their tangents, by name."""

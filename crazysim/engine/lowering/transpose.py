@@ -284,6 +284,8 @@ def _is_differentiable_loop(op: Operation) -> bool:
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
+    """Add the operations of a block, with its loops unrolled, to a builder, and return its outputs."""
+
     def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 

@@ -40,6 +40,7 @@ def fuse(program: Program) -> Program:
 
 
 def _join_segments(segments: list[Segment]) -> Segment:
+    """Return one segment that does what several segments do one after the other."""
     builder = Builder()
     inputs: dict[Slot, Value] = {}
     outputs: dict[Slot, Element] = {}
@@ -143,6 +144,7 @@ def hoist(program: Program) -> Program:
 
 
 def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
+    """Return a segment whose expensive values are computed in its hoisted block if no changing slot affects them."""
     block, slots = segment.block, dict(zip(segment.block.inputs, segment.reads, strict=True))
     fixed_values = {x for x, slot in slots.items() if slot not in changing}
     hoistable: set[Value] = set()

@@ -53,6 +53,7 @@ def require_casadi(block: Block) -> None:
 
 
 def _refusal_reason(op: Operation) -> str | None:
+    """Return the reason why CasADi has no form for an operation; None if it has a form."""
     match op.name:
         case "threefry2x32":
             return RANDOM_REASON
@@ -97,6 +98,7 @@ class _Interpreter:
         return self.env[x] if isinstance(x, Value) else self.casadi.SX(float(x))
 
     def _results(self, op: Operation, args: list[Expression]) -> list[Expression]:
+        """Return the expressions of the results of an operation."""
         match op.name:
             case "when":
                 mask, *old_values = args
