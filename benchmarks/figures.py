@@ -4,11 +4,11 @@
     python benchmarks/figures.py --write [--only loop step] [--device gpu] [--peer-python PATH/OF/python]
     python benchmarks/figures.py --stale
 
-``FIGURES`` has a command for each figure. ``--write`` runs the commands for a device, stores what they print in
-``docs/concepts/figures.json`` with machine, versions, date and commit, and writes their tables into the pages, between
-the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of other machines stay. On a machine without
-the repository, ``--write --records FILE --commit COMMIT`` writes the records to a file, and ``--write --take FILE`` in
-the repository puts them into the pages.
+``FIGURES`` has a command for each figure. ``--write`` runs the commands for a device. It stores what they print in
+``docs/concepts/figures.json``, with machine, versions, date and commit. Then it writes their tables into the pages,
+between the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of other machines stay. On a machine
+without the repository, ``--write --records FILE --commit COMMIT`` writes the records to a file. In the repository,
+``--write --take FILE`` then puts them into the pages.
 
 ``--stale`` lists each record that is older than a change of the code that it measures, and ends with status 1 if there
 is such a record. Changes of comments, docstrings, annotations of functions, names and error messages are ignored.
@@ -259,9 +259,9 @@ def changed_files(commit: str, path_specs: Iterable[str]) -> list[str]:
     def is_same_name(old: str, new: str) -> bool:
         """Return True if two names are equal, or if the new name replaced the old name.
 
-        The new name replaced the old name if both are defined in the changed files, and either the old name is no
-        longer defined, or the new name was not defined before. If the new name is a name of new code, the file that
-        defines it has changed.
+        The new name replaced the old name if the changed files defined the old name before and define the new name now.
+        In addition, the old name must no longer be defined, or the new name must not have been defined before. If the
+        new name is a name of new code, the file that defines it has changed.
         """
         is_renamed = old in old_names and new in new_names and (new not in old_names or old not in new_names)
         return old == new or is_renamed

@@ -3,8 +3,7 @@
     python benchmarks/mocap.py --objects 50 --freq 240 --seconds 10
 
 A thread sends frames in real time, and the simulation takes them between control steps, as a live loop does. One JSON
-line has the time that the tracker takes for a frame and the time of an update of the scene, as median and 99th
-percentile.
+line has two times, as median and 99th percentile: of a frame in the tracker, and of an update of the scene.
 """
 
 from __future__ import annotations

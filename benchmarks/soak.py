@@ -2,8 +2,8 @@
 
     python benchmarks/soak.py [--seconds 3600] [--drones 30] [--objects 50]
 
-Drones circle in real time while motion capture sends 240 frames a second, 50 pictures a second are sent to a client of
-the page, and poses are recorded. Linux only. The program prints one JSON line with these keys, among others:
+Drones circle in real time, and poses are recorded. Motion capture sends 240 frames a second, and a client of the page
+receives 50 pictures a second. Linux only. The program prints one JSON line with these keys, among others:
 
 - ``factor``: simulated seconds per second;
 - ``memory_mb``: resident memory of the process, MB, at the first reading after a tenth of the time and at the end;

@@ -5,21 +5,21 @@
     python benchmarks/train.py --check --device gpu --parallel 3
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
-All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
-building, compilation and evaluation for all seeds; ``--together`` limits the seeds of a process. If the recipe of a
-task has a teacher, each seed has its own process and its own teacher, whose steps and time are included. When a process
-ends, a JSON line for each of its seeds is printed. At the end there is a line for each task, with medians over its
-seeds. A seed that diverges has a success of 0, and the line of its task names it.
+All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``. Its time includes imports,
+building, compilation and evaluation for all seeds. ``--together`` limits the number of seeds of a process. If the
+recipe of a task has a teacher, each seed has its own process and its own teacher, whose steps and time are included.
+When a process ends, a JSON line for each of its seeds is printed. At the end there is a line for each task, with
+medians over its seeds. A seed that diverges has a success of 0, and the line of its task names it.
 
 Finished seeds are stored in the file ``results.jsonl`` of the folder ``--out``. They are not trained again while the
-sources of the package are the same: an interrupted command continues where it was, also on another machine that has
-this file. A process that was interrupted continues from its last checkpoint if its folder still exists. A failed
-training is reported at the end, and the other trainings continue.
+sources of the package are the same. An interrupted command therefore continues where it was, also on another machine
+that has this file. A process that was interrupted continues from its last checkpoint if its folder still exists. A
+failed training is reported at the end, and the other trainings continue.
 
 ``--write`` puts the rows of tasks with all seeds finished into the committed table,
-docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task, and fails
-if its success is lower than the least success in the table by more than two standard errors of 1,000 starts. Arguments
-after ``--`` are passed to ``crazysim train``.
+docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task. It fails if
+the success of a seed is lower than the least success in the table by more than two standard errors of 1,000 starts.
+Arguments after ``--`` are passed to ``crazysim train``.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@
 ``alone`` is true if the pipeline of the case has no stages of drones. Cars drive on circles all the time. If they stop
 or leave their circles, the script ends with an error.
 
-With ``--errors`` it prints the largest distances of cars from a figure eight of 6 m by 2 m in one round instead, by
-controller, vehicle and largest speed of the path. Cars start at the speed of the path.
+With ``--errors`` it prints errors instead: the largest distances of cars from a figure eight of 6 m by 2 m in one
+round, by controller, vehicle and largest speed of the path. Cars start at the speed of the path.
 """
 
 from __future__ import annotations

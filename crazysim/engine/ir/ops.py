@@ -1,8 +1,8 @@
 """The table of operations: meaning and name of each operation in every target.
 
-Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in NumPy (for
-constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. A target refuses a program
-with an operation for which it has no form.
+Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in each target,
+and its cost. The targets are NumPy (for constants and for the interpreter), XLA, C++ and CUDA, and CasADi. A target
+refuses a program with an operation for which it has no form.
 
 Integers and conversions follow XLA, which defines what C leaves undefined. The quotient of a division by zero is -1
 (all bits set), and the remainder is the dividend. A shift by the size of the type or more gives 0, or all sign bits. A

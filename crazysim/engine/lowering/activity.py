@@ -37,8 +37,8 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     """Return the numbers that depend differentiably on the perturbed leaves.
 
     Returns:
-        The slots of these numbers, and for each segment of the steps the indices of the outputs of its hoisted block
-        that depend on the perturbed leaves.
+        The slots of these numbers, and the indices of the hoisted numbers that depend on the perturbed leaves, by
+        segment of the steps.
     """
     changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     hoisted_indices: dict[Segment, tuple[int, ...]] = {}

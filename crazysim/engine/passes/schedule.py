@@ -131,7 +131,7 @@ def hoist(program: Program) -> Program:
     """Move expensive values that no step changes out of the loop over steps.
 
     A division of a changing value by a constant, or by a value that no step changes, becomes a product with the
-    inverse, which adds one rounding error.
+    inverse. This adds one rounding error.
     """
     changing = program.changing_slots()
     return dataclasses.replace(

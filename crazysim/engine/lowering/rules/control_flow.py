@@ -54,7 +54,7 @@ def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
     """Expand a primitive that is defined in terms of other primitives (JAX 0.12 and later).
 
     If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like any
-    call, so it reads tables where the operands are tables.
+    call. It then reads tables where the operands are tables.
     """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
     called_jaxpr = jax.make_jaxpr(expand_primitive(eqn))(*avals)
