@@ -67,10 +67,10 @@ def fit_residual(
             f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
             f"and {batch_size}. Leave them out for the defaults."
         )
-    data, dt, params = cut_windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
+    windows, dt, params = cut_windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
     validation_windows = cut_windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(
-        data.quat[:, 0], data.vel[:, 0], data.ang_vel[:, 0], data.rotor_vel[:, 1]
+        windows.quat[:, 0], windows.vel[:, 0], windows.ang_vel[:, 0], windows.rotor_vel[:, 1]
     )
     input_std = jnp.std(inputs, axis=0).at[0].set(1.0)
     weight = float(params.mass[0]) * float(jnp.linalg.norm(params.gravity_vec))
@@ -98,8 +98,8 @@ def fit_residual(
 
     @jax.jit
     def update(weights: dict[str, Array], state: Any, key: Array) -> tuple[Any, Any]:
-        rows = jax.random.choice(key, len(data.pos), (batch_size,))
-        grads = jax.grad(loss)(weights, jax.tree.map(lambda x: x[rows], data))
+        rows = jax.random.choice(key, len(windows.pos), (batch_size,))
+        grads = jax.grad(loss)(weights, jax.tree.map(lambda x: x[rows], windows))
         grads = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), grads)
         updates, state = optimizer.update(grads, state, weights)
         return optax.apply_updates(weights, updates), state

@@ -132,24 +132,24 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
     Raises:
         ConfigError: If the file is not a log of this format.
     """
-    data = path.read_bytes()
-    if len(data) < 9 or data[0] != 0xBC:
+    content = path.read_bytes()
+    if len(content) < 9 or content[0] != 0xBC:
         raise ConfigError(
             f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
             "Tables need the ending .csv or .npz."
         )
-    version, n_events = struct.unpack_from("<HH", data, 1)
+    version, n_events = struct.unpack_from("<HH", content, 1)
     if version not in (1, 2):
         raise ConfigError(
             f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
             "firmware's tools/usdlog."
         )
-    end = len(data) - 4
-    if crc32(data[:end]) != struct.unpack_from("<I", data, end)[0]:
+    end = len(content) - 4
+    if crc32(content[:end]) != struct.unpack_from("<I", content, end)[0]:
         repairs.append("the checksum does not match: read up to the last whole record")
-        end = len(data)
+        end = len(content)
     try:
-        events, offset = _read_events(data, n_events)
+        events, offset = _read_events(content, n_events)
     except (struct.error, ValueError) as error:
         raise ConfigError(
             f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
@@ -158,10 +158,12 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
     seconds_per_tick = 1e-3 if version == 1 else 1e-6
     rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in events}
     while offset + record_header.size <= end:
-        event, time = record_header.unpack_from(data, offset)
+        event, time = record_header.unpack_from(content, offset)
         if event not in events or offset + record_header.size + events[event][2].size > end:
             break
-        rows[event].append((time * seconds_per_tick, *events[event][2].unpack_from(data, offset + record_header.size)))
+        rows[event].append(
+            (time * seconds_per_tick, *events[event][2].unpack_from(content, offset + record_header.size))
+        )
         offset += record_header.size + events[event][2].size
     if offset < end and not repairs:
         repairs.append(f"left out {end - offset} bytes at the end that are not a record")
@@ -205,18 +207,18 @@ def decompress_quat(packed: NDArray) -> NDArray:
     return quat
 
 
-def _read_events(data: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
+def _read_events(content: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
     """Return name, variables and layout of each event, and the offset of the first record, bytes."""
     events, offset = {}, 5
 
     def read_string(offset: int) -> tuple[str, int]:
-        stop = data.index(0, offset)
-        return data[offset:stop].decode(), stop + 1
+        stop = content.index(0, offset)
+        return content[offset:stop].decode(), stop + 1
 
     for _ in range(n_events):
-        (key,) = struct.unpack_from("<H", data, offset)
+        (key,) = struct.unpack_from("<H", content, offset)
         name, offset = read_string(offset + 2)
-        (count,) = struct.unpack_from("<H", data, offset)
+        (count,) = struct.unpack_from("<H", content, offset)
         offset += 2
         variables, layout = [], "<"
         for _ in range(count):

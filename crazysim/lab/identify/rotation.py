@@ -249,35 +249,35 @@ def _band_pass(x: NDArray, dt: float, slow_width: float) -> NDArray:
     return smooth_columns(FAST_WIDTH) - smooth_columns(slow_width)
 
 
-def _solve_blocks(data: _LogTerms, extra_delay: float = 0.0) -> NDArray:
+def _solve_blocks(log_terms: _LogTerms, extra_delay: float = 0.0) -> NDArray:
     """Return the solution of each block, about z with a delay that is longer by ``extra_delay`` samples.
 
     The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
     variances of the four coefficients. (n_blocks, 9)
     """
-    n, margin = len(data.ang_vel_change), round(YAW_SLOW_WIDTH / data.dt / 2)
+    n, margin = len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
     is_kept = np.ones(n, bool)
-    for gap in (0, *data.gaps, n):
+    for gap in (0, *log_terms.gaps, n):
         is_kept[max(0, gap - margin) : gap + margin] = False
-    size, blocks = max(1, round(BLOCK_DURATION / data.dt)), []
+    size, blocks = max(1, round(BLOCK_DURATION / log_terms.dt)), []
     for k in range(0, n, size):
         indices = np.flatnonzero(is_kept[k : k + size]) + k
-        if len(indices) * data.dt < 1:
+        if len(indices) * log_terms.dt < 1:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt_fits = [_solve_samples(data, axis, delay, indices) for axis in (0, 1)]
+            tilt_fits = [_solve_samples(log_terms, axis, delay, indices) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt_fits]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        yaw_fit, variance = _solve_samples(data, 2, delay + extra_delay * data.dt, indices)
+        yaw_fit, variance = _solve_samples(log_terms, 2, delay + extra_delay * log_terms.dt, indices)
         blocks.append(
             [*(x[0] for x, _ in tilt_fits), *yaw_fit[:2], delay, *(v[0] for _, v in tilt_fits), *variance[:2]]
         )
     return np.reshape(blocks, (-1, 9))
 
 
-def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
+def _solve_samples(log_terms: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
     """Return the coefficients of the regressors and their variances, fitted at ``samples``.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
@@ -290,12 +290,12 @@ def _solve_samples(data: _LogTerms, axis: int, delay: float, samples: NDArray) -
             columns = rotors.impulse[:, 2], rotors.reaction
         else:
             columns = rotors.impulse[:, axis], rotors.torque_change[:, axis], rotors.thrust_impulse
-        return np.c_[shift_series(np.stack(columns, axis=-1), delay / data.dt), data.angle[:, axis]]
+        return np.c_[shift_series(np.stack(columns, axis=-1), delay / log_terms.dt), log_terms.angle[:, axis]]
 
     slow_width = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, ang_vel_change = (
-        _band_pass(x, data.dt, slow_width)[samples]
-        for x in (terms(data.rotors), terms(data.instruments), data.ang_vel_change[:, axis : axis + 1])
+        _band_pass(x, log_terms.dt, slow_width)[samples]
+        for x in (terms(log_terms.rotors), terms(log_terms.instruments), log_terms.ang_vel_change[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
     x = inverse @ instruments.T @ ang_vel_change[:, 0]

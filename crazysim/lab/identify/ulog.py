@@ -140,34 +140,34 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
     Raises:
         DamagedFileError: If the file is not a ULog, or a topic has no format.
     """
-    data = path.read_bytes()
-    if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
+    content = path.read_bytes()
+    if len(content) < HEADER_SIZE or not content.startswith(MAGIC):
         raise DamagedFileError(
             f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
         )
     message_header, formats, ids, payloads = struct.Struct("<HB"), {}, {}, {}
     offset, n_skipped_bytes, n_dropouts = HEADER_SIZE, 0, 0
-    while offset + message_header.size <= len(data):
-        size, kind = message_header.unpack_from(data, offset)
+    while offset + message_header.size <= len(content):
+        size, kind = message_header.unpack_from(content, offset)
         start, end = offset + message_header.size, offset + message_header.size + size
-        if kind not in MESSAGE_LETTERS or end > len(data):
-            sync = data.find(SYNC_BYTES, offset + 1)
-            n_skipped_bytes += (len(data) if sync < 0 else sync) - offset
+        if kind not in MESSAGE_LETTERS or end > len(content):
+            sync = content.find(SYNC_BYTES, offset + 1)
+            n_skipped_bytes += (len(content) if sync < 0 else sync) - offset
             if sync < 0:
                 break
             offset = sync + len(SYNC_BYTES)
             continue
         offset = end
         if kind == ord("D") and size > 2:
-            key = data[start] | data[start + 1] << 8
+            key = content[start] | content[start + 1] << 8
             if key in payloads:
-                payloads[key].append(data[start + 2 : end])
+                payloads[key].append(content[start + 2 : end])
         elif kind == ord("F"):
-            name, _, fields = data[start:end].decode(errors="replace").partition(":")
+            name, _, fields = content[start:end].decode(errors="replace").partition(":")
             formats[name] = fields
         elif kind == ord("A") and size > 3:
-            instance, key = struct.unpack_from("<BH", data, start)
-            name = data[start + 3 : end].decode(errors="replace")
+            instance, key = struct.unpack_from("<BH", content, start)
+            name = content[start + 3 : end].decode(errors="replace")
             if instance == 0 and name in topics and name not in ids:
                 ids[name], payloads[key] = key, []
         elif kind == ord("O"):

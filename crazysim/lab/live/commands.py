@@ -89,6 +89,7 @@ class LoadShow:
 
 
 Command = TakeOff | Land | Hover | Upload | Start | SetParameter | StartShow | LoadShow
+"""A command to one drone or to all drones."""
 
 
 def parse_command(message: Message | ShowFile, drone: int | None = None) -> Command:

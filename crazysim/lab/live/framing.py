@@ -25,13 +25,17 @@ MAX_SHOW = 64 * 2**20
 """Largest show, bytes."""
 
 ZIP_START, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
+"""First bytes of a zip archive, and of the record at its end."""
 ZIP_END_SIZE = 22
 """Length of the record at the end of a zip archive without its comment, bytes."""
 MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP_START)
+"""First bytes of the messages that have no ID at their start."""
 HEAD_PATTERN = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
 """Start of a command. The ID of the drone may be before or after ``CMDSTART``, or missing."""
 TOKEN_PATTERN = re.compile(rb'["\\{}]')
+"""Characters of JSON that decide where an object ends."""
 SPACE_BYTES = b" \r\n\t\0"
+"""Bytes that are ignored between messages."""
 
 
 class FramingError(ValueError):

@@ -85,9 +85,9 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     if len(set(names)) < len(names):
         checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_location)
     environment = show.get("environment") or {}
-    kind = checks.require_object(environment, f"{file_location}, environment").get("type", "outdoor")
-    if kind not in ("indoor", "outdoor"):
-        checks.raise_error("environment indoor or outdoor", short_repr(kind), file_location)
+    environment_kind = checks.require_object(environment, f"{file_location}, environment").get("type", "outdoor")
+    if environment_kind not in ("indoor", "outdoor"):
+        checks.raise_error("environment indoor or outdoor", short_repr(environment_kind), file_location)
     return Show(
         names=tuple(names),
         trajectories=Trajectory.stack(trajectories),
@@ -98,7 +98,7 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
         landings=np.stack([drone["landing"] for drone in parsed_drones]),
         parameters=tuple(drone["parameters"] for drone in parsed_drones),
         encodings=tuple(drone["encoding"] for drone in parsed_drones),
-        environment=kind,
+        environment=environment_kind,
         meta=checks.require_object(show.get("meta") or {}, f"{file_location}, meta"),
     )
 

@@ -268,3 +268,4 @@ def orders() -> Iterable[Row]:
 
 
 CHECKS = (free_fall, precession, terminal_velocity, motor_step, pendulum, dzhanibekov, orders)
+"""All comparisons of this module."""

@@ -140,12 +140,12 @@ def compute_air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> 
         Force, N, and torque, N m, body frame, of crazysim, and of RotorPy. (n, 6) each
     """
     rng = np.random.default_rng(1)
-    vel, rate = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
+    vel, ang_vel = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
     speeds = hover_speed(params) * rng.uniform(0.9, 1.1, (n, 4))
     sim = create_simulation(params, n)
     plugin = sim.add(rotor_aerodynamics(params))
     moving_data = with_states(
-        sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S
+        sim.data, vel=vel[:, None], ang_vel=ang_vel[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S
     )
     s = stage("drone")(plugin.influence)(moving_data).states
     drag = vel @ np.asarray(sim.data.params.drag_matrix).reshape(3, 3)
@@ -154,7 +154,7 @@ def compute_air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> 
     rotorpy, rotorpy_without_drag = multirotor(params), multirotor(params, aero=False)
     reference_values = [
         np.concatenate(rotorpy.compute_body_wrench(*x)) - np.concatenate(rotorpy_without_drag.compute_body_wrench(*x))
-        for x in zip(rate, speeds, vel, strict=True)
+        for x in zip(ang_vel, speeds, vel, strict=True)
     ]
     return own_values, np.stack(reference_values)
 
