@@ -267,6 +267,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim.data = _with_record(self._sim.data, name, record)
 
     def _build(self, pipeline: Pipeline, resets: Pipeline) -> None:
+        """Set the pipelines of step and reset, and build the step function."""
         self._is_checked = False
         if resets != self._sim.reset_pipeline:
             self._sim.reset_pipeline = resets
@@ -313,6 +314,7 @@ def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple
 
 
 def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, installed: _InstalledPlugin) -> Pipeline:
+    """Return the pipeline with one more stage, and add the change to ``installed``."""
     replaced = placement.replaces if placement.replaces in pipeline else None
     if name in pipeline and name != replaced:
         raise ConfigError(f"the step pipeline already has a stage {name!r}. Use sim.add(..., name=...).")
@@ -391,6 +393,7 @@ def _carry_over_states(record: PyTree | None, old_record: PyTree | None) -> PyTr
 
 
 def _signature(tree: object) -> tuple[object, list[tuple[object, ...]]]:
+    """Return the structure of a tree, and the shapes and types of its leaves."""
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
 
 

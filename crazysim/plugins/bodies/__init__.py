@@ -1,4 +1,4 @@
-"""Free rigid bodies: balls and boxes that push each other, and that drones and vehicles push."""
+"""Free rigid bodies: balls and boxes that exchange impulses with each other and with drones; vehicles push them."""
 
 from crazysim.plugins.bodies.free_bodies import FreeBodies, FreeBodiesData
 

@@ -54,10 +54,10 @@ class FreeBodiesData(Members):
     impulse: Array = leaf("member", 1, (3,))
     """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
     normal_impulse: Array = leaf("world", 1)
-    """Impulses of the last step along the normals of the contact points, N s, with which the next step begins.
+    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
     (n_worlds, 1, n_contacts)"""
     friction_impulse: Array = leaf("world", 2)
-    """Impulses of the last step across the normals, world frame, N s, with which the next step begins.
+    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
     (n_worlds, 1, n_contacts, 3)"""
     mass: Array = leaf("member", 1, (1,))
     """Mass, kg. (n_worlds, n_members, 1)"""

@@ -1,1 +1,1 @@
-"""Contacts: logs of them, the response of drones and loads, collisions, terrain, and the solver behind them."""
+"""Contact logs, the response of drones and loads to contact, collisions, terrain, and the solver."""

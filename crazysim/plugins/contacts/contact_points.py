@@ -131,9 +131,11 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     points = []
     for surface in surfaces:
         geom = surface.geom
-        to_geom, to_world, vel = _geom_frame(data, surface)
+        to_geom, to_world, velocity_at = _geom_frame(data, surface)
         surface_vel = (
-            jnp.zeros_like(world_corners) if vel is None else rotation.rotate_inverse(drone_quat, vel(world_corners))
+            jnp.zeros_like(world_corners)
+            if velocity_at is None
+            else rotation.rotate_inverse(drone_quat, velocity_at(world_corners))
         )
         if geom.shape.kind == "hfield":
             gap, normal = _height_above_field(data, geom, world_corners, to_geom, to_world)
@@ -149,7 +151,8 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
             )
         if geom.shape.kind not in ("plane", "hfield"):
             points += [
-                _nearest_plate_point(data, geom, to_geom, plate, plate_centre, vel) for plate_centre in plate_centres
+                _nearest_plate_point(data, geom, to_geom, plate, plate_centre, velocity_at)
+                for plate_centre in plate_centres
             ]
     arrays = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*points, strict=True)))
     return ContactPoints(*arrays)
@@ -169,7 +172,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     gaps, normals, vels = [], [], []
     for surface in surfaces:
         geom = surface.geom
-        to_geom, to_world, vel = _geom_frame(data, surface)
+        to_geom, to_world, velocity_at = _geom_frame(data, surface)
         if geom.shape.kind == "hfield":
             gap, normal = _height_above_field(data, geom, pos, to_geom, to_world)
             gap = gap - _extent_along(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
@@ -179,7 +182,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
             normal = pull_back(jnp.ones_like(gap))[0]
         gaps.append(gap)
         normals.append(normal)
-        vels.append(jnp.zeros_like(pos) if vel is None else vel(pos))
+        vels.append(jnp.zeros_like(pos) if velocity_at is None else velocity_at(pos))
     return ContactPoints(
         jnp.concatenate(gaps, axis=-1), jnp.concatenate(normals, axis=-2), None, jnp.concatenate(vels, axis=-2)
     )
@@ -204,7 +207,12 @@ def _extent_along(shape: Shape, direction: Array) -> Array:
 
 
 def _nearest_plate_point(
-    data: SimData, geom: CollisionGeom, to_geom: Callable, shape: Shape, plate_centre: Array, vel: Callable | None
+    data: SimData,
+    geom: CollisionGeom,
+    to_geom: Callable,
+    shape: Shape,
+    plate_centre: Array,
+    velocity_at: Callable | None,
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
 
@@ -225,9 +233,9 @@ def _nearest_plate_point(
     normal = rotation.rotate_inverse(quat, force)
     reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
     point = rotation.cross(normal, torque) - reach * normal
-    if vel is None:
+    if velocity_at is None:
         return ContactPoints(gap, normal, point, jnp.zeros_like(normal))
-    surface_vel = rotation.rotate_inverse(quat, vel(pos + rotation.rotate(quat, point)))
+    surface_vel = rotation.rotate_inverse(quat, velocity_at(pos + rotation.rotate(quat, point)))
     return ContactPoints(gap, normal, point, surface_vel)
 
 

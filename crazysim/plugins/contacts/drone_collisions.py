@@ -38,10 +38,11 @@ class DroneCollisionsData(PyTree):
     impulse: Array = leaf("drone", 1)
     """Impulse of the other drones in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
     normal_impulse: Array = leaf("world", 1)
-    """Impulses along the normals of the contact points, N s, with which the next step begins.
+    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
     (n_worlds, 1, n_contacts)"""
     friction_impulse: Array = leaf("world", 2)
-    """Impulses across the normals, world frame, N s, with which the next step begins. (n_worlds, 1, n_contacts, 3)"""
+    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
+    (n_worlds, 1, n_contacts, 3)"""
 
 
 class DroneCollisions(Plugin):

@@ -43,8 +43,8 @@ def velocity_after_contact(
     penalties on the speed into a surface and on slip. The penalty on slip grows no faster than the friction force
     allows (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns, or of three
     for a load. In the restitution phase, a fraction of the normal impulses is applied again (Poisson). Finally, the
-    function removes the energy that friction combined with bounces at several points (Kane 1984), or points that push
-    against each other, would create.
+    function removes energy that was created by friction combined with bounces at several points (Kane 1984), or by
+    points that push against each other.
 
     Args:
         points: Contact points, in the frame of the velocity.

@@ -32,7 +32,7 @@ SELF_GAP = 1e3
 
 
 def load_plugins(sim: Simulation) -> list[CollidingPlugin]:
-    """Return the plugins whose loads are objects of the scene, and collide."""
+    """Return the plugins with loads that are objects of the scene and can collide."""
     names = () if sim.data.objects is None else sim.data.objects.names
     return [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and f"{p.name}:0" in names]
 
@@ -142,7 +142,7 @@ def velocity_change(
 
 
 class _VelocityChanges(NamedTuple):
-    """Changes of velocity by the contacts of two groups of bodies with each other."""
+    """Changes of velocity by the contacts between two groups of bodies."""
 
     is_touching: Array
     """True where a body of the first group touches a body of the second group. (n, m)"""

@@ -108,7 +108,7 @@ class ContactResponse(Plugin):
     def _load_stages(
         self, plugin: CollidingPlugin, obstacles: list[Surface], boxes: DroneBoxes, n_drones: int
     ) -> list[StagePlacement]:
-        """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
+        """Return the stages for contacts of a plugin's loads with obstacles, with drones and with each other.
 
         Args:
             plugin: Plugin with the loads.

@@ -55,7 +55,7 @@ class BodyContacts:
         """Return the number of contact points in a world, including points that are not in contact.
 
         Args:
-            terrains: Names of the plugins whose height fields are terrain.
+            terrains: Names of the plugins that are terrain.
         """
         is_ball = [shape.kind == "sphere" for shape in self.shapes]
         geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
@@ -120,25 +120,26 @@ class BodyContacts:
         """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
         n_free = record.pos.shape[0]
         dtype = record.pos.dtype
-        owners, balls = list(range(n_free)), [x.kind == "sphere" for x in self.shapes]
+        body, is_ball = list(range(n_free)), [x.kind == "sphere" for x in self.shapes]
         sizes = [np.resize(x.size, 3) for x in self.shapes]
         pos, rot = [record.pos], [rotation.matrix(record.quat)]
         if self.n_drones:
-            owners += range(n_free, n_free + self.n_drones)
-            balls += [False] * self.n_drones
+            body += range(n_free, n_free + self.n_drones)
+            is_ball += [False] * self.n_drones
             sizes += list(self.boxes[:, 3:])
-            for batch, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
-                batch.append(part)
+            drone_pos, drone_rot = drones_as_boxes(data, self.boxes)
+            pos.append(drone_pos)
+            rot.append(drone_rot)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
                 if geom.shape.kind in EXACT_KINDS:
                     geom_pos, geom_rot = _geom_pose(data, carrier, geom, dtype)
-                    owners.append(n_free + self.n_drones + k)
-                    balls.append(geom.shape.kind == "sphere")
+                    body.append(n_free + self.n_drones + k)
+                    is_ball.append(geom.shape.kind == "sphere")
                     sizes.append(np.resize(geom.shape.size, 3))
                     pos.append(geom_pos[None])
                     rot.append(geom_rot[None])
-        return Solids(np.array(owners), np.array(balls), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
+        return Solids(np.array(body), np.array(is_ball), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
 
     def _pairs(self, solids: Solids, n_free: int) -> np.ndarray:
         """Return the pairs of solids with at least one free body. (n_pairs, 2)"""

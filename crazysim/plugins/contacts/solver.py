@@ -84,7 +84,7 @@ class SolvedBodies(NamedTuple):
     rotvec: Array
     """Rotations that remove overlaps, world frame, rad. (n, 3)"""
     contact_impulses: Impulses
-    """Impulses at the contacts, with which the next step begins."""
+    """Impulses at the contacts, the initial impulses of the next step."""
     impulse: Array
     """Sum of the impulses on each body, world frame, N s. (n, 3)"""
 

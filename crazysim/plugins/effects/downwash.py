@@ -143,8 +143,11 @@ class JetSource(NamedTuple):
 def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
     """Return the source of a drone's jet; for the arguments see ``hover_jet_speed``."""
     has_thrust = thrust > 0
-    impulse = jnp.where(has_thrust, jnp.sqrt(jnp.where(has_thrust, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
-    return JetSource(JET_DECAY * impulse, JET_DECAY * diameter, 1 / diameter)
+    # The product of u_0 and d.
+    speed_times_diameter = jnp.where(
+        has_thrust, jnp.sqrt(jnp.where(has_thrust, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0
+    )
+    return JetSource(JET_DECAY * speed_times_diameter, JET_DECAY * diameter, 1 / diameter)
 
 
 def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:

@@ -57,13 +57,13 @@ class Latency(Plugin):
         return self._initial_record(sim, sim.default_data)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        queue = stage("drone")(self.move_queue)
+        queue_stage = stage("drone")(self.move_queue)
         if sim.data.controls.mode == Control.rotor_vel:
-            return [StagePlacement(queue)]
+            return [StagePlacement(queue_stage)]
         name = _controller_stage(sim)
         (controller,) = as_stages({name: sim.step_pipeline[name]})
         return [
-            StagePlacement(queue, before=name),
+            StagePlacement(queue_stage, before=name),
             StagePlacement(self._delayed_controller(controller), replaces=name, name=name),
         ]
 
@@ -88,6 +88,7 @@ class Latency(Plugin):
         return Stage(run_on_delayed_command, scope, controller.when, controller.batched, controller.__name__)
 
     def _initial_record(self, sim: Simulation, data: SimData) -> LatencyData:
+        """Return the record with the staged command of ``data`` in all rows of the queue."""
         delay, max_delay = np.asarray(self.delay), self.max_delay
         max_delay = int(np.max(delay)) if max_delay is None else max_delay
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, max_delay, jnp.int32), _staged_command(data)

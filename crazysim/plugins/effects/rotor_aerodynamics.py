@@ -30,7 +30,8 @@ class RotorAerodynamicsData(PyTree):
     drag: Array = leaf("parameter", 1, (1,))
     """Drag of a rotor across its axis per velocity and rotor speed, N s^2/(m rad). (1,)"""
     blade: Array = leaf("parameter", 1, (1,))
-    """Loss of thrust per inflow velocity and rotor speed, N s^2/(m rad). (1,)"""
+    """Coefficient of the blades (``dynamics.inflow``): loss of thrust per velocity of the air through the rotor and
+    rotor speed, N s^2/(m rad). (1,)"""
     flapping: Array = leaf("parameter", 1, (1,))
     """Moment at a hub per velocity across its axis and rotor speed, N s^2/rad. (1,)"""
     propeller_radius: Array = leaf("parameter", 1, (1,))

@@ -31,7 +31,7 @@ N, N_BIASED = 9, 15
 """Number of error states without biases, and with the biases of accelerometer and gyroscope, in this order."""
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
 """Upper bound of covariances, and lower bound of variances by the number of errors. They are from kalman_core.c, except
-for the lower bound with biases, whose variances are smaller: it is an assumption."""
+that the lower bound with biases is an assumption, since the variances of biases are smaller."""
 NORM_EPSILON = 1e-6
 """Number that is added to a norm before a division by it (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0
@@ -263,7 +263,8 @@ def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
 
     Args:
         estimate: The estimate.
-        min_angle: Size up to which an error is dropped, rad; by default the value of the firmware.
+        min_angle: Angle that a component of the error must exceed, rad, else the error is dropped; by default as in the
+            firmware.
     """
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)

@@ -103,6 +103,7 @@ class ErrorStateFilter(Estimator):
         return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
+        """Return a function that returns True if the latest measurement of aiding sensor k was not used yet."""
         return lambda data: sensor.read(data).samples.taken_step[0] != self.read(data).used_steps[k]
 
     def _fusion_fn(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:

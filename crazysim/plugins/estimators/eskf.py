@@ -250,6 +250,7 @@ def _bias_walk(triad: TriadData, dt: float) -> Array:
 
 
 def _finalize(estimate: Estimate) -> Estimate:
+    """Return the estimate with its attitude error, however small, moved into the attitude."""
     return error_state.finalize(estimate, min_angle=0.0)
 
 
@@ -258,20 +259,20 @@ def _combined_std(*deviations: Array | float, min_std: float = MIN_STD) -> Array
     return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(min_std * min_std)))
 
 
-def _use_pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), _combined_std(record.noise)))
     return updates.update_quat(estimate, sensor.part(data, "quat"), _combined_std(record.angle_noise))
 
 
-def _use_satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     std = _combined_std(record.noise, record.drift)
     estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), std))
     return updates.update_vel(estimate, sensor.part(data, "vel"), _combined_std(record.vel_noise))
 
 
-def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     altitude = estimate.pos[2:] + record.altitude
     predicted_pressure = pressure_at(altitude)
@@ -281,7 +282,7 @@ def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 
-def _use_field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_magnetometer(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     errors, size = record.errors, rotation.safe_norm(record.field)
     noise = errors.noise * math.sqrt(0.5 / sensor.interval(data))
@@ -290,20 +291,20 @@ def _use_field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate
     return updates.update_direction(estimate, measured, record.field / size, std)
 
 
-def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_optical_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
     scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
     return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _combined_std(record.noise[0]))
 
 
-def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_time_of_flight(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, distance = sensor.read(data), sensor.latest(data)
     std = _combined_std(record.noise + range_deviation(distance, record.far_noise))
     updated = updates.update_ray(estimate, distance[0], std[0])
     return error_state.select_estimate(distance[0] < record.max_range[0], updated, estimate)
 
 
-def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_uwb(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, measured = sensor.read(data), sensor.latest(data)
     std = _combined_std(record.noise[0])
     if sensor.tdoa:
@@ -313,7 +314,7 @@ def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Es
     return estimate
 
 
-def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _update_by_lighthouse(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     rot, std = (
         rotation.matrix(estimate.quat),
         {"sweep": _combined_std(sensor.read(data).noise[0], min_std=0.1 * MIN_STD)},
@@ -322,13 +323,13 @@ def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate)
 
 
 UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
-    MotionCapture: _use_pose,
-    GPS: _use_satellites,
-    Barometer: _use_pressure,
-    Magnetometer: _use_field,
-    OpticalFlow: _use_flow,
-    TimeOfFlight: _use_range,
-    UWB: _use_beacons,
-    Lighthouse: _use_sweeps,
+    MotionCapture: _update_by_motion_capture,
+    GPS: _update_by_gps,
+    Barometer: _update_by_barometer,
+    Magnetometer: _update_by_magnetometer,
+    OpticalFlow: _update_by_optical_flow,
+    TimeOfFlight: _update_by_time_of_flight,
+    UWB: _update_by_uwb,
+    Lighthouse: _update_by_lighthouse,
 }
 """Functions that update an estimate with a measurement, by the class of the sensor."""

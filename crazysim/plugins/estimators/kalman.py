@@ -178,25 +178,31 @@ class Kalman(ErrorStateFilter):
         return error_state.initial_estimate(pos, jnp.zeros_like(pos), quat, INITIAL_STD)
 
 
-def _use_pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _update_by_motion_capture(
+    sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
+) -> Estimate:
     estimate = updates.update_pos(estimate, sensor.part(data, "pos"), std["pos"])
     return updates.update_quat(estimate, sensor.part(data, "quat"), std["quat"])
 
 
-def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _update_by_optical_flow(
+    sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
+) -> Estimate:
     scale = sensor.interval(data) * sensor.read(data).scale[0]
     gyro = imu.measured_states(data)["ang_vel"]
     return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
 
 
-def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _update_by_time_of_flight(
+    sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
+) -> Estimate:
     distance = sensor.latest(data)
     deviation = range_deviation(distance, std["range"])[0]
     updated = updates.update_range(estimate, rot, distance[0], deviation)
     return error_state.select_estimate(distance[0] < sensor.read(data).max_range[0], updated, estimate)
 
 
-def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _update_by_uwb(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     anchors, measured = sensor.read(data).anchors, sensor.latest(data)
     for k in range(measured.shape[0]):
         if sensor.tdoa:
@@ -206,7 +212,9 @@ def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: 
     return estimate
 
 
-def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _update_by_lighthouse(
+    sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
+) -> Estimate:
     lighthouse = sensor.read(data)
     angle, visibility, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
     for pos, quat in zip(lighthouse.stations, lighthouse.quat, strict=True):
@@ -220,10 +228,10 @@ def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate,
 
 
 UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
-    MotionCapture: _use_pose,
-    OpticalFlow: _use_flow,
-    TimeOfFlight: _use_range,
-    UWB: _use_beacons,
-    Lighthouse: _use_sweeps,
+    MotionCapture: _update_by_motion_capture,
+    OpticalFlow: _update_by_optical_flow,
+    TimeOfFlight: _update_by_time_of_flight,
+    UWB: _update_by_uwb,
+    Lighthouse: _update_by_lighthouse,
 }
 """Functions that update an estimate with a measurement, by the class of the sensor."""

@@ -172,7 +172,7 @@ def update_difference(
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after measured differences of distances: to each other anchor minus to the first anchor.
+    """Return the estimate after measured differences between the distances to the other anchors and to the first one.
 
     The distances are measured at the same time, so all differences contain the error of the first distance. A distance
     minus the mean of the k distances before it is a combination of differences. Such combinations have independent

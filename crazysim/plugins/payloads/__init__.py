@@ -1,4 +1,4 @@
-"""Loads that hang from drones, on rods, cables and hooks or below several drones, and jets of rotors on them."""
+"""Loads that hang from one drone or several, on rods, cables or hooks, and the jets of rotors on these loads."""
 
 from crazysim.plugins.payloads.hook import Hook, HookData
 from crazysim.plugins.payloads.jet_table import JetTable, load_jet_table

@@ -292,5 +292,6 @@ class Hook(CollidingPlugin, Plugin):
         return jnp.where(load.attached[..., None], mass, jnp.zeros_like(mass))
 
     def _link_params(self, load: HookData) -> LinkParams:
+        """Return the parameters of one rod, with the masses of the hook and of a load on it at the tip."""
         mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))
         return LinkParams(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)

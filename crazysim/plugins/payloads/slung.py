@@ -162,7 +162,7 @@ def load_record(
         record_type: Class of the record.
         is_cable: True for cables.
         clearance: Height of a load's position above the floor when it rests there, m.
-        ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
+        ring: Height above the middle of the load of the ring that a hook holds, m; None without a hook.
         **fields: Further fields of the record.
     """
     height_at_rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
@@ -204,7 +204,7 @@ def move_loads(
         tip: Ends of the links, world frame, m. (n_drones, 3)
         is_held: True for links with a load or hook at their end; other links point down the body's z axis. (n_drones,)
         n_pieces: Number of straight pieces of a link.
-        ring: Height of the point by which a load hangs above its middle, m.
+        ring: Height above the middle of the load of the point from which the load hangs, m.
         show_free_links: True to show links of loads that do not exist.
     """
     hidden_offset = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)

@@ -36,7 +36,7 @@ class CellObstacles(NamedTuple):
     half_yaw: Array
     """Half the angle of rotation about the axis, rad. (...)"""
     size: Array
-    """Size, m. (...)"""
+    """Size, m: the radius of a trunk, or the width of a pillar. (...)"""
     is_standing: Array
     """True where the cell has an obstacle. (...)"""
 

@@ -31,7 +31,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 HIDDEN_DEPTH = 100.0
 """Depth by which obstacles that a layout leaves out are moved down, m."""
 MIN_REGION_LENGTH = 1e-3
-"""Lower limit of the length of a region by which the travelled distance is divided, m."""
+"""Smallest length by which ``wander`` divides a travelled distance, m, since a region may have no length."""
 MAX_OBSTACLES = 10_000
 """Largest number of obstacles of a layout."""
 DIFFICULTY_INDEX = np.uint32(2**32 - 1)

@@ -17,7 +17,7 @@ from crazysim.plugins.sensors.sensor import Samples, Sensor, gauss_markov_step, 
 from crazysim.pytree import PyTree, leaf
 
 SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE_RATE = 101325.0, 288.15, 0.0065
-"""Pressure, Pa, and temperature, K, at sea level, and decrease of temperature with height, K/m (ISO 2533:1975)."""
+"""Pressure at sea level, Pa; temperature at sea level, K; decrease of temperature with height, K/m (ISO 2533:1975)."""
 PRESSURE_EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE_RATE)
 """Exponent of the pressure, 5.256: g M / (R L) with the constants of the US Standard Atmosphere 1976."""
 

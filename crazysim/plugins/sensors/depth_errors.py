@@ -15,7 +15,7 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import quantise
 
 D435_WIDTH, D435_HFOV = 848, 90.0
-"""Width, pixels, at which a RealSense D435 measures best, and its horizontal field of view, degrees (Intel, *Subpixel
+"""Image width at which a RealSense D435 measures best, pixels; its horizontal field of view, degrees (Intel, *Subpixel
 Linearity Improvement for Intel RealSense Depth Camera D400 Series*, revision 1.3)."""
 D435_BASELINE = 0.05
 """Distance between the imagers of a D435, m (extrinsics that a D435 reports: 0.05003; orb_slam_2_ros issue 46)."""
@@ -124,6 +124,7 @@ class Distortion:
         Raises:
             ConfigError: If an image position has no point, or several, because the distortion folds the image.
         """
+        # (u, v) is the point, (a, b) its image position, and xx, xy, yy are the derivatives at the point.
         u, v = x.copy(), y.copy()
         with np.errstate(all="ignore"):
             for _ in range(N_NEWTON_STEPS):

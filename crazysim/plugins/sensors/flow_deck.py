@@ -26,8 +26,8 @@ MIN_TILT_COSINE = 0.1
 MIN_FLOW_DISTANCE = 0.02
 """Smallest distance to the ground, m, by which the flow is divided. An assumption."""
 FAR_NOISE = math.log(0.2 / 0.0025) / (4.0 - 2.5), 2.5, 0.0025
-"""Growth b, 1/m, distance c, m, and scale a, m, of the noise of the time of flight, ``a (1 + exp(b (d - c)))``, as the
-filter of the Crazyflie assumes it (zranger2.c of crazyflie-firmware)."""
+"""Growth b, 1/m, distance c, m, and scale a, m, of the standard deviation of a distance d by time of flight,
+``a (1 + exp(b (d - c)))``, as the filter of the Crazyflie assumes it (zranger2.c of crazyflie-firmware)."""
 
 
 class OpticalFlowData(PyTree):

@@ -20,10 +20,10 @@ from crazysim.plugins.sensors.sensor import quantise
 VLP16_ELEVATIONS = tuple(range(15, -16, -2))
 """Elevations of the 16 rows, degrees (VLP-16 User Manual, 63-9243 revision D, table 9-1)."""
 VLP16_RANGE, VLP16_NOISE, VLP16_RESOLUTION = 100.0, 0.03, 0.002
-"""Range, m, accuracy, m, taken as a standard deviation, and steps of the distance, m (VLP-16 User Manual, 63-9243
+"""Range, m; accuracy, m, used as a standard deviation; steps of the distance, m (VLP-16 User Manual, 63-9243
 revision D: up to 100 m, +-3 cm typical, 2 mm granularity)."""
 VL53L5CX_ZONES, VL53L5CX_FOV, VL53L5CX_RANGE = 8, 45.0, 4.0
-"""Zones on a side, width and height of the square field of view, degrees, and range, m (ST, user manual UM2884: 8 x 8
+"""Zones on a side; width and height of the square field of view, degrees; range, m (ST, user manual UM2884: 8 x 8
 zones, 63 degrees along the diagonal, which is 45 degrees on a side, and up to 4 m)."""
 
 

@@ -111,11 +111,11 @@ class RangeFinder(Plugin):
             current_data = with_moved_objects(data, movers_present)
             return self.write(data, self._measure(model, current_data, scope == "drone", scene.ray_kernels))
 
-        def measure_at_times(data: SimData) -> SimData:
+        def measure_if_due(data: SimData) -> SimData:
             """Measure in a call that is skipped if no world is due."""
             return jax.lax.cond(jnp.any(is_due(data)), measure, lambda data: data, data)
 
-        fn = measure_at_times if scope == "batch" and period > 1 else measure
+        fn = measure_if_due if scope == "batch" and period > 1 else measure
         condition = None if period == 1 else is_due
         reason = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
         measurement_stage = Stage(fn, scope, condition, name="range_finder", unfused_reason=reason)

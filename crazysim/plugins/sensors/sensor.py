@@ -175,7 +175,7 @@ class Sensor(Plugin):
 
     @property
     def is_late(self) -> bool:
-        """True where measurements arrive after a delay."""
+        """True if measurements arrive after a delay."""
         return bool(self._max_delay)
 
     @property

@@ -27,8 +27,8 @@ aiml_virtual/controller/car_lpv_controller.py."""
 LONGITUDINAL_GAINS = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
 """Gains of lag and speed error as polynomials of p (see ``LPV``), highest power first. Sources as above."""
 INTEGRAL_FREQ, INTEGRAL_MAX, RATE_WEIGHT = 40, 0.1, 0.5
-"""Rate of the controller to which the integral's gain refers, Hz, limit of the integral, m, and weight of the newest
-difference in the rate of the offset. Sources as above."""
+"""Rate of the controller to which the integral's gain refers, Hz; limit of the integral, m; weight of the newest
+difference in the smoothed rate of the offset. Sources as above."""
 
 
 class LPVGains(PyTree):

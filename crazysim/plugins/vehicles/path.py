@@ -1,4 +1,7 @@
-"""Paths on the ground: curves by arc length with signed curvature, projection onto them, and their timing."""
+"""Paths on the ground: curves by arc length with signed curvature, projection onto them, and their timing.
+
+``following.PathState`` explains references by time and by arc length.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ MAX_PIECE_LENGTH = 0.1
 MAX_PIECES = 100_000
 """Largest number of pieces of a path."""
 N_SAMPLES = 8193
-"""Number of samples of a curve from which its arc length is integrated, by the trapezoidal rule."""
+"""Number of samples of a curve for the integral of its arc length by the trapezoidal rule."""
 N_TIMES = 257
 """Number of samples of the arc length as a function of time."""
 NEWTON_STEPS = 2
@@ -32,10 +35,10 @@ NEWTON_STEPS = 2
 MAX_NEWTON_STEP = 0.5
 """Largest displacement in one Newton step, m."""
 STOPPING_LENGTH = 0.5
-"""Length before the end of an open path in which a reference by arc length slows down, m."""
+"""Distance from the end of an open path at which a reference by arc length begins to slow down, m."""
 MIN_SPEED_FRACTION = 0.1
-"""Smallest speed of a reference by arc length on a path of a trajectory, as a fraction of the path's largest speed, so
-that vehicles at rest can start. Only the slowdown at the end of an open path goes below it."""
+"""Smallest speed of a reference by arc length on a path ``of_trajectory``, as a fraction of the path's largest speed,
+so that vehicles at rest can start. Only the slowdown at the end of an open path goes below it."""
 MIN_CURVED_SPEED_FRACTION = 0.05
 """Parametric speed, as a fraction of its maximum, below which the curvature is set to zero."""
 N_REPEATED_POINTS = 12
