@@ -6,7 +6,8 @@
 
 Every variant of a task is trained by PPO on drones that ``randomize="generic"`` draws around one airframe, all seeds in
 one program. Each kept policy is then flown on other drones. They are drawn in the same way around the airframe of the
-training (``drawn``) and around each of the other Crazyflies, with the controller and the actions of that airframe.
+training (``drawn``) and around each of the other Crazyflies. Each evaluation uses the controller and the actions of its
+airframe.
 
 There is a JSON line for each seed. Runs in the folder ``--out`` are continued from their checkpoints.
 """

@@ -15,8 +15,8 @@ from crazysim.sim.sim import Sim
 BACKGROUND_COLOR, OBSTACLE_COLOR, OUTLINE_COLOR = (238, 238, 230), (40, 65, 40), (20, 20, 20)
 """Colours of a map, of obstacles, and of the outlines of drones, RGB."""
 MIN_OBSTACLE_TOP = 0.1
-"""Smallest height of the top of an obstacle, m. Lower geoms are not drawn, such as markers on the floor, and obstacles
-that a layout has moved below the floor."""
+"""Smallest height of the top of an obstacle, m. Lower geoms are not drawn: markers on the floor, and obstacles that a
+layout has moved below the floor."""
 MARGIN = 1.0
 """Width of the margin around obstacles and paths, m."""
 MIN_WIDTH, MAX_WIDTH = 6.0, 24.0

@@ -220,7 +220,7 @@ def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequenc
 def _batching_rule(
     primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], spec: DerivativeSpec, **params: Any
 ) -> Any:
-    """Return the results of a primitive for ``n`` batches: one call for all their worlds if parameters are the same."""
+    """Return the results of a primitive for ``n`` batches, by one call if all batches have the same parameters."""
     n_nonlinear = len(spec.array_leaves)
     have_world_axis = [*spec.world_axis_flags(spec.array_leaves), *(True for _ in args[n_nonlinear:])]
     if any(b and not has_axis for b, has_axis in zip(batched, have_world_axis, strict=True)):

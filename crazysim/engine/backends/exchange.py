@@ -229,7 +229,7 @@ def lanes_of_block(group_size: int) -> tuple[int, int]:
 
     A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, sizes up to 256 threads are compared,
     larger sizes only if one world needs them. The block gets the size with the smallest share of threads without a
-    drone, to the nearest percent; of several such sizes the smallest.
+    drone, to the nearest percent. Of sizes with equal shares, it gets the smallest.
 
     Args:
         group_size: Drones of a world that read each other's numbers.

@@ -45,7 +45,7 @@ def run_block(
 
     Args:
         block: The block.
-        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
+        inputs: Its inputs: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
         shape: Shape of the lanes.
         observe: Function that is called with every operation and its results, or None.
 

@@ -113,8 +113,8 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
 
 def _used_slots(program: Program, s: Segment) -> list[Slot]:
     """Return the slots of the inputs that a segment uses."""
-    used, slots = s.block.used_values(), program.drone_slots(s, s.reads)
-    return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
+    used_values, slots = s.block.used_values(), program.drone_slots(s, s.reads)
+    return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used_values]
 
 
 def _float_type(block: Block) -> np.dtype:
@@ -175,18 +175,18 @@ def _reverse_segment(
 
     primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
     seeds = [sum_copies(s.writes[k], s.block.outputs[k].dtype) for k in float_outputs]
-    parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
+    contributions = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
     # The segment overwrites these numbers, so the numbers after it depend on the old ones only through its inputs.
     for k in float_outputs:
         zero = constant(0, s.block.outputs[k].dtype)
         ct_outputs.update(dict.fromkeys(cotangent_slots(s.writes[k]), zero))
-    for k, part in zip(input_indices, parts, strict=False):
+    for k, contribution in zip(input_indices, contributions, strict=False):
         ct_slot, dtype = cotangent_slots(s.reads[k])[0], s.block.inputs[k].dtype
         old_ct = ct_outputs[ct_slot] if ct_slot in ct_outputs else read_cotangent(ct_slot, dtype)
-        ct_outputs[ct_slot] = builder.add("add", (old_ct, part), dtype)
-    for k, part in zip(hoisted_indices, parts[len(input_indices) :], strict=True):
+        ct_outputs[ct_slot] = builder.add("add", (old_ct, contribution), dtype)
+    for k, contribution in zip(hoisted_indices, contributions[len(input_indices) :], strict=True):
         ct_slot, dtype = (hoisted_leaf, k), s.block.inputs[len(reads) + k].dtype
-        ct_outputs[ct_slot] = builder.add("add", (read_cotangent(ct_slot, dtype), part), dtype)
+        ct_outputs[ct_slot] = builder.add("add", (read_cotangent(ct_slot, dtype), contribution), dtype)
     read_inputs, hoisted_inputs = primal[: len(reads)], primal[len(reads) : n_inputs]
     block = Block(
         (*read_inputs, *ct_inputs.values(), *hoisted_inputs), tuple(builder.operations), tuple(ct_outputs.values())
@@ -213,8 +213,8 @@ def _reverse_hoisted(
             seeds.append(constant(0, x.dtype))
     old_cts = [builder.input(s.hoisted.inputs[k].dtype) for k in input_indices]
     cts = [x for x in seeds if isinstance(x, Value)]
-    parts = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
-    sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old_cts, parts, strict=True)]
+    contributions = inline(builder, pullback, dict(zip(pullback.inputs, [*primal, *seeds], strict=True)))
+    sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old_cts, contributions, strict=True)]
     targets = tuple((n_leaves + reads[k][0], reads[k][1]) for k in input_indices)
     block = Block((*primal, *cts, *old_cts), tuple(builder.operations), tuple(sums))
     return Segment("drone", s.stages, "each", block, (*reads, *ct_slots, *targets), targets)

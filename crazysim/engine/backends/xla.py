@@ -25,7 +25,7 @@ def run_block(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env
 
     Args:
         block: The block.
-        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
+        inputs: Its inputs: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
         shape: Shape of the lanes.
         env: Values of the enclosing blocks.
 
@@ -139,7 +139,8 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
 
 MAX_UNROLLED = 8
-"""Maximum number of drones per world for which the loop over other drones is unrolled; larger worlds use an axis."""
+"""Maximum number of drones per world for which the loop over other drones is unrolled. For larger worlds, arrays get an
+axis for the other drones."""
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:

@@ -255,8 +255,8 @@ REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
 """Operations that combine the results of ``over_others``."""
 
 INDEX_REDUCTIONS: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
-"""Comparison by which a number replaces the best number so far, for each reduction to the index of the first drone with
-the smallest or largest number. Only derivatives in kernels use these reductions."""
+"""Comparison that decides whether a number replaces the best number so far, for each reduction that returns an index:
+of the first drone with the smallest or largest number. Only derivatives in kernels use these reductions."""
 
 
 def neutral_number(name: str, dtype: np.dtype) -> np.generic:

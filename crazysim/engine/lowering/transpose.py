@@ -83,9 +83,11 @@ def _recompute(
     over other drones and loops are not recomputed.
     """
     operations = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
-    recomputed, used = {x for op in operations for x in op.results}, part.used_values()
+    recomputed, used_values = {x for op in operations for x in op.results}, part.used_values()
     inputs = [
-        x for x in values if x in used and x in active_set and x not in recomputed and isinstance(values[x], Value)
+        x
+        for x in values
+        if x in used_values and x in active_set and x not in recomputed and isinstance(values[x], Value)
     ]
     copies = {x: builder.add("opaque_copy", (values[x],), x.dtype, (("part", part_number),)) for x in inputs}
     elements = values | copies
@@ -122,15 +124,16 @@ def _add_cotangents(
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
         derivative = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
         operands = [*map(map_element, op.args), result_cts[0]]
-        parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
+        contributions = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
         floats = [x for x in op.args if x.dtype.kind == "f"]
-        for x, part in zip(floats, parts, strict=True):
+        for x, contribution in zip(floats, contributions, strict=True):
             if isinstance(x, Value) and x in active_set:
-                _accumulate(builder, cts, x, part)
+                _accumulate(builder, cts, x, contribution)
 
 
-def _accumulate(builder: Builder, cts: Cotangents, x: Value, part: Element) -> None:
-    cts[x] = builder.add("add", (cts[x], part), x.dtype) if x in cts else part
+def _accumulate(builder: Builder, cts: Cotangents, x: Value, contribution: Element) -> None:
+    """Add a contribution to the cotangent of a value."""
+    cts[x] = builder.add("add", (cts[x], contribution), x.dtype) if x in cts else contribution
 
 
 @functools.lru_cache(maxsize=1024)
@@ -187,10 +190,10 @@ def _custom_jvp(
     seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, result_cts, strict=True)
              if x.dtype.kind == "f"]  # fmt: skip
     operands = [*args, *(constant(0, x.dtype) for x in args), *seeds]
-    parts = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
-    for x, part in zip([x for x in op.args if x.dtype.kind == "f"], parts, strict=True):
+    contributions = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
+    for x, contribution in zip([x for x in op.args if x.dtype.kind == "f"], contributions, strict=True):
         if isinstance(x, Value) and x in active_set:
-            _accumulate(builder, cts, x, part)
+            _accumulate(builder, cts, x, contribution)
 
 
 @functools.lru_cache(maxsize=256)
@@ -245,10 +248,10 @@ def _over_others(
         block = Block((*(y for y, _ in pairs), new_inputs[-1]), block.operations, block.outputs)
         params = (("reduce", ("add",) * len(perturbed)), ("n_members", op.param("n_members")))
         sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in perturbed], params, (block,))
-        for x, part in zip(perturbed, sums, strict=True):
+        for x, contribution in zip(perturbed, sums, strict=True):
             target = dict(zip(body.inputs, op.args, strict=False)).get(x, x)
             if isinstance(target, Value) and target in active_set:
-                _accumulate(builder, cts, target, part)
+                _accumulate(builder, cts, target, contribution)
 
     other_inputs = body.inputs[:-1]
     add_reverse_loop(other_inputs, {}, [x for x in captured if x in active_set], published)
