@@ -248,6 +248,7 @@ ANNOUNCE_DELAY = 1.0
 """Default time after which unfinished work is announced, s."""
 
 _announced_work: set[str] = set()
+"""Names of the work that has been announced in this process."""
 
 
 def announce(work: str, duration: str) -> None:

@@ -91,8 +91,8 @@ def _provenance(selected_sections: Sequence[Section]) -> str:
         if not section.problem:
             packages |= section.packages
             packages |= {k: name for k, name in section.peers.items() if importlib.util.find_spec(k) is not None}
-    others = dict.fromkeys(re.split(r"[\[=@]", name)[0] for name in packages.values())
-    programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *others))
+    other_packages = dict.fromkeys(re.split(r"[\[=@]", name)[0] for name in packages.values())
+    programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *other_packages))
     return (
         f"Made on {datetime.now(UTC):%Y-%m-%d} with crazysim {crazysim.__version__}{commit}, {programs}, Python "
         f"{platform.python_version()}, on a CPU ({_processor()})."

@@ -121,6 +121,7 @@ INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
     Integrator.symplectic_euler: symplectic_euler,
     Integrator.rk4: rk4,
 }
+"""Function ``(data, deriv_fn) -> data`` of each scheme."""
 
 
 @dataclass(frozen=True)

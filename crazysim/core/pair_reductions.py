@@ -37,6 +37,7 @@ def safe_max(x: Array, axis: int) -> Array:
 
 
 REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": safe_min, "max": safe_max}
+"""Function ``(array, axis) -> array`` of each reduction."""
 
 MAX_PAIRS = 2**20
 """Largest number of pairs of a world computed at once. Larger swarms are computed in batches, to bound memory."""

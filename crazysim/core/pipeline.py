@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 
 Pipeline = dict[str, Callable[..., Any]]
+"""Functions of the stages by name, in order."""
 F = TypeVar("F")
 
 

@@ -129,9 +129,9 @@ def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
         data: Data of all worlds.
         mesh: The devices.
     """
-    over_worlds, shared = PartitionSpec(WORLD_AXIS), PartitionSpec()
-    specs = jax.tree.map(lambda scope: over_worlds if n_batch_axes(scope) else shared, scopes(data))
-    return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=over_worlds, check_vma=False)(data)
+    split_spec, replicated_spec = PartitionSpec(WORLD_AXIS), PartitionSpec()
+    specs = jax.tree.map(lambda scope: split_spec if n_batch_axes(scope) else replicated_spec, scopes(data))
+    return jax.shard_map(fn, mesh=mesh, in_specs=(specs,), out_specs=split_spec, check_vma=False)(data)
 
 
 def distribute(tree: T, shardings: Any) -> T:

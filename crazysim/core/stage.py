@@ -230,11 +230,11 @@ class Axes:
         if stage.scope == "world":
             return [*populations, "world"]
         if stage.scope not in (*populations, "drone"):
-            others = ", ".join(repr(name) for name in populations if name != "drone")
+            other_names = ", ".join(repr(name) for name in populations if name != "drone")
             raise ConfigError(
                 f"stage {stage.__name__!r} is declared for one {stage.scope!r}, and there is no population of that "
-                f"name; there {'are ' + others if others else 'is none'}. Add it with sim.add first, or declare the "
-                f"stage for 'drone' or 'world'."
+                f"name; there {'are ' + other_names if other_names else 'is none'}. Add it with sim.add first, or "
+                f"declare the stage for 'drone' or 'world'."
             )
         return [stage.scope]
 

@@ -16,14 +16,18 @@ from crazysim.errors import ConfigError, UnknownNameError
 CASCADE_NAME = "mellinger"
 """Crazyflow's name for its cascade of controllers, which is ``"crazyflow"`` here; not the controller ``Mellinger``."""
 _CORE_KEYS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
+"""Keys of ``[controller]`` for Crazyflow's table ``core``, which all functions of the cascade receive."""
 _ROTOR_NAMES = {
     "thrust_curve": "rpm2thrust",
     "torque_curve": "rpm2torque",
     "thrust_min": "thrust_min",
     "thrust_max": "thrust_max",
 }
+"""Crazyflow's names of keys of ``[rotors]``."""
 _STATE_KEYS = ("kp", "kd", "ki", "int_err_max")
+"""Keys of ``[controller.state]``."""
 _ATTITUDE_KEYS = ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
+"""Keys of ``[controller.attitude]``."""
 CRAZYFLOW_TABLES: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("core", "controller", {key: key for key in _CORE_KEYS}),
     ("core", "rotors", _ROTOR_NAMES),

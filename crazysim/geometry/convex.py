@@ -110,8 +110,8 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
             squared_distance = jnp.where(is_closer, squares[k], squared_distance)
         return (*simplex, pair.with_candidate(n, best))
 
-    first = pair.support_point(n)
-    triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
+    first_point = pair.support_point(n)
+    triangle, nearest, best = lax.fori_loop(0, steps, step, ((first_point,) * 3, first_point[0], (pair.gap(n), n)))
     weights = closest_point(*(point for point, _ in triangle))
     coordinates = [
         jnp.asarray(sum(w * x for w, x in zip(weights, xs, strict=True)))

@@ -122,9 +122,9 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
 
     is_a = best_face < 3
     boxes = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
-    face = tuple(jnp.where(is_a, x, y) for x, y in zip(*boxes, strict=True))
-    other = tuple(jnp.where(is_a, y, x) for x, y in zip(*boxes, strict=True))
-    gap, normal, point = _clip_face(face, best_face % 3, other)
+    face_box = tuple(jnp.where(is_a, x, y) for x, y in zip(*boxes, strict=True))
+    other_box = tuple(jnp.where(is_a, y, x) for x, y in zip(*boxes, strict=True))
+    gap, normal, point = _clip_face(face_box, best_face % 3, other_box)
     gap_edge, normal_edge, point_edge = _edge_contact(boxes, edge_pair, axes.reshape(-1, 3)[edge_pair], offset)
     gap = jnp.concatenate(
         [

@@ -180,9 +180,12 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
 
     # An arc is (n, p, m, q, peak): directions n and m with support points p and q, and the estimate between them.
     start = (jnp.ones_like(x), jnp.zeros_like(x))
-    first = support_point(start)
+    first_point = support_point(start)
     _, _, gap, initial_arc = lax.fori_loop(
-        0, N_ARCS, try_arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
+        0,
+        N_ARCS,
+        try_arc,
+        (start, first_point, jnp.full_like(x, -jnp.inf), (start, first_point, start, first_point, start)),
     )
 
     def narrow_arc(_: int, carry: tuple[Array, tuple[PlaneVector, ...]]) -> tuple[Array, tuple[PlaneVector, ...]]:

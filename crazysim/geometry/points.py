@@ -183,3 +183,4 @@ POINT_DISTANCE = {
     "ellipsoid": _ellipsoid,
     "mesh": _mesh,
 }
+"""Function ``(shape, point) -> distance`` of each kind of shape."""

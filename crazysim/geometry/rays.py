@@ -199,6 +199,7 @@ LINE_INTERVALS = {
     "ellipsoid": _ellipsoid_interval,
     "mesh": _mesh_interval,
 }
+"""Function ``(shape, origin, direction) -> interval`` of each kind of convex shape."""
 
 
 # Normals of surface points -------------------------------------------------------------------------------------------
@@ -264,3 +265,4 @@ SURFACE_NORMALS = {
     "ellipsoid": _ellipsoid_normal,
     "mesh": _mesh_normal,
 }
+"""Function ``(shape, point) -> normal`` of each kind of shape, for points of the surface."""

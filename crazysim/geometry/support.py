@@ -99,9 +99,11 @@ SUPPORT_FUNCTION: dict[str, Callable[[Shape, Vector], Array]] = {
     "ellipsoid": _ellipsoid_function,
     "mesh": _mesh_function,
 }
+"""Function ``(shape, unit direction) -> support function`` of each kind of shape."""
 SUPPORT_POINT: dict[str, Callable[[Shape, Vector], Vector]] = {
     "box": _box_point,
     "cylinder": _cylinder_point,
     "ellipsoid": _ellipsoid_point,
     "mesh": _mesh_point,
 }
+"""Function ``(shape, direction) -> support point`` of each kind of shape."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 STATE_FIELDS = tuple(field.name for field in dataclasses.fields(SimState))  # type: ignore[arg-type]
 COMMAND_LEVELS = ("state", "attitude", "body_rate", "force_torque")
+"""Fields of ``SimControls`` with the records of command levels."""
 COMMAND_FIELDS = ("cmd", "staged_cmd", "feedforward", "staged_feedforward", "staged_ang_vel_des")
 """Fields with commands in the record of a command level; each level has only some of them."""
 

@@ -254,6 +254,7 @@ def _residual(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Arra
 
 
 _rotation_slope = jax.jit(lambda x, *log: -jax.jacfwd(_residual)(x, *log))
+"""Derivative of the simulated angles with respect to the parameters. (n, k, 3)"""
 
 
 def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
