@@ -107,9 +107,9 @@ def attitude2force_torque(
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
     p = params
-    desired = rotation.from_rpy(cmd[..., :3])
-    error = rotation.multiply(rotation.conjugate(desired), quat)
-    rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
+    quat_des = rotation.from_rpy(cmd[..., :3])
+    quat_error = rotation.multiply(rotation.conjugate(quat_des), quat)
+    rotation_error = 4 * quat_error[..., 3:] * quat_error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
     r_int_error = rotation.clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
     torque_pwm = -p.kR * rotation_error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * r_int_error

@@ -254,7 +254,7 @@ class Auto(Controller):
             cast(PositionParams, p.position),
             cast(AutoTarget, memory.target),
         )
-        specific_thrust, position = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
+        specific_thrust, position_memory = specific_force(s.pos, s.vel, known_acc, sp, target.position, freq, loop)
         # The desired attitude is constant for a period, so the setpoint's acceleration half a period later is used.
         specific_thrust = keep_upright(specific_thrust - drag + 0.5 / freq * sp.jerk, sp, loop)
 
@@ -273,7 +273,7 @@ class Auto(Controller):
         yaw_rate = heading_terms / jnp.maximum(x_forward, MIN_HEADING_SINE)
         ang_vel = cross(z, z_rate) + clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
         attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * square_norm * inverse
-        return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
+        return memory.replace(target=AutoTarget(position_memory, attitude, matvec(to_body, ang_vel), thrust))
 
     def params(self, airframe: Airframe) -> AutoParams:
         return AutoParams.create(airframe, self.freq, self.outer_freq)
@@ -302,8 +302,8 @@ class Auto(Controller):
         gyroscopic = cross(s.ang_vel, momentum)
         # The momentum of the rotors is included, because rotors that speed up turn the body the other way.
         total_momentum = momentum - rotation.along_z((p.reaction * rotor_torque[..., 2:])[..., 0])
-        impulse = p.torque_max / self.freq
-        measured_impulse = jnp.clip(total_momentum - memory.momentum, -impulse, impulse)
+        impulse_max = p.torque_max / self.freq
+        measured_impulse = jnp.clip(total_momentum - memory.momentum, -impulse_max, impulse_max)
         is_at_rest = dot(s.ang_vel, s.ang_vel) == 0  # such a drone is assumed to stand on the floor
         disturbance_torque = (1 - p.observer) * memory.torque + jnp.where(
             is_at_rest, 0.0, p.observer * self.freq

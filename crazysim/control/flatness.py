@@ -146,6 +146,7 @@ def thrust_direction(
     is_undefined = dot(specific_thrust, specific_thrust) < MIN_SPECIFIC_THRUST**2
     inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, specific_thrust)))
     z = jnp.where(is_undefined, jnp.asarray([0.0, 0.0, 1.0], specific_thrust.dtype), specific_thrust * inverse)
+    # ``growth`` is the relative rate of change of the thrust's magnitude, 1/s.
     growth = dot(z, specific_thrust_rate) * inverse
     z_rate = specific_thrust_rate * inverse - growth * z
     growth_rate = (dot(z_rate, specific_thrust_rate) + dot(z, specific_thrust_acc)) * inverse

@@ -177,8 +177,8 @@ def indi_control(
     momentum_rate = jnp.where(is_first_tick, modelled_torque, (total_momentum - memory.momentum) * freq)
     acc = jnp.where(is_first_tick, rotor_acc + p.gravity_vec, (vel - memory.vel) * freq)
     signals = jnp.concatenate([acc, rotor_acc, momentum_rate, wrench[..., 1:]], axis=-1)
-    state = jnp.where(is_first_tick, steady_filter_states(signals, params.filter), memory.filter)
-    signals, state = apply_filter(signals, state, params.filter)
+    filter_state = jnp.where(is_first_tick, steady_filter_states(signals, params.filter), memory.filter)
+    signals, filter_state = apply_filter(signals, filter_state, params.filter)
     acc, rotor_acc, momentum_rate, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
@@ -198,7 +198,7 @@ def indi_control(
     rotor_vel_des = force_torque2rotor_vel(wrench_cmd, params=allocation)
     rotor_vel_min = rotor_vel_of_thrust(allocation.thrust_min, allocation.rpm2thrust)
     rotor_vel_cmd = jnp.maximum(rotor_vel + params.lead * (rotor_vel_des - rotor_vel), jnp.maximum(rotor_vel_min, 1.0))
-    return rotor_vel_cmd, INDIMemory(vel, total_momentum, state, jnp.ones_like(memory.started))
+    return rotor_vel_cmd, INDIMemory(vel, total_momentum, filter_state, jnp.ones_like(memory.started))
 
 
 class INDI(Controller):

@@ -65,27 +65,31 @@ class PID(Controller):
         s, heading = data.states, heading_vector(data.states.quat)
         # The first measurement is in world axes, as in positionControllerResetAllPID. It has no effect with the
         # firmware's derivative gain, which is zero in this loop.
-        position = memory.position.with_first_measurement(s.pos, memory.started)
-        vel_des, position = desired_velocity(
-            s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
+        position_memory = memory.position.with_first_measurement(s.pos, memory.started)
+        vel_des, position_memory = desired_velocity(
+            s.pos, heading, command.pos, position_memory, self.outer_freq, loop=params.position
         )
-        tilt, thrust, velocity = desired_attitude(
+        tilt, thrust, velocity_memory = desired_attitude(
             s.vel, heading, vel_des, memory.velocity, self.outer_freq, params=params
         )
         rpy_des = jnp.concatenate([tilt, memory.rpy_des[2:]])
-        return memory.replace(position=position, velocity=velocity, rpy_des=rpy_des, thrust=thrust)
+        return memory.replace(position=position_memory, velocity=velocity_memory, rpy_des=rpy_des, thrust=thrust)
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
     ) -> tuple[Array, PIDMemory]:
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(data.states.quat), DEGREES_PER_RADIAN * data.states.ang_vel
         thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
-        rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
-        torque, rate = desired_torque(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
+        rpy_des, attitude_memory, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
+        torque, rate_memory = desired_torque(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
         pwm = distribute_power(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
         rotor_vel = rotor_vel_of_pwm(pwm, params=params.motors)
         new_memory = memory.replace(
-            attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)
+            attitude=attitude_memory,
+            rate=rate_memory,
+            rpy_des=rpy_des,
+            thrust=thrust,
+            started=jnp.ones_like(memory.started),
         )
         return rotor_vel, _reset_at_zero_thrust(new_memory, rpy, data.states.pos)
 
@@ -100,17 +104,21 @@ class PID(Controller):
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         if isinstance(command, Setpoint):
             heading = heading_vector(s.quat)
-            position = initial_memory.position.with_first_measurement(
+            position_memory = initial_memory.position.with_first_measurement(
                 to_heading_frame(heading, s.pos), initial_memory.started
             )
-            vel_des, _ = desired_velocity(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
-            measured = to_heading_frame(heading, s.vel)
-            velocity = initial_memory.velocity.with_first_measurement(measured, initial_memory.started)
-            output, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
+            vel_des, _ = desired_velocity(
+                s.pos, heading, command.pos, position_memory, self.outer_freq, loop=p.position
+            )
+            measured_vel = to_heading_frame(heading, s.vel)
+            velocity_memory = initial_memory.velocity.with_first_measurement(measured_vel, initial_memory.started)
+            output, _ = pid_step(
+                vel_des - measured_vel, measured_vel, velocity_memory, self.outer_freq, loop=p.velocity
+            )
             scaled_thrust = (thrust - p.thrust_base) / THRUST_SCALE
             current_output = jnp.stack([rpy[1], -rpy[0], scaled_thrust[0]])
-            velocity = continue_integral(velocity, output, current_output, loop=p.velocity)
-            initial_memory = initial_memory.replace(position=position, velocity=velocity)
+            velocity_memory = continue_integral(velocity_memory, output, current_output, loop=p.velocity)
+            initial_memory = initial_memory.replace(position=position_memory, velocity=velocity_memory)
         initial_memory = initial_memory.replace(
             attitude=initial_memory.attitude.with_first_measurement(rpy, initial_memory.started),
             rate=initial_memory.rate.with_first_measurement(ang_vel, initial_memory.started),
@@ -137,11 +145,11 @@ class PID(Controller):
         else:
             rpy_des = DEGREES_PER_RADIAN * command[:3]
         rpy_des = jnp.concatenate([rpy_des[:2], wrap_degrees(rpy_des[2:])])
-        attitude = memory.attitude.with_first_measurement(rpy, memory.started)
-        ang_vel_des, attitude = desired_rates(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
+        attitude_memory = memory.attitude.with_first_measurement(rpy, memory.started)
+        ang_vel_des, attitude_memory = desired_rates(rpy, rpy_des, attitude_memory, self.freq, loop=params.attitude)
         if is_rate_command:
             ang_vel_des = jnp.concatenate([DEGREES_PER_RADIAN * command[:2], ang_vel_des[2:]])  # type: ignore[index]
-        return rpy_des, attitude, ang_vel_des
+        return rpy_des, attitude_memory, ang_vel_des
 
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:

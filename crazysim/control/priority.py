@@ -28,8 +28,8 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     Returns:
         Collective thrust, N, and body torque, N m. (..., 4)
     """
-    force, scale, yaw, _ = _prioritize(wrench, params)
-    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw * params.torque_arms[..., 2:]], axis=-1)
+    force, scale, yaw_force, _ = _prioritize(wrench, params)
+    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw_force * params.torque_arms[..., 2:]], axis=-1)
 
 
 def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
@@ -52,18 +52,18 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
         params: Parameters of the allocation, shared or with the leading axes of the wrench.
     """
-    force, scale, yaw, tilt_thrusts = _prioritize(wrench, params)
+    force, scale, yaw_force, tilt_thrusts = _prioritize(wrench, params)
     lift_shares, yaw_shares = params.allocation_matrix[..., 0], params.allocation_matrix[..., 3]
-    return lift_shares * (force + scale * tilt_thrusts) + yaw_shares * yaw
+    return lift_shares * (force + scale * tilt_thrusts) + yaw_shares * yaw_force
 
 
 def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
     """Return the collective thrust, the scale of roll and pitch torque, the yaw force and the tilt thrusts.
 
     Returns:
-        Collective thrust, N (..., 1); factor in [0, 1] of roll and pitch torque (..., 1); yaw torque over its torque
-        arm, N (..., 1); thrust of each rotor for the unscaled roll and pitch torque, over the rotor's share of the
-        collective thrust, N (..., n_rotors).
+        Collective thrust, N (..., 1); factor in [0, 1] of roll and pitch torque (..., 1); yaw force, which is the yaw
+        torque over its torque arm, N (..., 1); tilt thrusts, which are the thrust of each rotor for the unscaled roll
+        and pitch torque, over the rotor's share of the collective thrust, N (..., n_rotors).
     """
     p = params
     # Thrust of each rotor divided by the collective thrust, positive.
@@ -85,18 +85,20 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
         _reduce_rotors(jnp.minimum, high - tilt_thrusts),
     )
     weight = high_untilted if p.weight is None else p.weight
-    limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, low_untilted))
+    force_limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, low_untilted))
 
     # The length of the interval of allowed F ("room") is a concave function of s. Therefore it is at least the linear
     # interpolation between s = 0, where it is positive, and s = 1. The scale is 1 if the room at s = 1 is not negative,
     # and otherwise the s at which the interpolation is zero.
     room_untilted, room_tilted = (
-        jnp.minimum(high_untilted, limit) - low_untilted,
-        jnp.minimum(high_tilted, limit) - low_tilted,
+        jnp.minimum(high_untilted, force_limit) - low_untilted,
+        jnp.minimum(high_tilted, force_limit) - low_tilted,
     )
     scale = room_untilted / jnp.maximum(room_untilted - jnp.minimum(room_tilted, 0.0), 1 / UNLIMITED_THRUST)
     force_low = low_untilted + scale * (low_tilted - low_untilted)
-    force = clip(wrench[..., :1], force_low, jnp.where(room_tilted < 0, force_low, jnp.minimum(high_tilted, limit)))
+    force = clip(
+        wrench[..., :1], force_low, jnp.where(room_tilted < 0, force_low, jnp.minimum(high_tilted, force_limit))
+    )
 
     yaw_room = jnp.maximum(jnp.minimum(force - force_low, high_tilted - force), 0.0) / max_yaw_share
     return force, scale, clip(wrench[..., 3:] / p.torque_arms[..., 2:], -yaw_room, yaw_room), tilt_thrusts

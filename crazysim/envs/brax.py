@@ -91,8 +91,8 @@ class BraxEnv:
         state = self.env.reset(self._seed_key(rng))
         zeros = jnp.zeros(self.sim.n_worlds, state.reward.dtype)
         metrics = {"error": self._mean_over_drones(state.info["error"])}
-        episode = {"sum_reward": zeros, "length": zeros} | dict.fromkeys(metrics, zeros)
-        info = {"steps": zeros, "truncation": zeros, "episode_done": zeros, "episode_metrics": episode}
+        episode_metrics = {"sum_reward": zeros, "length": zeros} | dict.fromkeys(metrics, zeros)
+        info = {"steps": zeros, "truncation": zeros, "episode_done": zeros, "episode_metrics": episode_metrics}
         return State(state, self._flatten_obs(state.obs), zeros, zeros, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
@@ -112,14 +112,14 @@ class BraxEnv:
         dtype = state.reward.dtype
         done, reward = env_state.done.astype(dtype), self._mean_over_drones(env_state.reward)
         metrics = {"error": self._mean_over_drones(env_state.info["error"])}
-        continues = 1 - state.done
+        was_running = 1 - state.done
         increments = {"sum_reward": reward, "length": jnp.ones_like(reward)} | metrics
         sums = state.info["episode_metrics"]
         info = {
-            "steps": state.info["steps"] * continues + 1,
+            "steps": state.info["steps"] * was_running + 1,
             "truncation": (env_state.truncated & ~env_state.terminated).astype(dtype),
             "episode_done": done,
-            "episode_metrics": {name: sums[name] * continues + x for name, x in increments.items()},
+            "episode_metrics": {name: sums[name] * was_running + x for name, x in increments.items()},
         }
         return state.replace(
             pipeline_state=env_state,

@@ -107,11 +107,11 @@ class Env(ABC):
         """The engine's step that ``step`` calls: the stages of the physics and of the phases."""
         batched_parts = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
         batched_parts += [f"task {self.task.name!r}"] if self.task.batched else []
-        unfused_reason = f"{', '.join(batched_parts)} is declared to need all worlds at once" if batched_parts else None
+        batched_reason = f"{', '.join(batched_parts)} is declared to need all worlds at once" if batched_parts else None
         if self.base.episode_reset.has_foreign_record:
-            unfused_reason = "a record in data.plugins is of another library and is not divided among worlds"
+            batched_reason = "a record in data.plugins is of another library and is not divided among worlds"
         physics = self.base.physics
-        return physics.with_stages(self.phases.stages(physics.stages, unfused_reason))
+        return physics.with_stages(self.phases.stages(physics.stages, batched_reason))
 
     def reset(self, key: Array) -> EnvState:
         """Return the state of all worlds at the start of an episode; the same key gives the same episodes.

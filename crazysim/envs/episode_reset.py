@@ -38,13 +38,13 @@ class EpisodeReset:
         self.batched_reason: str | None = None
         """Reason why resets are computed for all worlds and then used where an episode begins; None if only worlds in
         which an episode begins are reset."""
-        rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
+        leaf_rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if batched_stages:
             self.batched_reason = (
                 f"{', '.join(map(repr, batched_stages))} of the reset pipeline takes all worlds at once"
             )
-        elif any(n_batch_axes(scope) == 2 and x.shape[0] > 1 and i != world_id for scope, x, i in rows):
+        elif any(n_batch_axes(scope) == 2 and x.shape[0] > 1 and i != world_id for scope, x, i in leaf_rows):
             self.batched_reason = "episodes begin from different data in different worlds"
         movable = () if sim.data.objects is None else sim.data.objects.names
         keeps_objects = len(moving_plugins(sim.plugins.values(), movable)) == len(movable)

@@ -150,11 +150,11 @@ def make(
             )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
-    repeated = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
-    if repeated:
+    repeated_names = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
+    if repeated_names:
         raise ConfigError(
-            f"expected no plugin {repeated[0]!r} besides those that the simulation's settings add, got another. Leave "
-            f"it out, give it another name=, or use estimator=Kalman([...]) with your own sensors."
+            f"expected no plugin {repeated_names[0]!r} besides those that the simulation's settings add, got another. "
+            f"Leave it out, give it another name=, or use estimator=Kalman([...]) with your own sensors."
         )
     task.install(sim)
     for plugin in plugins:

@@ -118,16 +118,20 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if state is None:
             return None
         obs, reward, info = self._outputs
-        n = (self.num_envs, self.sim.n_drones)
+        batch_shape = (self.num_envs, self.sim.n_drones)
         drone_entries = self._drone_entries if self._has_single_drone else ()
-        entries = {
-            k: v.reshape(*n, *v.shape[1:]) if k in drone_entries else v for k, v in info.items() if k in state.info
+        info_entries = {
+            k: v.reshape(*batch_shape, *v.shape[1:]) if k in drone_entries else v
+            for k, v in info.items()
+            if k in state.info
         }
-        if "final_obs" in entries:
-            entries["final_obs"] = {k: v.reshape(*n, -1) for k, v in info["final_obs"].items()}
-        obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
+        if "final_obs" in info_entries:
+            info_entries["final_obs"] = {k: v.reshape(*batch_shape, -1) for k, v in info["final_obs"].items()}
+        obs = {k: v.reshape(*batch_shape, -1) for k, v in obs.items()}
         images = {name: obs.pop(name) for name in state.record.images}
-        return state.replace(obs=obs, images=images, reward=jnp.broadcast_to(reward[:, None], n), info=entries)
+        return state.replace(
+            obs=obs, images=images, reward=jnp.broadcast_to(reward[:, None], batch_shape), info=info_entries
+        )
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all worlds; return observations, rewards, ``terminated``, ``truncated`` and infos.

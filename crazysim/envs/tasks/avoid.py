@@ -116,9 +116,9 @@ class Avoid(Task):
         )
         size = CELL_WIDTH * np.array([N_CELLS_ALONG, n_cells_across])
         arena_half_size = np.array([size[0] / 2 + FIELD_GAP + START_JITTER + 0.5, size[1] / 2 + 0.5])
-        row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
+        y = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
         goals = np.stack(
-            [np.full(n_drones, size[0] / 2 + FIELD_GAP + START_JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1
+            [np.full(n_drones, size[0] / 2 + FIELD_GAP + START_JITTER), y, np.full(n_drones, HEIGHT / 2)], axis=-1
         )
         return Field(n_cells_across, size, arena_half_size, goals)
 

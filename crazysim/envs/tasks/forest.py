@@ -148,14 +148,14 @@ class Forest(Task):
         """Return drones in flight in front of a new forest."""
         n_drones, dtype = data.core.n_drones, data.states.pos.dtype
         x = draw(key, n_drones, start=3, goal=3, rpy=3, vel=3)
-        start, goal, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
-        row = np.zeros((n_drones, 3))
-        row[:, 1], row[:, 2] = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2), HEIGHT
+        start_shift, goal_shift, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
+        mean_pos = np.zeros((n_drones, 3))
+        mean_pos[:, 1], mean_pos[:, 2] = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2), HEIGHT
         jitter = np.array([START_JITTER[0], START_JITTER[1] if n_drones == 1 else 0.2, START_JITTER[2]])
         data = self.trees(n_drones).sample_layout(data, jax.random.fold_in(key, 1))
-        start_pos = (row + jitter * start).astype(dtype)
+        start_pos = (mean_pos + jitter * start_shift).astype(dtype)
         data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
-        goal = (row + jitter * goal + np.array([self.length + EDGE_DISTANCE, 0.0, 0.0])).astype(dtype)
+        goal = (mean_pos + jitter * goal_shift + np.array([self.length + EDGE_DISTANCE, 0.0, 0.0])).astype(dtype)
         return with_record(data, passage_of(data).replace(goal=goal))
 
     def before_step(self, data: SimData) -> SimData:

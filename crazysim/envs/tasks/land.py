@@ -98,10 +98,10 @@ class Land(TouchDown):
         n_drones = data.core.n_drones
         x = draw(key, n_drones, start=3, rpy=3, vel=3, circle=1, direction=1, phase=1)
         dtype = data.states.pos.dtype
-        start, rpy, vel = (2 * x[name] - 1 for name in ("start", "rpy", "vel"))
+        start_shift, rpy, vel = (2 * x[name] - 1 for name in ("start", "rpy", "vel"))
         start_pos = (
             self.path_centres(n_drones).astype(dtype)
-            + start * np.array([1.0, 1.0, 0.4], dtype)
+            + start_shift * np.array([1.0, 1.0, 0.4], dtype)
             + np.array([0, 0, 1.0], dtype)
         )
         data = flying(data, start_pos, rotation.from_rpy(0.2 * rpy), 0.3 * vel)

@@ -165,10 +165,10 @@ class Race(Task):
 
     def before_step(self, data: SimData) -> SimData:
         record = race_of(data)
-        seen_gates, seen_obstacles = visited_objects(data, self.sensor_range)
+        visited_gates, visited_obstacles = visited_objects(data, self.sensor_range)
         record_after = record.replace(
-            gates_visited=seen_gates,
-            obstacles_visited=seen_obstacles,
+            gates_visited=visited_gates,
+            obstacles_visited=visited_obstacles,
             passed_before=record.passed,
             flight_over_before=record.flight_over,
             remaining_way_before=rules.remaining_way(data),

@@ -45,17 +45,17 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     gates_pos, gates_quat, poles = (
         jnp.broadcast_to(x, (n_drones, *x.shape)) for x in (*gates_of(data), obstacles_of(data))
     )
-    seen_gates, seen_obstacles = visited_objects(data, sensor_range)
-    n_gates, n_obstacles = seen_gates.shape[-1], seen_obstacles.shape[-1]
+    visited_gates, visited_obstacles = visited_objects(data, sensor_range)
+    n_gates, n_obstacles = visited_gates.shape[-1], visited_obstacles.shape[-1]
     nominal_pos, nominal_quat = record.nominal_pos, record.nominal_quat
     if nominal_pos is not None and nominal_quat is not None:
-        gates_pos = jnp.where(seen_gates[..., None], gates_pos, nominal_pos[:n_gates])
-        gates_quat = jnp.where(seen_gates[..., None], gates_quat, nominal_quat)
-        poles = jnp.where(seen_obstacles[..., None], poles, nominal_pos[n_gates:])
+        gates_pos = jnp.where(visited_gates[..., None], gates_pos, nominal_pos[:n_gates])
+        gates_quat = jnp.where(visited_gates[..., None], gates_quat, nominal_quat)
+        poles = jnp.where(visited_obstacles[..., None], poles, nominal_pos[n_gates:])
     matrix = rotation.matrix(s.quat)
 
-    def to_body_frame(world: Array) -> Array:
-        return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], world)
+    def to_body_frame(vector: Array) -> Array:
+        return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], vector)
 
     corners = []
     for k in (0, 1):
@@ -73,9 +73,9 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "target_gate": jnp.where(record.finished, -1, record.passed)[..., None],
         "gates_pos": gates_pos,
         "gates_quat": gates_quat,
-        "gates_visited": seen_gates,
+        "gates_visited": visited_gates,
         "obstacles_pos": poles,
-        "obstacles_visited": seen_obstacles,
+        "obstacles_visited": visited_obstacles,
         "rot": matrix,
         "vel_body": to_body_frame(s.vel[..., None, :]),
         "gate_corners": jnp.concatenate(corners, axis=-2),

@@ -37,13 +37,15 @@ class EpisodeStatistics(Wrapper):
     """
 
     def after_reset(self, state: EnvState) -> EnvState:
-        return self._record(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
+        return self._store(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
 
     def after_step(self, state: EnvState) -> EnvState:
         sums = self.recall(state)
-        return self._record(state, EpisodeSums(sums.reward + state.reward, sums.length + 1))
+        return self._store(state, EpisodeSums(sums.reward + state.reward, sums.length + 1))
 
-    def _record(self, state: EnvState, sums: EpisodeSums) -> EnvState:
+    def _store(self, state: EnvState, sums: EpisodeSums) -> EnvState:
+        """Return the state with the sums in ``info`` where the episode ended, and in the memory elsewhere."""
+
         def zero_outside(mask: Array, x: Array) -> Array:
             return jnp.where(mask, x, jnp.zeros((), x.dtype))
 
