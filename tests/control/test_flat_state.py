@@ -15,8 +15,10 @@ from crazysim.control.setpoint import Setpoint
 pytestmark = pytest.mark.usefixtures("x64")
 
 MASS, INERTIA = 0.5, np.array([[2e-3, 1e-4, 0.0], [1e-4, 3e-3, 2e-4], [0.0, 2e-4, 5e-3]])
+"""Mass, kg, and inertia, kg m^2."""
 GRAVITY = np.array([0.0, 0.0, -9.81])
 STEP = 1e-4
+"""Step of the central differences, s."""
 
 
 def wave(amplitude, rate, phase, order, t):

@@ -12,6 +12,7 @@ from crazysim.control.linear_models import drone_derivative, linearize, load_der
 pytestmark = pytest.mark.usefixtures("x64")
 
 MASS, J, LOAD, LENGTH = np.array([0.605]), np.diag([1.5e-3, 1.45e-3, 2.66e-3]), np.array([0.05]), np.array([0.4])
+"""Mass and inertia of the drone, mass of the load, and length of its rod, in SI units."""
 GRAVITY = np.array([0, 0, -9.81])
 drone = jax.jit(lambda x, u: drone_derivative(x, u, MASS, J, GRAVITY))
 load = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, GRAVITY, LOAD, LENGTH))

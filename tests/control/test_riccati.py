@@ -15,6 +15,7 @@ SOLVERS = {
 }
 GAINS = {gain: jax.jit(gain) for gain in (gain_continuous, gain_discrete)}
 SIZES = [(2, 1), (4, 2), (12, 4), (16, 4)]
+"""Numbers of states and inputs."""
 
 
 def random_problem(n, m, seed):

@@ -30,6 +30,7 @@ CASES = [
     ("state", "pid", FIRMWARE_PAIR),
     ("attitude", "mellinger", FIRMWARE_PAIR),
 ]
+"""Command level, controller and airframes."""
 COMMANDS = {
     "attitude": [0.1, 0.05, 0.2, 0.35],
     "body_rate": [0.1, 0.05, 0.2, 0.35],
@@ -37,6 +38,7 @@ COMMANDS = {
     "rotor_vel": [15000.0, 15100, 14900, 15000, 15050, 15000],
     "state": [0.3, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0],
 }
+"""Command at each level; rotor speeds are cut to the number of rotors."""
 
 
 def set_flying(sim, pos):

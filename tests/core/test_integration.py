@@ -14,7 +14,9 @@ from crazysim.core.integration import INTEGRATORS, Integrator
 from crazysim.core.stages import first_principles_derivative
 
 DURATION = 0.5
+"""Duration of every flight, s."""
 STEPS = np.array([32, 64, 128])
+"""Number of steps in this time, by drone."""
 
 
 @pytest.fixture(scope="module")

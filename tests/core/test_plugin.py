@@ -45,6 +45,7 @@ from crazysim.plugins.sensors import Barometer
 DURATION = 0.5
 STEPS = np.array([32, 64, 128])
 MASS = 0.0434
+"""Mass of a drone, kg."""
 
 
 class WakeData(PyTree):

@@ -21,6 +21,7 @@ from crazysim.errors import EngineWarning, UnknownNameError
 from crazysim.pytree import PyTree, check_axes, leaf, scopes
 
 COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
+"""Numbers of worlds, drones and members."""
 
 
 def keep_mass_stages(sim):

@@ -643,13 +643,13 @@ def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
 def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     """Lengths that are left out follow from mass and rotors: within a factor of 2.1, spheres of contact within 20%."""
     tables = plain_tables(name)
-    true = body_shape(load_airframe(tables))
+    given = body_shape(load_airframe(tables))
     derived = body_shape(load_airframe({k: v for k, v in tables.items() if k != "shape"}))
     assert set(derived) == set(TABLES["shape"])
     for key in ("plate", "battery", "arm_radius", "motor_radius", "propeller_radius"):
-        ratio = (derived[key] / true[key]).ravel()[:2]  # not the thickness of the plate
+        ratio = (derived[key] / given[key]).ravel()[:2]  # not the thickness of the plate
         assert np.all((ratio > 1 / 2.1) & (ratio < 2.1)), (key, ratio)
-    np.testing.assert_allclose(derived["collision_sphere"][3], true["collision_sphere"][3], rtol=0.2)
+    np.testing.assert_allclose(derived["collision_sphere"][3], given["collision_sphere"][3], rtol=0.2)
     assert {key: value.shape for key, value in derived.items()} == {k: v.shapes[0] for k, v in TABLES["shape"].items()}
     partly_derived = body_shape(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
     assert partly_derived["propeller_radius"] == 0.02

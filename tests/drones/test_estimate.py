@@ -13,7 +13,9 @@ from crazysim.dynamics import supported_dynamics
 QUAD = {"mass": 1.2, "propeller": 0.127, "arm": 0.12, "thrust_to_weight": 4.0}
 SMALL = {"mass": 0.25, "propeller": 0.0762, "arm": 0.07, "thrust_to_weight": 4.0}
 HEXA = {"mass": 4.0, "propeller": 0.33, "arm": 0.36, "n_rotors": 6, "thrust_to_weight": 2.4}
+"""Numbers of a quadrotor, a small one, and a hexacopter, as ``estimate_airframe`` takes them."""
 TABLE = {"throttle": [30, 60, 100], "thrust_g": [200, 600, 1200], "rpm": [10e3, 17.3e3, 24.5e3]}
+"""Measurements of a motor with its propeller."""
 
 
 def load(**numbers):
@@ -44,8 +46,8 @@ def test_every_number_has_a_source_that_is_described():
 
 def test_a_quadrotor_is_that_of_the_built_in_airframes():
     """Order and signs of the rotors: clockwise from ahead-right, which turns counter-clockwise."""
-    mine, theirs = load(**QUAD), load_airframe("cf21B_500")
-    np.testing.assert_array_equal(mine.mixing_matrix, theirs.mixing_matrix)
+    estimated, built_in = load(**QUAD), load_airframe("cf21B_500")
+    np.testing.assert_array_equal(estimated.mixing_matrix, built_in.mixing_matrix)
     assert load(**QUAD | {"layout": "+"}).value("rotors.position")[0].tolist() == [0.12, 0, 0]
     assert load(**HEXA).n_rotors == 6
 
@@ -55,24 +57,24 @@ def test_a_quadrotor_is_that_of_the_built_in_airframes():
 )
 def test_estimates_are_near_the_numbers_of_built_in_airframes(name, propeller, pitch):
     """Inertias within 45%, thrust at a speed and torque over thrust within 35%, of the built-in airframes."""
-    true = load_airframe(name)
-    mass = float(true.value("rigid_body.mass"))
-    most = float(np.sum(np.broadcast_to(true.value("rotors.thrust_max"), true.n_rotors)))
-    mine = load(
+    built_in = load_airframe(name)
+    mass = float(built_in.value("rigid_body.mass"))
+    total_thrust = float(np.sum(np.broadcast_to(built_in.value("rotors.thrust_max"), built_in.n_rotors)))
+    estimated = load(
         mass=mass,
         propeller=propeller,
-        positions=true.value("rotors.position")[:, :2],
-        spins=-true.value("rotors.yaw_torque_sign"),
-        thrust_to_weight=most / mass / 9.81,
+        positions=built_in.value("rotors.position")[:, :2],
+        spins=-built_in.value("rotors.yaw_torque_sign"),
+        thrust_to_weight=total_thrust / mass / 9.81,
         pitch=pitch,
     )
-    np.testing.assert_allclose(np.diag(mine.inertia) / np.diag(true.inertia), 1, atol=0.45)
-    np.testing.assert_allclose(mine.value("rotors.thrust_max"), true.value("rotors.thrust_max"), rtol=1e-5)
-    if "rotors.thrust_curve" not in true.values:
+    np.testing.assert_allclose(np.diag(estimated.inertia) / np.diag(built_in.inertia), 1, atol=0.45)
+    np.testing.assert_allclose(estimated.value("rotors.thrust_max"), built_in.value("rotors.thrust_max"), rtol=1e-5)
+    if "rotors.thrust_curve" not in built_in.values:
         return
-    speed = true.rotor_vel_limits.max()
+    speed = built_in.rotor_vel_limits.max()
     thrusts, torques = (
-        [float(np.polyval(a.value(f"rotors.{key}_curve")[::-1], speed)) for a in (mine, true)]
+        [float(np.polyval(a.value(f"rotors.{key}_curve")[::-1], speed)) for a in (estimated, built_in)]
         for key in ("thrust", "torque")
     )
     np.testing.assert_allclose(thrusts[0] / thrusts[1], 1, atol=0.35)
@@ -100,10 +102,10 @@ def test_a_motor_table_gives_thrust_and_curves(tmp_path):
 
 
 def test_given_numbers_replace_estimates():
-    mine = load(**QUAD, inertia=[4e-3, 5e-3, 8e-3], time_constant=0.03, cells=6, capacity=1.3, resistance=0.04)
-    np.testing.assert_allclose(mine.value("rigid_body.inertia"), [4e-3, 5e-3, 8e-3])
-    assert rotor_rate(mine) == pytest.approx(1 / 0.03, rel=1e-5)
-    assert [float(mine.value(f"battery.{key}")) for key in ("cells", "capacity", "resistance")] == [6, 1.3, 0.04]
+    estimated = load(**QUAD, inertia=[4e-3, 5e-3, 8e-3], time_constant=0.03, cells=6, capacity=1.3, resistance=0.04)
+    np.testing.assert_allclose(estimated.value("rigid_body.inertia"), [4e-3, 5e-3, 8e-3])
+    assert rotor_rate(estimated) == pytest.approx(1 / 0.03, rel=1e-5)
+    assert [float(estimated.value(f"battery.{key}")) for key in ("cells", "capacity", "resistance")] == [6, 1.3, 0.04]
 
 
 @pytest.mark.parametrize(

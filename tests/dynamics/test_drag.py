@@ -15,6 +15,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 vectors = arrays(np.float64, 3, elements=st.floats(-30, 30))
 quats = arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 0.1)
 D = np.diag([-0.02, -0.03, -0.05])
+"""Drag matrix in the body frame, N s/m."""
 force = jax.jit(drag_force)
 
 

@@ -25,9 +25,9 @@ quats = unit_quats()
 def reference(quat, vel, ang_vel, cmd, rotor_vel, force, torque, airframe):
     """Return the derivatives by matrices, cross products and loops, from the numbers of the airframe's file."""
     a = airframe.value
-    turn = Rotation.from_quat(quat).as_matrix()
-    total_force = np.array(force) + turn @ np.diag(a("drag.coefficients")) @ turn.T @ vel
-    total_torque = turn.T @ torque
+    rotation = Rotation.from_quat(quat).as_matrix()
+    total_force = np.array(force) + rotation @ np.diag(a("drag.coefficients")) @ rotation.T @ vel
+    total_torque = rotation.T @ torque
     rotor_acc, momentum = [], np.zeros(3)
     for i in range(airframe.n_rotors):
         position, sign = a("rotors.position")[i], a("rotors.yaw_torque_sign")[i]
@@ -36,7 +36,7 @@ def reference(quat, vel, ang_vel, cmd, rotor_vel, force, torque, airframe):
         x, y = a("rotors.lag")[:2] if cmd[i] > rotor_vel[i] else a("rotors.lag")[2:]
         acc = x * (cmd[i] - rotor_vel[i]) + y * (cmd[i] ** 2 - rotor_vel[i] ** 2)
         rotor_acc.append(acc)
-        total_force = total_force + turn @ [0, 0, thrust]
+        total_force = total_force + rotation @ [0, 0, thrust]
         in_plane = np.array([position[0], position[1], 0.0])  # the height above the centre gives no torque to a z force
         total_torque = total_torque + np.cross(in_plane, [0, 0, thrust]) + [0, 0, sign * drag_torque]
         spin = -sign * a("rotors.inertia") * 2 * np.pi / 60
@@ -65,8 +65,8 @@ def test_derivatives_agree_with_the_same_physics_in_numpy(name, quat, vel, ang_v
     out = model(np.zeros(3), quat, vel, ang_vel, cmd, rotor_vel, force, torque, params=params)
     expected = reference(quat, vel, ang_vel, cmd, rotor_vel, force, torque, airframe)
     # Rounding of torques over an inertia of 2e-5 kg m^2, which magnifies it.
-    for value, wanted, atol in zip(out, expected, (0, 1e-11, 1e-8, 1e-8), strict=True):
-        np.testing.assert_allclose(value, wanted, rtol=1e-10, atol=atol)
+    for value, expected_value, atol in zip(out, expected, (0, 1e-11, 1e-8, 1e-8), strict=True):
+        np.testing.assert_allclose(value, expected_value, rtol=1e-10, atol=atol)
 
 
 @pytest.mark.parametrize(
@@ -88,17 +88,17 @@ def test_nothing_accelerates_at_hover(name):
 def test_limits_of_rotor_speed_give_the_limits_of_thrust(name):
     airframe = load_airframe(name)
     p = first_principles.Params.create(airframe)
-    ends = quadratic_curve(jnp.stack([p.rotor_vel_min, p.rotor_vel_max]), p.rpm2thrust)[:, 0]
+    thrust_limits = quadratic_curve(jnp.stack([p.rotor_vel_min, p.rotor_vel_max]), p.rpm2thrust)[:, 0]
     expected = [airframe.value("rotors.thrust_min"), airframe.value("rotors.thrust_max")]
-    np.testing.assert_allclose(ends, expected, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(thrust_limits, expected, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose(p.J @ p.J_inv, np.eye(3), atol=1e-12)
 
 
 def test_no_disturbance_is_a_disturbance_of_zero():
     params = first_principles.Params.create(load_airframe("cf21B_500"))
     args = (np.zeros(3), np.array([0.1, 0.2, 0.3, 0.9]), np.ones(3), np.ones(3), np.full(4, 1e4), np.full(4, 9e3))
-    without = model(*args, params=params)
-    for a, b in zip(without, model(*args, np.zeros(3), np.zeros(3), params=params), strict=True):
+    undisturbed = model(*args, params=params)
+    for a, b in zip(undisturbed, model(*args, np.zeros(3), np.zeros(3), params=params), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

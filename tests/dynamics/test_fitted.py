@@ -72,15 +72,17 @@ def test_up_to_100_rad_and_100_rad_a_second_the_fit_holds(cmd, rates):
     np.testing.assert_allclose(model_ang_acc(rpy, rates, cmd, params()), expected, rtol=3e-4, atol=0.05)
 
 
-@pytest.mark.parametrize("what", ["rate", "command"])
-def test_beyond_the_fit_the_model_changes_to_spring_and_damper_without_a_jump(what):
+@pytest.mark.parametrize("varied_quantity", ["rate", "command"])
+def test_beyond_the_fit_the_model_changes_to_spring_and_damper_without_a_jump(varied_quantity):
     """From 90 to 210 rad/s, or rad: half the step, half the largest change; at 200 it is the spring and damper."""
     changes, p = [], params()
-    quat, fixed = np.asarray(rotation.from_rpy(jnp.array([0.2, 0.9, 0.3]))), np.array([0.6, 0.0, 0.8])
+    quat, direction = np.asarray(rotation.from_rpy(jnp.array([0.2, 0.9, 0.3]))), np.array([0.6, 0.0, 0.8])
     for n in (20_001, 40_001):
-        varied = np.linspace(90, 210, n)[:, None] * fixed
-        rates = varied if what == "rate" else np.zeros((n, 3))
-        commands = np.concatenate([varied if what == "command" else np.zeros((n, 3)), np.full((n, 1), 0.4)], axis=-1)
+        varied = np.linspace(90, 210, n)[:, None] * direction
+        rates = varied if varied_quantity == "rate" else np.zeros((n, 3))
+        commands = np.concatenate(
+            [varied if varied_quantity == "command" else np.zeros((n, 3)), np.full((n, 1), 0.4)], axis=-1
+        )
         still = np.zeros((n, 3))
         ang_acc = model(still, np.tile(quat, (n, 1)), still, rates, commands, np.zeros((n, 4)), params=p)[2]
         changes.append(np.max(np.abs(np.diff(ang_acc, axis=0))))
@@ -130,7 +132,7 @@ def test_saturate_limits_the_thrust_only():
     np.testing.assert_allclose(out[:, 3], [0, 0, low, 0.3, high])
 
 
-def over_the_top(n, first=79.0, last=101.0):
+def attitudes_over_vertical(n, first=79.0, last=101.0):
     """Return attitudes that pitch over the vertical, with some roll and yaw, as quaternions. (n, 4)"""
     pitch = jnp.deg2rad(jnp.linspace(first, last, n))
     return rotation.from_rpy(jnp.stack([jnp.full(n, 0.2), pitch, jnp.full(n, 0.3)], axis=-1))
@@ -143,7 +145,7 @@ def test_fault_04_angular_acceleration_is_continuous_and_bounded_over_90_degrees
     ang_vel, cmd = np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.2, -0.3, 0.4])
     changes = []
     for n in (20_001, 40_001):
-        quats = over_the_top(n, 79.0 * sign, 101.0 * sign)
+        quats = attitudes_over_vertical(n, 79.0 * sign, 101.0 * sign)
         still, rates, commands = np.zeros((n, 3)), np.tile(ang_vel, (n, 1)), np.tile(cmd, (n, 1))
         ang_acc = model(still, quats, still, rates, commands, np.zeros((n, 4)), params=params(dynamics))[2]
         assert np.all(np.isfinite(ang_acc))
@@ -164,8 +166,8 @@ def test_fault_04_angular_acceleration_is_bounded_for_every_attitude(quat, ang_v
 
 
 def test_law_07_gradients_are_finite_over_90_degrees():
-    """Law 7, with the vertical itself, exactly and to either side of it, and at both ends of the handover."""
-    quats = over_the_top(2001)
+    """Law 7, with the vertical itself, exactly and to either side of it, and where the model changes from the fit."""
+    quats = attitudes_over_vertical(2001)
     half = np.sqrt(0.5)
     exact = np.array([[0, half, 0, half], [0, -half, 0, half], [0.5, 0.5, 0.5, 0.5], [-0.5, 0.5, 0.5, 0.5]])
     for dtype in (jnp.float64, jnp.float32):
@@ -182,7 +184,7 @@ def test_law_07_gradients_are_finite_over_90_degrees():
             assert np.max(np.abs(values)) < 1e6
 
 
-def test_beyond_the_handover_the_drone_is_pulled_to_its_commanded_attitude():
+def test_beyond_the_fit_the_drone_is_pulled_to_its_commanded_attitude():
     """At exactly 90 degrees, at rest: the spring turns the shortest way to level, about -y."""
     half = np.sqrt(0.5)
     quat = np.array([0, half, 0, half])

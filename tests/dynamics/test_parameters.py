@@ -13,6 +13,7 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.sim.sim import rotor_vel_limits
 
 COMMON = {"gravity_vec": (3,), "mass": (), "J": (3, 3), "J_inv": (3, 3), "thrust_min": (), "thrust_max": ()}
+"""Shapes of the parameters of all models."""
 SHAPES = {
     "first_principles": {
         "L": (), "prop_inertia": (), "rpm2thrust": (3,), "rpm2torque": (3,), "rotor_dyn_coef": (4,),
@@ -59,9 +60,9 @@ def test_tables_of_the_controller():
     assert set(params) == {"core", "state2attitude", "attitude2force_torque", "body_rate2force_torque"}
     assert float(params["core"]["mass"]) == 0.029
     np.testing.assert_array_equal(params["attitude2force_torque"]["kR"], [70000, 70000, 60000])
-    own = load_control_fn_params(state2attitude, "cf2x_L250")
-    assert float(own["thrust_max"]) == 0.12
-    np.testing.assert_array_equal(own["kp"], [0.4, 0.4, 1.25])
+    fn_params = load_control_fn_params(state2attitude, "cf2x_L250")
+    assert float(fn_params["thrust_max"]) == 0.12
+    np.testing.assert_array_equal(fn_params["kp"], [0.4, 0.4, 1.25])
     assert "rpm2thrust" not in load_control_params("mellinger", "hb_x500")["core"]
 
 

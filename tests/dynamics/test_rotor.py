@@ -27,7 +27,9 @@ pytestmark = pytest.mark.usefixtures("x64")
 speeds = arrays(np.float64, 4, elements=st.floats(0, 25_000))
 vectors = arrays(np.float64, 3, elements=st.floats(-20, 20))
 SIGN = np.array([-1.0, 1.0, -1.0, 1.0])
+"""Sign of the yaw torque of each rotor."""
 LAG = np.array([[14.0, 1.1e-4, 6.0, 3.2e-4]])
+"""Linear and quadratic coefficients of a rotor that speeds up, then of one that slows down."""
 
 
 def test_rotor_acceleration_by_hand():

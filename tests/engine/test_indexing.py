@@ -67,6 +67,7 @@ ROWS = "lax.ScatterDimensionNumbers((0,), (0,), (0,))"
 BATCHED = "lax.ScatterDimensionNumbers((), (1,), (1,), (0,), (0,))"
 ELEMENTS = "lax.GatherDimensionNumbers((), (1,), (1,), (0,), (0,))"
 SLICES = "lax.GatherDimensionNumbers((1,), (), (0,))"
+"""Dimension numbers of scatters and gathers, as code of the generated programs."""
 MODES = ("clip", "fill", "promise_in_bounds")
 INDICES = {"clip": "v1", "fill": "v1", "promise_in_bounds": "jnp.clip(v1, 0, 1)"}
 

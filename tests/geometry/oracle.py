@@ -123,8 +123,8 @@ def overlap_depths(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40
     def depth(n):
         return support(a, -n @ rot) + support(b, n) - np.sum(n * pos[:, None], axis=-1)
 
-    everywhere = depth(np.broadcast_to(n, (len(pos), *n.shape)))
-    best = n[np.argsort(everywhere, axis=1)[:, :n_best]]
+    all_depths = depth(np.broadcast_to(n, (len(pos), *n.shape)))
+    best = n[np.argsort(all_depths, axis=1)[:, :n_best]]
     value, width = depth(best), 3 / np.sqrt(n_directions)
     for _ in range(n_rounds):
         tried = normalize(best[:, :, None] + width * rng.normal(size=(*best.shape[:2], 12, 3)))
@@ -170,8 +170,17 @@ def compile_distance_and_slopes(a, b):
     return evaluate
 
 
-def check_pair(a, b, rng, n, apart_tolerance=1e-5, shallow=1e-6, deep=1e-6):
-    """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs."""
+def check_pair(a, b, rng, n, separated_tolerance=1e-5, shallow_tolerance=1e-6, deep_tolerance=1e-6):
+    """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs.
+
+    Args:
+        a, b: Two shapes.
+        rng: Random generator of the poses of ``a``.
+        n: Number of poses.
+        separated_tolerance: Tolerance of the distances of separated shapes, m.
+        shallow_tolerance: Tolerance of depths below 0.05 m, m.
+        deep_tolerance: Tolerance of other depths, m.
+    """
     pos, quat = poses(rng, n)
     rot, evaluate = rotations(quat), compile_distance_and_slopes(a, b)
     (actual, by_pos, _), expected = evaluate(pos, rot), distances(a, b, pos, quat)
@@ -179,14 +188,14 @@ def check_pair(a, b, rng, n, apart_tolerance=1e-5, shallow=1e-6, deep=1e-6):
     counts = np.sum(is_apart), np.sum(~is_apart), np.sum(np.abs(expected) < 0.02)
     assert min(counts) > 0.01 * n, counts
     np.testing.assert_array_equal(actual > 0, is_apart)
-    np.testing.assert_allclose(actual[is_apart], expected[is_apart], atol=apart_tolerance)
+    np.testing.assert_allclose(actual[is_apart], expected[is_apart], atol=separated_tolerance)
     inside = np.flatnonzero(~is_apart)[:200]
     depth = -expected[inside] if b.kind == "plane" else overlap_depths(a, b, pos[inside], rot[inside], rng)
     # The search must not find a shorter translation, and the computed one must separate the shapes.
-    limit = np.where(depth < 0.05, shallow, deep)
+    limit = np.where(depth < 0.05, shallow_tolerance, deep_tolerance)
     assert np.all(-actual[inside] - depth < limit), np.max(-actual[inside] - depth)
-    parted = pos[inside] + by_pos[inside] * (1e-5 - actual[inside, None])
-    assert np.min(distances(a, b, parted, quat[inside])) > 0
+    separated_pos = pos[inside] + by_pos[inside] * (1e-5 - actual[inside, None])
+    assert np.min(distances(a, b, separated_pos, quat[inside])) > 0
 
 
 def check_slopes(a, b, rng, n, deepest=-np.inf):
@@ -206,14 +215,14 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
     sides = np.array([[evaluate(pos + s * h * e, rot)[0] for e in np.eye(3)] for s in (1, -1)])
     differences = (sides[0] - sides[1]).T / (2 * h)
     forward, backward = (evaluate(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
-    turning = (forward - backward) / (2 * h)
+    turn_differences = (forward - backward) / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
     smooth = smooth & (value > deepest)
     assert np.mean(smooth) > 0.4
     is_smooth_turn = smooth & (np.arange(n) >= n // 5)  # where axes are parallel the distance has a crease
     by_turn = np.sum(by_rot * (cross @ rot), axis=(1, 2))
     return np.abs(by_pos[smooth] - differences[smooth]).max(axis=1), np.abs(
-        by_turn[is_smooth_turn] - turning[is_smooth_turn]
+        by_turn[is_smooth_turn] - turn_differences[is_smooth_turn]
     )
 
 

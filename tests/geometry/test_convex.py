@@ -11,13 +11,21 @@ from crazysim.geometry.shapes import N_SIZES
 
 PAIRS = [(a, b) for a in ("capsule", "box") for b in ("cylinder", "ellipsoid", "mesh")] + [("box", "box")]
 N = 1250
-DEEP = {("capsule", "ellipsoid"): 1e-2}
-"""Tolerance of the depth of a deep overlap, m."""
+DEEP_TOLERANCES = {("capsule", "ellipsoid"): 1e-2}
+"""Tolerances of the depths of deep overlaps of some pairs, m."""
 
 
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_convex_pairs(x64, rng, a, b):
-    check_pair(DRONES[a], SHAPES[b], rng, N, apart_tolerance=1e-6, shallow=1e-3, deep=DEEP.get((a, b), 1e-3))
+    check_pair(
+        DRONES[a],
+        SHAPES[b],
+        rng,
+        N,
+        separated_tolerance=1e-6,
+        shallow_tolerance=1e-3,
+        deep_tolerance=DEEP_TOLERANCES.get((a, b), 1e-3),
+    )
 
 
 @pytest.mark.parametrize("a, b", PAIRS)
@@ -41,19 +49,21 @@ def test_float32_errs_by_little(rng, a, b):
     found, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
     with jax.enable_x64(True):
         exact, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(pos, rot)
-    size = 1 + np.linalg.norm(pos, axis=1)
-    assert np.max(np.abs(found - exact) / size) < 1e-3
-    clear = np.abs(exact) > 2e-5 * size
-    np.testing.assert_array_equal(found[clear] > 0, exact[clear] > 0)
+    scale = 1 + np.linalg.norm(pos, axis=1)
+    assert np.max(np.abs(found - exact) / scale) < 1e-3
+    is_clear = np.abs(exact) > 2e-5 * scale
+    np.testing.assert_array_equal(found[is_clear] > 0, exact[is_clear] > 0)
 
 
 def test_law_01_one_drone_then_many(x64, rng):
     pos, quat = poses(rng, N)
     rot, pair = rotations(quat), (DRONES["capsule"], SHAPES["mesh"])
-    many = compile_distance_and_slopes(*pair)(pos, rot)[0]
+    batch = compile_distance_and_slopes(*pair)(pos, rot)[0]
     for i in range(0, N, 200):  # in a batch of equal poses
-        one = compile_distance_and_slopes(*pair)(np.broadcast_to(pos[i], (N, 3)), np.broadcast_to(rot[i], (N, 3, 3)))[0]
-        np.testing.assert_allclose(one, many[i], atol=1e-6)
+        single = compile_distance_and_slopes(*pair)(
+            np.broadcast_to(pos[i], (N, 3)), np.broadcast_to(rot[i], (N, 3, 3))
+        )[0]
+        np.testing.assert_allclose(single, batch[i], atol=1e-6)
     shape = jax.eval_shape(lambda p, r: distance(*pair, p, r), jnp.zeros((2, 4, 3)), jnp.zeros((2, 4, 3, 3)))
     assert shape.shape == (2, 4)
 

@@ -76,8 +76,8 @@ def test_distance_of_a_sphere_equals_that_of_mujoco(x64, rng, kind):
     found = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
     expected = distances(drone, SHAPES[kind], pos, quat)
     assert_same_signs(found, expected)
-    known = expected > 0 if kind in ("ellipsoid", "mesh") else slice(None)  # MuJoCo's depths in these are rough
-    np.testing.assert_allclose(found[known], expected[known], atol=1e-5)
+    is_compared = expected > 0 if kind in ("ellipsoid", "mesh") else slice(None)  # MuJoCo's depths in these are rough
+    np.testing.assert_allclose(found[is_compared], expected[is_compared], atol=1e-5)
 
 
 PAIRS = [
@@ -140,9 +140,9 @@ def test_float32_errs_by_rounding_only(rng, kind):
 def test_law_01_one_drone_then_many(rng, kind):
     """Distances and gradients of all points at once equal those of each point by itself."""
     points = (0.5 * rng.uniform(-1, 1, (N, 3))).astype(np.float32).astype(float)
-    many, slopes = evaluate_points(kind, points)
-    one, slope = evaluate_points(kind, points, one_by_one=True)
-    np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-14)
+    batch, slopes = evaluate_points(kind, points)
+    single, slope = evaluate_points(kind, points, one_by_one=True)
+    np.testing.assert_allclose(batch, single, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(slopes, slope, atol=1e-9)
     np.testing.assert_allclose(
         evaluate_points(kind, points[:12], np.float32, one_by_one=True)[1], slope[:12], atol=1e-4
@@ -166,9 +166,9 @@ def test_law_08_gradient_equals_central_differences_and_has_length_one(rng, kind
 def test_second_derivatives_of_an_ellipsoid_equal_differences(x64, rng):
     """The gradient is a contact normal, so the derivative of a contact force is a second derivative."""
     points, h = normalize(rng.normal(size=(50, 3))), 1e-5
-    one = jax.grad(lambda p: point_distance(SHAPES["ellipsoid"], p))
+    gradient = jax.grad(lambda p: point_distance(SHAPES["ellipsoid"], p))
     normal = jax.jit(jax.grad(lambda p: jnp.sum(point_distance(SHAPES["ellipsoid"], p))))
-    found = jax.jit(jax.vmap(jax.jacfwd(one)))(points)
+    found = jax.jit(jax.vmap(jax.jacfwd(gradient)))(points)
     steps = h * np.eye(3)[:, None]
     differences = normal(points + steps) - normal(points - steps)
     np.testing.assert_allclose(found, np.moveaxis(np.asarray(differences), 0, -1) / (2 * h), atol=1e-5)

@@ -19,6 +19,7 @@ point_distance = jax.jit(eager_point_distance, static_argnums=0)
 FIELD = SHAPES["hfield"]
 N = 1250
 CELL = (2 * 0.6 / 7, 2 * 0.5 / 5)
+"""Size of a cell along x and y, m."""
 
 
 def prisms():
@@ -38,9 +39,11 @@ def prisms():
 
 def distances_to_prisms(a, pos, quat):
     """Return the distance to the nearest prism, m; of a negative distance only the sign is meaningful. (n,)"""
-    bodies = prisms()
-    meshes = "".join(f'<mesh name="m{k}" vertex="{" ".join(map(str, v.ravel()))}"/>' for k, v in enumerate(bodies))
-    geoms = "".join(f'<geom type="mesh" mesh="m{k}"/>' for k in range(len(bodies)))
+    corners_of_prisms = prisms()
+    meshes = "".join(
+        f'<mesh name="m{k}" vertex="{" ".join(map(str, v.ravel()))}"/>' for k, v in enumerate(corners_of_prisms)
+    )
+    geoms = "".join(f'<geom type="mesh" mesh="m{k}"/>' for k in range(len(corners_of_prisms)))
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <option ccd_iterations="200" ccd_tolerance="1e-9"/>
@@ -51,7 +54,7 @@ def distances_to_prisms(a, pos, quat):
     for i in range(len(pos)):
         data.mocap_pos[0], data.mocap_quat[0] = pos[i], quat[i]
         mujoco.mj_kinematics(model, data)
-        moving = len(bodies)
+        moving = len(corners_of_prisms)
         out[i] = min(mujoco.mj_geomDistance(model, data, moving, k, 1.0, None) for k in range(moving))
     return out
 
@@ -67,17 +70,17 @@ def test_drones_over_a_height_field(x64, rng, kind):
     pos[:, :2] = np.clip(pos[:, :2], -0.4, 0.4) if kind != "sphere" else pos[:, :2]
     found, by_pos, _ = (x[:200] for x in compile_distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
     expected = distances_to_prisms(DRONES[kind], pos[:200], quat[:200])
-    apart = expected > 0
-    assert min(np.sum(apart & (expected < 0.1)), np.sum(~apart)) > 30
-    np.testing.assert_array_equal(found > 0, apart)
-    exact = apart & (expected < 0.08)
+    is_apart = expected > 0
+    assert min(np.sum(is_apart & (expected < 0.1)), np.sum(~is_apart)) > 30
+    np.testing.assert_array_equal(found > 0, is_apart)
+    exact = is_apart & (expected < 0.08)
     np.testing.assert_allclose(found[exact], expected[exact], atol=1e-5)
-    assert np.all(found[apart] > expected[apart] - 1e-5)  # beyond, an upper bound
+    assert np.all(found[is_apart] > expected[is_apart] - 1e-5)  # beyond, an upper bound
     np.testing.assert_allclose(np.linalg.norm(by_pos, axis=1), 1, atol=1e-6)
 
 
 def test_depth_below_a_height_field_is_that_of_the_nearest_surface(x64, rng):
-    """Lifted off the ground along the gradient by its depth, a point is on the surface, a wall or the bottom."""
+    """Moved along the gradient by its depth, a point is on the surface, a wall or the bottom."""
     points = draw_poses_near_surface(rng, N)[0]
     sphere = lambda p: compile_distance_and_slopes(DRONES["sphere"], FIELD)(p, np.tile(np.eye(3), (N, 1, 1)))  # noqa: E731
     depth, slope, _ = sphere(points)
@@ -97,8 +100,8 @@ def test_reach_by_hand(x64):
     heights[4, 7] = 1.0  # at x = 0.3, y = 0; along x the slope begins at 0.2
     field, point = hfield(heights, (0.4, 0.4, 1.0, 0.1)), np.array([0.0, 0.0, 0.9])
     np.testing.assert_allclose(point_distance(field, point), 0.9, atol=1e-12)
-    of_sphere = distance(Shape("sphere", (0.3,)), field, point, np.eye(3))
-    np.testing.assert_allclose(of_sphere, (0.2 * 10 + 0.9) / np.sqrt(101) - 0.3, atol=1e-12)
+    sphere_distance = distance(Shape("sphere", (0.3,)), field, point, np.eye(3))
+    np.testing.assert_allclose(sphere_distance, (0.2 * 10 + 0.9) / np.sqrt(101) - 0.3, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", DRONES)
@@ -109,6 +112,6 @@ def test_law_07_no_nan(kind):
 def test_law_01_one_drone_then_many(x64, rng):
     pos, quat = draw_poses_near_surface(rng, 4)
     rot = rotations(quat)
-    many = distance(DRONES["sphere"], FIELD, pos.reshape(2, 2, 3), rot.reshape(2, 2, 3, 3))
-    one = [distance(DRONES["sphere"], FIELD, p, r) for p, r in zip(pos, rot, strict=True)]
-    np.testing.assert_allclose(np.ravel(many), one, atol=1e-12)
+    batch = distance(DRONES["sphere"], FIELD, pos.reshape(2, 2, 3), rot.reshape(2, 2, 3, 3))
+    singles = [distance(DRONES["sphere"], FIELD, p, r) for p, r in zip(pos, rot, strict=True)]
+    np.testing.assert_allclose(np.ravel(batch), singles, atol=1e-12)

@@ -11,6 +11,7 @@ from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
 
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
+"""Half sizes of the two boxes, m."""
 EYE, ZERO = np.eye(3), np.zeros(3)
 N = 500
 """Pairs in each call, so that each function is compiled once for all tests."""
@@ -43,7 +44,7 @@ def contacts_of_boxes(pos, rot_a, rot_b):
     return boxes(HALF_A, pos, rot_a, HALF_B, ZERO, rot_b)
 
 
-def min_overlap(pos, rot_a, rot_b):
+def largest_separation(pos, rot_a, rot_b):
     """Return the largest separation over the 15 axes, m, computed by loops in float64."""
     axes = [*rot_a.T, *rot_b.T, *(np.cross(x, y) for x in rot_b.T for y in rot_a.T)]
     found = []
@@ -60,7 +61,7 @@ def test_boxes_overlap_where_no_axis_separates_them(rng):
     """The deepest point has the minimum overlap; if faces are preferred to edges, it is a little deeper."""
     pos, rot_a, rot_b = poses(rng, 500)
     gap = contacts_of_boxes(pos, rot_a, rot_b).gap.min(axis=1)
-    exact = np.array([min_overlap(*x) for x in zip(pos, rot_a, rot_b, strict=True)])
+    exact = np.array([largest_separation(*x) for x in zip(pos, rot_a, rot_b, strict=True)])
     touching = exact < 0
     assert 50 < touching.sum() < 450
     np.testing.assert_array_equal(gap[touching] < 0, True)
@@ -70,10 +71,10 @@ def test_boxes_overlap_where_no_axis_separates_them(rng):
 
 def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
     found = boxes(HALF_A, [0.03, 0.02, 0.139], EYE, HALF_B, ZERO, EYE)
-    near = found.gap < 1
-    points = found.point[near]
-    np.testing.assert_allclose(found.gap[near], -0.001, atol=1e-6)
-    np.testing.assert_allclose(found.normal[near], np.tile([0, 0, 1.0], (near.sum(), 1)), atol=1e-6)
+    is_contact = found.gap < 1
+    points = found.point[is_contact]
+    np.testing.assert_allclose(found.gap[is_contact], -0.001, atol=1e-6)
+    np.testing.assert_allclose(found.normal[is_contact], np.tile([0, 0, 1.0], (is_contact.sum(), 1)), atol=1e-6)
     expected = [(x, y) for x in (-0.07, 0.12) for y in (-0.03, 0.07)]
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
@@ -114,8 +115,8 @@ def test_edges_that_cross_touch_at_one_point():
     along_y = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ about_x
     height = 2 * 0.1 * np.sqrt(2) - 0.004
     found = boxes(half, [0.2, 0.3, height], about_x, half, ZERO, along_y)
-    near = np.flatnonzero(found.gap < 1)
-    assert near.tolist() == [12]
+    contacts = np.flatnonzero(found.gap < 1)
+    assert contacts.tolist() == [12]
     np.testing.assert_allclose(found.gap[12], -0.004, atol=1e-5)
     np.testing.assert_allclose(found.normal[12], [0, 0, 1], atol=1e-5)
     np.testing.assert_allclose(found.point[12], [0.0, 0.3, height / 2], atol=1e-5)

@@ -21,12 +21,12 @@ def compile_rays(kind):
     cubes of the normals.
     """
 
-    def answer(origin, direction):
+    def trace(origin, direction):
         (t, normal), pullback = jax.vjp(functools.partial(ray_distance, SHAPES[kind]), origin, direction)
         hit = jnp.isfinite(t).astype(t.dtype)
         return t, normal, pullback((hit, jnp.zeros_like(normal))), pullback((hit, 3 * normal**2))
 
-    return jax.jit(answer)
+    return jax.jit(trace)
 
 
 def trace_rays(kind, origin, direction, dtype=np.float64):
@@ -75,10 +75,10 @@ def test_float32_rays_end_on_the_surface(rng, kind):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_01_one_ray_then_many(x64, rng, kind):
-    """All rays at once, and a function of one ray mapped over them."""
+    """All rays at once give the results of a function of one ray that is mapped over them."""
     rays = draw_rays(rng)
-    each = jax.jit(jax.vmap(functools.partial(ray_distance, SHAPES[kind])))(*rays)
-    for x, y in zip(trace_rays(kind, *rays), each, strict=False):
+    one_by_one = jax.jit(jax.vmap(functools.partial(ray_distance, SHAPES[kind])))(*rays)
+    for x, y in zip(trace_rays(kind, *rays), one_by_one, strict=False):
         np.testing.assert_allclose(x, y, atol=1e-12)
     shapes = jax.eval_shape(functools.partial(ray_distance, SHAPES[kind]), *(jnp.zeros((3, 4, 3)),) * 2)
     assert [x.shape for x in shapes] == [(3, 4), (3, 4, 3)]
@@ -90,12 +90,12 @@ def test_law_08_gradient_equals_central_differences(rng, kind):
     origin, direction = draw_rays(rng)
     _, normal, (slope, _), _ = trace_rays(kind, origin, direction)
     sides = np.array([[trace_rays(kind, origin + s * h * e, direction)[0] for e in np.eye(3)] for s in (1, -1)])
-    clear = (np.abs(np.sum(normal * direction, axis=1)) > 0.05) & np.isfinite(sides).all(axis=(0, 1))
-    sides = np.moveaxis(sides[:, :, clear], 1, -1)
+    is_clear = (np.abs(np.sum(normal * direction, axis=1)) > 0.05) & np.isfinite(sides).all(axis=(0, 1))
+    sides = np.moveaxis(sides[:, :, is_clear], 1, -1)
     differences = (sides[0] - sides[1]) / (2 * h)
     smooth = np.max(np.abs(differences), axis=1) < 1e3  # not across an edge
     assert np.sum(smooth) > 1000
-    np.testing.assert_allclose(slope[clear][smooth], differences[smooth], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(slope[is_clear][smooth], differences[smooth], rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("kind", SHAPES)

@@ -10,7 +10,7 @@ Names of pairs on the command line, such as `so_rpy-state`, limit the run to tho
 
 Every flight lasts 500 steps of 2 ms in two worlds with one drone each and is sampled every 50 steps. The
 start, the command and the external force and torque are drawn from a fixed seed per world; the command,
-force and torque then stay constant. The keys of a file are `<integrator>[-slow]/<airframe>/<what>`:
+force and torque then stay constant. The keys of a file are `<integrator>[-slow]/<airframe>/<quantity>`:
 
 * `start_pos`, `start_quat`, `start_vel`, `start_ang_vel`, `start_rotor_vel`, `force`, `torque` and `command`
   have shape (2, 1, k) and say where the flight began and what drove it.

@@ -96,10 +96,10 @@ def fly(stem, variant, with_crazyflow_rk4=True):
         data = step(data, jnp.int32(int(step_count) - n_done))
         n_done = int(step_count)
         samples.append(jax.tree.map(np.asarray, data.states))
-    mine = {f: np.stack([getattr(s, f) for s in samples]) for f in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
-    theirs = {f: np.concatenate([flight[f] for flight in recorded.values()], axis=1) for f in mine}
-    noise = {f: np.max([flight[f"float32_error_{f}"] for flight in recorded.values()]) for f in mine}
-    return mine, theirs, noise
+    flown = {f: np.stack([getattr(s, f) for s in samples]) for f in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
+    reference = {f: np.concatenate([flight[f] for flight in recorded.values()], axis=1) for f in flown}
+    float32_errors = {f: np.max([flight[f"float32_error_{f}"] for flight in recorded.values()]) for f in flown}
+    return flown, reference, float32_errors
 
 
 def align_signs(quat, reference):
@@ -108,14 +108,14 @@ def align_signs(quat, reference):
 
 
 @pytest.mark.parametrize(("stem", "variant"), CASES)
-def test_float64_agrees_with_the_peer(stem, variant, x64):
+def test_float64_agrees_with_crazyflow(stem, variant, x64):
     """In float64 the two programs evaluate the same equations: position and attitude agree to 1e-6."""
-    mine, theirs, _ = fly(stem, variant)
-    assert np.max(np.abs(mine["pos"][-1] - mine["pos"][0])) > 0.01, "nothing moved: the flight shows nothing"
-    np.testing.assert_allclose(mine["pos"], theirs["pos"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(align_signs(mine["quat"], theirs["quat"]), theirs["quat"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(mine["vel"], theirs["vel"], atol=1e-5, rtol=0)
-    np.testing.assert_allclose(mine["ang_vel"], theirs["ang_vel"], atol=1e-4, rtol=0)
+    flown, reference, _ = fly(stem, variant)
+    assert np.max(np.abs(flown["pos"][-1] - flown["pos"][0])) > 0.01, "nothing moved: the flight shows nothing"
+    np.testing.assert_allclose(flown["pos"], reference["pos"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(align_signs(flown["quat"], reference["quat"]), reference["quat"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(flown["vel"], reference["vel"], atol=1e-5, rtol=0)
+    np.testing.assert_allclose(flown["ang_vel"], reference["ang_vel"], atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(("stem", "variant"), [case for case in CASES if case[1] == "euler"])
@@ -125,15 +125,15 @@ def test_float32_is_as_near_to_float64_as_that_of_crazyflow(stem, variant):
     The recorded error is the largest of all airframes and starts in one second. One unit in the last place of a
     position of 2 m (2.4e-7) per step is added, in case the errors of Crazyflow are small by chance.
     """
-    mine, theirs, noise = fly(stem, variant)
-    assert mine["pos"].dtype == np.float32
-    mine["quat"] = align_signs(mine["quat"], theirs["quat"])
+    flown, reference, float32_errors = fly(stem, variant)
+    assert flown["pos"].dtype == np.float32
+    flown["quat"] = align_signs(flown["quat"], reference["quat"])
     for field in ("pos", "quat"):
-        assert np.max(np.abs(mine[field] - theirs[field])) <= 3 * noise[field] + 500 * 2.4e-7, field
+        assert np.max(np.abs(flown[field] - reference[field])) <= 3 * float32_errors[field] + 500 * 2.4e-7, field
 
 
-def test_our_rk4_differs_from_the_peers_by_its_order_in_attitude_only(x64):
+def test_rk4_differs_from_that_of_crazyflow_by_its_order_in_attitude_only(x64):
     """The commutators in crazysim's Runge-Kutta are a correction of second order in the step, and not zero."""
-    mine, theirs, _ = fly("first_principles-attitude", "rk4", with_crazyflow_rk4=False)
-    difference = np.max(np.abs(align_signs(mine["quat"], theirs["quat"]) - theirs["quat"]))
+    flown, reference, _ = fly("first_principles-attitude", "rk4", with_crazyflow_rk4=False)
+    difference = np.max(np.abs(align_signs(flown["quat"], reference["quat"]) - reference["quat"]))
     assert 1e-9 < difference < 1e-3

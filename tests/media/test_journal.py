@@ -17,6 +17,7 @@ from crazysim.sim import Sim
 from crazysim.storage import unfinished_path
 
 CHUNKS = [(b"AAAA", b"first"), (b"BBBB", b""), (b"CCCC", bytes(range(256)))]
+"""Kind and content of each chunk."""
 
 
 @pytest.fixture
@@ -32,12 +33,12 @@ def journal_path(tmp_path):
 
 def test_a_journal_that_is_cut_off_keeps_the_chunks_before(journal_path, caplog):
     content = journal_path.read_bytes()
-    last = len(content) - CHUNK_HEADER.size - len(CHUNKS[-1][1])
-    for length in (last, last + 1, last + CHUNK_HEADER.size, len(content) - 1):
+    last_chunk_start = len(content) - CHUNK_HEADER.size - len(CHUNKS[-1][1])
+    for length in (last_chunk_start, last_chunk_start + 1, last_chunk_start + CHUNK_HEADER.size, len(content) - 1):
         journal_path.write_bytes(content[:length])
         caplog.clear()
         assert list(read_journal(journal_path)) == CHUNKS[:2]
-        assert ("cut off or damaged at byte" in caplog.text) == (length > last)
+        assert ("cut off or damaged at byte" in caplog.text) == (length > last_chunk_start)
 
 
 def test_a_damaged_chunk_ends_the_file(journal_path):

@@ -25,7 +25,7 @@ from crazysim.sim import Sim
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
 """Positions of the drone of world 1 at the start and at the end, m."""
 BOX = np.array([0.25, 0.0, 0.05])
-"""Position of the obstacle of world 0, m; it is upright in the model, and lies along x in that world."""
+"""Position of the box in world 0, m. It is upright in the model, and lies along x in that world."""
 MAGENTA, GREEN = (1, 0, 1), (0, 1, 0)
 
 
@@ -126,8 +126,8 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
     open_flight(chromium, out.as_uri())
     for fraction in (0.2, 0.8):
         scrub(chromium, fraction)
-        for color, place in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
-            expected = pixel(chromium, flight, place, 0)
+        for color, point in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
+            expected = pixel(chromium, flight, point, 0)
             np.testing.assert_allclose(chromium.find(color, expected), expected, atol=MAX_PIXEL_DISTANCE)
     rows, columns = chromium.mask(GREEN)
     assert np.ptp(columns) > 2 * np.ptp(rows), "the box lies"

@@ -19,7 +19,7 @@ POS = slice(6, 9)
 """Slice of the position in the observations, after ``ang_vel`` and ``difference_to_goal``."""
 
 
-def raises(error, fn, *args):
+def error_message(error, fn, *args):
     """Return the message of the error that a call must raise."""
     try:
         fn(*args)
@@ -34,7 +34,7 @@ def check_contract():
     assert isinstance(env, VecEnv)
     assert env.observation_space.shape == (21,)
     assert env.action_space.shape == (4,)
-    assert "reset" in raises(ConfigError, env.step, np.zeros((3, 4)))
+    assert "reset" in error_message(ConfigError, env.step, np.zeros((3, 4)))
     env.seed(3)
     first = env.reset()
     assert (first.shape, first.dtype) == ((3, 21), np.float32)
@@ -43,7 +43,7 @@ def check_contract():
     np.testing.assert_array_equal(env.reset(), first)
     np.testing.assert_array_equal(env.reset(), second)
     assert not np.allclose(first, second)
-    rewards, before = np.zeros(3), None
+    rewards, obs_before = np.zeros(3), None
     for step in range(N_STEPS):
         obs, reward, done, infos = env.step(np.zeros((3, 4), np.float32))
         assert [x.shape for x in (obs, reward, done)] == [(3, 21), (3,), (3,)]
@@ -52,22 +52,22 @@ def check_contract():
         if step < N_STEPS - 1:
             assert not done.any()
             assert infos == [{}, {}, {}]
-            before = obs
+            obs_before = obs
     assert done.all()
     for world, info in enumerate(infos):
         assert info["TimeLimit.truncated"] is True
         assert info["episode"]["l"] == N_STEPS
         np.testing.assert_allclose(info["episode"]["r"], rewards[world], rtol=1e-5)
         last = info["terminal_observation"][POS]
-        assert np.abs(last - before[world][POS]).max() < 0.02, "it is the last observation of the old episode"
+        assert np.abs(last - obs_before[world][POS]).max() < 0.02, "it is the last observation of the old episode"
         assert np.abs(last - obs[world][POS]).max() > 0.1, "the returned observation is of the new episode"
     assert not env.step(np.zeros((3, 4)))[2].any()
-    assert "of shape (3, 4), got (2, 4)" in raises(ValueError, env.step, np.zeros((2, 4)))
-    assert "world(s) [0, 1, 2]" in raises(ConfigError, env.step, np.full((3, 4), np.nan))
+    assert "of shape (3, 4), got (2, 4)" in error_message(ValueError, env.step, np.zeros((2, 4)))
+    assert "world(s) [0, 1, 2]" in error_message(ConfigError, env.step, np.full((3, 4), np.nan))
     assert env.get_attr("max_steps") == [N_STEPS] * 3
     assert env.get_attr("max_steps", 1) == [N_STEPS]
     assert not env.has_attr("colour")
-    assert "one compiled program" in raises(ConfigError, env.set_attr, "max_steps", 7)
+    assert "one compiled program" in error_message(ConfigError, env.set_attr, "max_steps", 7)
     crash = DroneVecEnv(make("hover", 2))
     crash.reset()
     done = np.zeros(2, bool)
@@ -110,16 +110,17 @@ def check_training():
     kwargs = {"log_std_init": -0.7, "net_arch": [64, 64]}
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=1024, n_epochs=4, learning_rate=1e-3, gamma=0.98,
                 seed=0, device="cpu", policy_kwargs=kwargs)  # fmt: skip
-    before, far = score(model)
-    begin = time.perf_counter()
+    reward_before, error_before = score(model)
+    start_time = time.perf_counter()
     model.learn(250_000)
-    after, near = score(model)
+    reward_after, error_after = score(model)
     print(
-        f"PPO of Stable-Baselines3, hover, 250,000 steps in {time.perf_counter() - begin:.0f} s: reward of an episode "
-        f"{before:.0f} -> {after:.0f}, distance at its end {far:.2f} m -> {near:.2f} m"
+        f"PPO of Stable-Baselines3, hover, 250,000 steps in {time.perf_counter() - start_time:.0f} s: reward of an "
+        f"episode {reward_before:.0f} -> {reward_after:.0f}, distance at its end "
+        f"{error_before:.2f} m -> {error_after:.2f} m"
     )
-    assert after > before + 50
-    assert near < 0.3
+    assert reward_after > reward_before + 50
+    assert error_after < 0.3
 
 
 def check_example():

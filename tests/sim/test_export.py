@@ -19,6 +19,7 @@ OTHER_INTEGRATORS = [("first_principles", c, "rk4") for c in ("rotor_vel", "atti
     ("so_rpy_rotor_drag", "attitude", "rk4"),
     ("first_principles", "attitude", "symplectic_euler"),
 ]
+"""Dynamics, command level and integrator."""
 assert all(integrator in INTEGRATORS for *_, integrator in OTHER_INTEGRATORS)
 
 

@@ -24,6 +24,7 @@ VEHICLES = [
     ("Mass_4", "4 5 6", "1 0 0 0"),
     ("Crazyflie_2", "0 1 1", "1 0 0 0"),
 ]
+"""Name, position and attitude of each body, as in MJCF."""
 CAR = ("Fleet1Tenth_5", "2 3 0.05", "0 0 0 1")
 
 
@@ -42,8 +43,8 @@ def write_fleet(folder, vehicles=VEHICLES):
 
 def test_names_are_prefixes_with_numbers():
     assert build_fleet().names == ("Crazyflie_0", "Bumblebee_0", "Crazyflie_1", "Mass_0", "Mass_1")
-    own = {"base": "cf21B_500", "name": "my hexa-rotor"}
-    assert Sim(drone=[own, "crazyflie"]).names == ("MyHexaRotor_0", "Crazyflie_0")
+    airframe = {"base": "cf21B_500", "name": "my hexa-rotor"}
+    assert Sim(drone=[airframe, "crazyflie"]).names == ("MyHexaRotor_0", "Crazyflie_0")
 
 
 def test_a_view_reads_the_data():
@@ -107,9 +108,9 @@ def test_wrong_names_and_shapes_are_refused():
         UnknownNameError, match=r"got 'Crazyfly_0'. There are Crazyflie_0, Bumblebee_0, Crazyflie_1, Mas"
     ):
         sim["Crazyfly_0"]
-    many = Sim(n_drones=20)
+    large_sim = Sim(n_drones=20)
     with pytest.raises(UnknownNameError, match=r"Did you mean Crazyflie_19 or .*sim\.names has all"):
-        many["Crazyflie_190"]
+        large_sim["Crazyflie_190"]
     with pytest.raises(AttributeError, match=r"got 'mass'. Use one of \['pos', 'vel', 'cmd', 'ticks'\]"):
         _ = sim["Mass_0"].mass
     with pytest.raises(UnknownNameError, match="expected a field of 'Mass_0', got 'mass'"):

@@ -128,6 +128,7 @@ WRONG_SETTINGS = {
     "text as seed": (lambda sim: MPPI(sim, seed="a"), "as seed, got 'a'"),
     "endless noise": (lambda sim: MPPI(sim, noise=[np.inf] * 4), "noise"),
 }
+"""Functions that must fail, and a part of their message."""
 
 
 @pytest.mark.parametrize("case", WRONG_SETTINGS)

@@ -10,6 +10,7 @@ from crazysim.trajectories.approaches import closest_approaches
 from crazysim.trajectories.piece_table import PieceTable
 
 TOLERANCE = 1e-3
+"""Tolerance of the distances, m."""
 
 
 def fly_straight(begin, end, duration):

@@ -1,4 +1,7 @@
-"""Minimum-derivative interpolation, against integrals and differences."""
+"""Minimum-derivative interpolation, against integrals and differences.
+
+The cost is the integral of the square of the derivative that is minimised.
+"""
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from numpy.polynomial import Polynomial
 from crazysim.trajectories import interpolation
 
 ORDERS = [2, 3, 4]
+"""Orders of the minimised derivative."""
 
 
 def random_problem(order, n_pieces, seed, spread=1.0):
@@ -45,9 +49,9 @@ def test_the_cost_is_the_integral_of_the_square(order):
 def test_other_derivatives_cost_more(order, seed):
     nodes, durations = random_problem(order, 5, seed)
     filled = interpolation.fill_derivatives(nodes, durations)
-    least = interpolation.derivative_cost(filled, durations)
+    min_cost = interpolation.derivative_cost(filled, durations)
     change = np.where(np.isnan(nodes), np.random.default_rng(seed).normal(size=nodes.shape), 0.0)
-    steps = [interpolation.derivative_cost(filled + step * change, durations) - least for step in (-1e-3, 1e-3)]
+    steps = [interpolation.derivative_cost(filled + step * change, durations) - min_cost for step in (-1e-3, 1e-3)]
     assert min(steps) > 0
     np.testing.assert_allclose(steps[0], steps[1], rtol=1e-4)  # a minimum has no slope
 
@@ -56,12 +60,12 @@ def test_other_derivatives_cost_more(order, seed):
 def test_the_gradient_with_respect_to_durations_equals_differences(order):
     nodes, durations = random_problem(order, 4, 3, 0.5)
 
-    def least(lengths):
+    def min_cost(lengths):
         return interpolation.derivative_cost(interpolation.fill_derivatives(nodes, lengths), lengths)
 
     gradient = interpolation.cost_gradient(interpolation.fill_derivatives(nodes, durations), durations)
     for k, step in enumerate(1e-6 * np.eye(4)):
-        difference = (least(durations + step) - least(durations - step)) / 2e-6
+        difference = (min_cost(durations + step) - min_cost(durations - step)) / 2e-6
         np.testing.assert_allclose(gradient[k], difference, rtol=1e-6, atol=1e-6 * np.abs(gradient).max())
 
 

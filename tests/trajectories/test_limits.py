@@ -41,8 +41,8 @@ def test_peaks_agree_with_dense_samples(seed):
             found_peak = quantity.sign * peak.value[k]
             assert dense - 1e-7 * abs(dense) - 1e-12 <= found_peak <= dense * (1 + 0.01 * np.sign(dense)) + 1e-6, name
             # Where pieces meet, the record has the derivatives of either side.
-            near = peak.time[k] + np.array([-1e-6, 0.0, 1e-6])
-            derivatives = [table.evaluate(np.full(3, k), near, order) for order in quantity.orders]
+            times_around = peak.time[k] + np.array([-1e-6, 0.0, 1e-6])
+            derivatives = [table.evaluate(np.full(3, k), times_around, order) for order in quantity.orders]
             assert np.min(np.abs(quantity.compute(*derivatives) - peak.value[k])) < 1e-3 * (1 + abs(found_peak)), name
 
 

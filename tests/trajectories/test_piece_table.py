@@ -17,6 +17,7 @@ TRAJECTORIES = [
 ]
 TRAJECTORIES[1] = TRAJECTORIES[1].replace(repeats=np.bool_(True))
 STARTS = np.array([0.5, 0.0, 2.0])
+"""Time at which each drone starts, s."""
 TABLE = PieceTable.create(TRAJECTORIES, STARTS, duration=12.0)
 STACK = Trajectory.stack(TRAJECTORIES)
 evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))

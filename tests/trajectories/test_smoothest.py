@@ -11,6 +11,7 @@ from crazysim.trajectories import interpolation, minimum_jerk, minimum_snap, smo
 RNG = np.random.default_rng(3)
 WAYPOINTS, DURATIONS = RNG.uniform(-2, 2, (6, 3)), RNG.uniform(0.6, 2.0, 5)
 METHODS = {4: minimum_snap, 3: minimum_jerk}
+"""Planner on the host for each order of the minimised derivative."""
 
 
 @pytest.mark.parametrize("order", METHODS)

@@ -30,6 +30,7 @@ WAYPOINTS = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1.5], [0, 2, 1], [-1, 0, 1.0]
 DURATIONS = np.array([1.5, 1.2, 1.4, 1.0])
 LIMITS = Limits(speed=2.0, acceleration=4.0)
 METHODS = {minimum_snap: 4, minimum_jerk: 3}
+"""Order of the derivative that each planner minimises."""
 
 
 def pieces(trajectory):
@@ -166,10 +167,10 @@ def test_ratios_of_the_durations_minimise_snap():
         scaled = snap * lengths[:, None, None] ** (np.arange(4) + 0.5)
         return np.einsum("pai,ij,paj->", scaled, weights, scaled)
 
-    least = cost(durations)
-    assert least < 0.8 * cost(DURATIONS)
+    min_cost = cost(durations)
+    assert min_cost < 0.8 * cost(DURATIONS)
     rng = np.random.default_rng(0)
-    assert all(cost(durations * np.exp(0.05 * rng.normal(size=4))) > least for _ in range(20))
+    assert all(cost(durations * np.exp(0.05 * rng.normal(size=4))) > min_cost for _ in range(20))
 
 
 def test_fixed_derivatives_are_met_and_the_others_are_free():
@@ -256,10 +257,10 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
         return ((0.9925 * radius) ** 2 - np.sum((pos - nearest) ** 2, axis=-1)).ravel()
 
     bound = {"type": "ineq", "fun": clearance}
-    least = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
+    min_cost = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
     free = cost(pieces(minimum_snap(waypoints, durations))[:, :2])
-    assert free < 0.7 * least  # the corridor matters
-    np.testing.assert_allclose(cost(found[:, :2]), least, rtol=3e-3)
+    assert free < 0.7 * min_cost  # the corridor matters
+    np.testing.assert_allclose(cost(found[:, :2]), min_cost, rtol=3e-3)
 
 
 def test_coincident_waypoints_are_allowed_with_durations():
@@ -268,19 +269,20 @@ def test_coincident_waypoints_are_allowed_with_durations():
 
 
 BENT = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+"""Waypoints of a path with a right angle."""
 
 
 @settings(max_examples=5)
 @pytest.mark.parametrize("method", METHODS)
-@given(seed=st.integers(0, 10_000), n=st.integers(2, 8), passes=st.booleans())
-def test_planned_flights_stay_between_floor_and_height(method, seed, n, passes):
+@given(seed=st.integers(0, 10_000), n=st.integers(2, 8), has_velocity=st.booleans())
+def test_planned_flights_stay_between_floor_and_height(method, seed, n, has_velocity):
     """Many waypoints are on the floor or at the height; velocities are free or fixed."""
     rng = np.random.default_rng(seed)
     waypoints = rng.uniform(-3, 3, (n, 3))
     waypoints[:, 2] = rng.choice([0.5, 0.6, 1.5, 2.0], n)
     velocities = np.full((n, 3), np.nan)
     velocities[[0, -1]] = 0.0
-    if passes and n > 2:
+    if has_velocity and n > 2:
         velocities[1] = [1.0, -1.0, 0.0]
     limits = Limits(speed=3.0, acceleration=8.0, floor=0.5, height=2.0)
     report = check(method(waypoints, limits=limits, velocities=velocities), limits)
@@ -291,9 +293,9 @@ def test_a_plan_through_high_gates_does_not_dip_below_the_floor():
     gates = [[0, 0, 1], [0, 0, 3], [1, 0, 0.8], [6, 0, 0.8], [7, 0, 3], [7, 0, 1]]
     free = minimum_snap(gates, limits=Limits(speed=3.0, floor=None))
     assert check(free, Limits(floor=None)).peaks["floor"].value < -0.1
-    bound = minimum_snap(gates, limits=Limits(speed=3.0))
-    assert check(bound, Limits()).ok
-    assert check(bound, Limits()).peaks["floor"].value < 1e-3  # the flight reaches the floor
+    limited = minimum_snap(gates, limits=Limits(speed=3.0))
+    assert check(limited, Limits()).ok
+    assert check(limited, Limits()).peaks["floor"].value < 1e-3  # the flight reaches the floor
 
 
 NAN = np.full((3, 3), np.nan)
@@ -341,33 +343,30 @@ def test_durations_times_the_factor_of_the_error_meet_the_limits():
     assert "separation" not in QUANTITIES
 
 
-CORNER = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
-
-
 @pytest.mark.parametrize(
     ("call", "name"),
     [
         (lambda: minimum_snap("abc", [1.0]), "waypoints"),
         (lambda: minimum_snap([[0, 0], [1, 1, 1]], [1.0]), "waypoints"),
-        (lambda: minimum_snap(CORNER, "ab"), "durations"),
-        (lambda: minimum_snap(CORNER, [1.0, 1.0], corridors="x"), "corridors"),
-        (lambda: minimum_snap(CORNER, [1.0, 1.0], yaw="x"), "yaw"),
-        (lambda: minimum_snap(CORNER, [1.0, 1.0], velocities="x"), "velocities"),
-        (lambda: minimum_snap(CORNER, limits=5), "limits as Limits"),
-        (lambda: spline("a", CORNER), "times"),
-        (lambda: spline([0, 1, 2], CORNER, degree=[3]), "degree 3, 5 or 7"),
+        (lambda: minimum_snap(BENT, "ab"), "durations"),
+        (lambda: minimum_snap(BENT, [1.0, 1.0], corridors="x"), "corridors"),
+        (lambda: minimum_snap(BENT, [1.0, 1.0], yaw="x"), "yaw"),
+        (lambda: minimum_snap(BENT, [1.0, 1.0], velocities="x"), "velocities"),
+        (lambda: minimum_snap(BENT, limits=5), "limits as Limits"),
+        (lambda: spline("a", BENT), "times"),
+        (lambda: spline([0, 1, 2], BENT, degree=[3]), "degree 3, 5 or 7"),
         (lambda: of_bezier([1.0], None), "control points as a list"),
         (lambda: of_bezier([1.0], [[[0, 0, 1], [0, 1]]]), "control points"),
         (lambda: check(5, Limits()), "each of one vehicle"),
-        (lambda: check(spline([0, 1, 2], CORNER), None), "limits as Limits"),
-        (lambda: check(spline([0, 1, 2], CORNER), Limits(), starts="x"), "starts"),
-        (lambda: check(spline([0, 1, 2], CORNER), Limits(), tolerance="x"), "tolerance"),
+        (lambda: check(spline([0, 1, 2], BENT), None), "limits as Limits"),
+        (lambda: check(spline([0, 1, 2], BENT), Limits(), starts="x"), "starts"),
+        (lambda: check(spline([0, 1, 2], BENT), Limits(), tolerance="x"), "tolerance"),
         (lambda: figure_eight(width="a"), "width"),
         (lambda: circle(along="no"), "along as True or False"),
         (lambda: formation.matched("a", "b"), "starts"),
         (lambda: save_csv(None, "x.csv"), "a trajectory, got None"),
         (lambda: save_samples("x.csv", 0.0, [0, 0, 0]), r"times \(n,\)"),
-        (lambda: save_samples("x.csv", [0, 1], CORNER[:2], yaw=[[0], [0]]), r"times \(n,\)"),
+        (lambda: save_samples("x.csv", [0, 1], BENT[:2], yaw=[[0], [0]]), r"times \(n,\)"),
         (lambda: save_samples("x.csv", [0, 1], [[0, 0, 1], [0, 0, np.nan]]), "finite pos"),
     ],
 )

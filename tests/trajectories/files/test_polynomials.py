@@ -169,8 +169,8 @@ def test_wrong_memories_and_trajectories_are_errors(tmp_path):
     for content in (b"", bytes(100), bytes(132)):
         with pytest.raises(ConfigError):
             unpack_poly4d(content)
-    whole = pack_compressed(random_trajectory())
-    for content in (b"", whole[:7], whole[:8], whole[:12], whole[:-4]):
+    packed = pack_compressed(random_trajectory())
+    for content in (b"", packed[:7], packed[:8], packed[:12], packed[:-4]):
         with pytest.raises(ConfigError):
             unpack_compressed(content)
     far = Trajectory.of_pieces([1.0], np.full((1, 4, 1), 33.0))
