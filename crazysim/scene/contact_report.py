@@ -161,12 +161,12 @@ def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
         return None
     if isinstance(objects, (Handle, str)):
         return (objects,)
-    listed = tuple(objects) if isinstance(objects, Iterable) else (objects,)
-    if not all(isinstance(x, (Handle, str)) for x in listed):
+    selection = tuple(objects) if isinstance(objects, Iterable) else (objects,)
+    if not all(isinstance(x, (Handle, str)) for x in selection):
         raise ConfigError(
             f"expected objects as handles or names of bodies, got {short_repr(objects)}. Use None for all, () for none."
         )
-    return listed
+    return selection
 
 
 def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data: bool = True) -> list[CollisionBody]:
@@ -178,11 +178,11 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
         require_data: True to refuse bodies whose poses are not part of the data, for use in a step.
     """
     by_name = {body.name: body for body in model.objects}
-    listed = list_objects(objects)
-    if listed is None:
+    selection = list_objects(objects)
+    if selection is None:
         names = list(by_name)
     else:
-        names = [name for x in listed for name in (x.bodies if isinstance(x, Handle) else (x,))]
+        names = [name for x in selection for name in (x.bodies if isinstance(x, Handle) else (x,))]
     for name in names:
         if name not in by_name:
             raise ConfigError(
@@ -198,7 +198,10 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
 
 
 def _group_key(body: CollisionBody) -> tuple[Any, ...]:
-    """Return a key that is equal for objects whose distances can be computed together."""
+    """Return a key that is equal for objects whose distances can be computed together.
+
+    Its first entry is True for objects that can move.
+    """
     if body.row is not None:
         return (True, body.geoms)
     kinds = tuple([(geom.shape, geom.rot is None) for geom in body.geoms])
@@ -222,7 +225,8 @@ def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
 
 
 DroneParts = Sequence[tuple[CollisionGeom, Array, Array | None]]
-"""Geoms of drones; positions, world frame, m (..., 3); True for drones that have the geom (...), None if all do."""
+"""For each geom of drones: the geom; its position on each drone, world frame, m (..., 3); True for the drones that have
+it (...), None if all do."""
 
 
 def _mask_absent(is_present: Array | None, gap: Array) -> Array:
@@ -265,21 +269,23 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
     Distances to many geoms of one shape, or to many boxes, are computed together.
     """
     gaps = []
-    for equal_geoms in _geoms_by_kind(geoms):
+    for geoms_of_kind in _geoms_by_kind(geoms):
         for part, part_pos, is_present in parts:
-            if len(equal_geoms) > MAX_LISTED_GEOMS and part_pos.ndim == 1:
-                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.from_geoms(equal_geoms))
+            if len(geoms_of_kind) > MAX_LISTED_GEOMS and part_pos.ndim == 1:
+                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.from_geoms(geoms_of_kind))
                 gaps.append(_mask_absent(is_present, gap))
-            elif len(equal_geoms) > MAX_UNROLLED_GEOMS:
+            elif len(geoms_of_kind) > MAX_UNROLLED_GEOMS:
                 gaps.append(
                     jnp.min(
-                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.from_geoms(equal_geoms), is_present),
+                        _stacked_distances(
+                            part, part_pos, drone_rot, StackedGeoms.from_geoms(geoms_of_kind), is_present
+                        ),
                         axis=-1,
                     )
                 )
             else:
                 gaps += [
-                    _mask_absent(is_present, _geom_distance(part, part_pos, drone_rot, geom)) for geom in equal_geoms
+                    _mask_absent(is_present, _geom_distance(part, part_pos, drone_rot, geom)) for geom in geoms_of_kind
                 ]
     return _minimum(gaps, parts[0][1])
 

@@ -70,9 +70,10 @@ class Handle:
 
         Args:
             data: Simulation, or one world of it in a stage.
-            pos: Positions of the bodies' frames, world frame, m. None keeps them. (3,), (n, 3) or (n_worlds, n, 3)
-            quat: Attitudes, body to world, xyzw, which are normalised. None keeps them. (4,), (n, 4) or (n_worlds, n,
-                4)
+            pos: Positions of the bodies' frames, world frame, m. None keeps the positions. (3,), (n, 3) or (n_worlds,
+                n, 3)
+            quat: Attitudes, body to world, xyzw; they are normalised. None keeps the attitudes. (4,), (n, 4) or
+                (n_worlds, n, 4)
             vel: Velocities for contact response, world frame, m/s; they do not move the objects. None sets them to
                 zero if ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
             mask: True in the worlds to change; None for all. (n_worlds,)
@@ -89,7 +90,7 @@ class Handle:
         return data.replace(objects=objects.replace(**new_arrays))
 
     def pose(self, data: SimData) -> tuple[Array, Array]:
-        """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4)."""
+        """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4); without n_worlds in a stage."""
         objects = self._objects(data)
         return _select_rows(objects.pos, self.rows), _select_rows(objects.quat, self.rows)
 

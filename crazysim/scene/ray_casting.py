@@ -139,8 +139,8 @@ def cast_rays(
 
 def _hit_points(origin: Array, direction: Array, distance: Array) -> Array:
     """Return the points at distances along rays, m, zero where a distance is infinite. (..., 3)"""
-    hit = jnp.isfinite(distance)[..., None]
-    return jnp.where(hit, origin + jnp.where(hit, distance[..., None], 0.0) * direction, 0.0)
+    is_hit = jnp.isfinite(distance)[..., None]
+    return jnp.where(is_hit, origin + jnp.where(is_hit, distance[..., None], 0.0) * direction, 0.0)
 
 
 def _hit_bodies(
@@ -265,7 +265,7 @@ def _hit_rows(
     local_origin, local_direction = ray_in_frame(row, components(origin), components(direction))
     ray_start, ray_direction = jnp.stack(local_origin, axis=-1), jnp.stack(local_direction, axis=-1)
     code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(geom_index, 0))
-    hits = []
+    surface_hits = []
     distance = jnp.full_like(local_origin[0], jnp.inf)
     for index, surface in enumerate(surfaces):
         is_selected = (geom_index >= 0) & (code == index)
@@ -276,11 +276,11 @@ def _hit_rows(
         else:
             ray_length, normal = hit_distance(shape, local_origin, local_direction), None
         distance = jnp.where(is_selected, ray_length, distance)
-        hits.append((is_selected, shape, normal))
+        surface_hits.append((is_selected, shape, normal))
 
     def normal_at(distance: Array) -> Array:
         normals = jnp.zeros_like(origin)
-        for is_selected, shape, normal in hits:
+        for is_selected, shape, normal in surface_hits:
             normal = hit_normal(shape, ray_start, ray_direction, distance) if normal is None else normal
             normals = jnp.where(is_selected[..., None], normal, normals)
         return jnp.stack([sum(row[4 + 3 * i + k] * normals[..., k] for k in range(3)) for i in range(3)], axis=-1)

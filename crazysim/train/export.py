@@ -67,7 +67,7 @@ class PolicyNumbers(NamedTuple):
     images: tuple[Image, ...]
     """Images that convolutions replace by features."""
     convolutions: Sequence[Sequence[tuple[Any, Any]]]
-    """Weights (9 n_in, n_out) and biases of the layers of each image."""
+    """Weights (9 n_in, n_out) and biases (n_out,) of the layers of each image."""
     gru: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Weights of the inputs (n_inputs, n_memory), weights of the memory (n_memory, n_memory) and biases (n_memory,) of
     each gate; empty without memory."""
