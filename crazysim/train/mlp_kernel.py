@@ -236,25 +236,28 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
         is_gradient: True for the kernel of gradients, False for the kernel of outputs.
     """
     n_warps, n_blocks = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
-    padded, layers = [-(-size // 16) * 16 for size in sizes], range(len(sizes) - 1)
-    memory = [(f"u16* w{i}", 2 * padded[i] * (padded[i + 1] + 8)) for i in layers]
-    memory += [(f"float* b{i}", 4 * padded[i + 1]) for i in layers]
+    padded_sizes, layers = [-(-size // 16) * 16 for size in sizes], range(len(sizes) - 1)
+    # Declarations of the arrays in shared memory, and their sizes, bytes.
+    memory = [(f"u16* w{i}", 2 * padded_sizes[i] * (padded_sizes[i + 1] + 8)) for i in layers]
+    memory += [(f"float* b{i}", 4 * padded_sizes[i + 1]) for i in layers]
     if is_gradient:
-        memory += [(f"u16* rows{i}", 2 * 16 * n_warps * (padded[i] + 8)) for i in layers]
-        memory += [(f"u16* below{i}", 2 * 16 * n_warps * (padded[i + 1] + 8)) for i in layers]
-    ends = list(itertools.accumulate((size for _, size in memory), initial=0))
+        memory += [(f"u16* rows{i}", 2 * 16 * n_warps * (padded_sizes[i] + 8)) for i in layers]
+        memory += [(f"u16* below{i}", 2 * 16 * n_warps * (padded_sizes[i + 1] + 8)) for i in layers]
+    offsets = list(itertools.accumulate((size for _, size in memory), initial=0))
     setup = ["int n = *count;", f"x += (size_t)blockIdx.y * n * {sizes[0]};"]
     setup += [
-        f"{name} = ({name.split()[0]})(memory + {offset});" for (name, _), offset in zip(memory, ends, strict=False)
+        f"{name} = ({name.split()[0]})(memory + {offset});" for (name, _), offset in zip(memory, offsets, strict=False)
     ]
-    body = [f"u32 a0[{padded[0] // 16}][4]; load_rows<{padded[0]}>(a0, x, row, n, {sizes[0]}, 1.0f);"]
+    body = [f"u32 a0[{padded_sizes[0] // 16}][4]; load_rows<{padded_sizes[0]}>(a0, x, row, n, {sizes[0]}, 1.0f);"]
     for i in layers:
-        shape, k, n = f"{padded[i]}, {padded[i + 1]}", sizes[i], sizes[i + 1]
+        shape, k, n = f"{padded_sizes[i]}, {padded_sizes[i + 1]}", sizes[i], sizes[i + 1]
         setup += [f"weight{i} += (size_t)blockIdx.y * {k * n}; bias{i} += (size_t)blockIdx.y * {n};"]
         setup += [f"load_layer<{shape}>(w{i}, b{i}, weight{i}, bias{i}, {k}, {n});"]
         if i < layers[-1]:
-            body += [f"u32 a{i + 1}[{padded[i + 1] // 16}][4]; apply_hidden<{shape}>(a{i + 1}, a{i}, w{i}, b{i});"]
-    epilogue, (inner, outer), width, last = [], padded[-2:], sizes[-1], layers[-1]
+            body += [
+                f"u32 a{i + 1}[{padded_sizes[i + 1] // 16}][4]; apply_hidden<{shape}>(a{i + 1}, a{i}, w{i}, b{i});"
+            ]
+    epilogue, (inner, outer), width, last = [], padded_sizes[-2:], sizes[-1], layers[-1]
     if is_gradient:
         n_weights = sum((k + 1) * n for k, n in itertools.pairwise(sizes))
         setup += [f"cotangent += (size_t)blockIdx.y * n * {width};"]
@@ -262,10 +265,10 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
         body += [f"load_rows<{outer}>(d{last}, cotangent, row, n, {width}, scale[blockIdx.y]);"]
         epilogue = [f"out += ((size_t)blockIdx.y * gridDim.x + blockIdx.x) * {n_weights};"]
         for i in layers:
-            setup += [f"Sums<{padded[i]}, {padded[i + 1]}> sums{i} = {{}};"]
+            setup += [f"Sums<{padded_sizes[i]}, {padded_sizes[i + 1]}> sums{i} = {{}};"]
             epilogue += [f"sums{i}.write(out, {sizes[i]}, {sizes[i + 1]}); out += {(sizes[i] + 1) * sizes[i + 1]};"]
         for i in reversed(layers):
-            k, n = padded[i], padded[i + 1]
+            k, n = padded_sizes[i], padded_sizes[i + 1]
             body += [f"store_rows<{k}>(rows{i}, a{i}); store_rows<{n}>(below{i}, d{i});"]
             body += [f"u32 d{i - 1}[{k // 16}][4]; reverse_layer<{k}, {n}>(d{i - 1}, d{i}, a{i}, w{i});"] if i else []
         body += ["__syncthreads();", *(f"sums{i}.add(rows{i}, below{i});" for i in layers), "__syncthreads();"]
@@ -283,7 +286,7 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
         "for (int first = blockIdx.x * 16 * WARPS; first < n; first += gridDim.x * 16 * WARPS) {",
         "int row = first + 16 * WARP;", *body, "}", *epilogue, "}",
     ]  # fmt: skip
-    return "\n".join(text), ends[-1]
+    return "\n".join(text), offsets[-1]
 
 
 def choose_mlp(network: Network, device: jax.Device, mesh: Mesh | None = None, n_seeds: int = 1) -> ApplyLayers:
