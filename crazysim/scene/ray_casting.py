@@ -408,7 +408,7 @@ class RayKernels:
     def run(
         self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets
     ) -> tuple[list[Array], str | None]:
-        """Return the results of a function of one ray for ``n`` rays, and the platform of its kernel or None."""
+        """Return the results of a function of one ray for ``n`` rays, and the platform of its kernel; None for XLA."""
         hits, platform = self._map_indices(fn, n, tables)
         has_objects = any(target.carrier == "object" for target in targets.movable_geoms)
         method = "XLA, without a kernel" if platform is None else "one kernel with a lane for each ray"

@@ -32,7 +32,8 @@ BLUR_VARIANCE = 0.3
 MAX_SLOPE = 1.3
 """Largest slope of a direction at which projections are linearised, as a multiple of the slope at the image's edge."""
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.999
-"""Alpha, the opacity of a Gaussian at a pixel, below which it is not drawn there, and largest alpha; as in splax."""
+"""Smallest and largest alpha, the opacity of a Gaussian at a pixel, as in splax. Below the smallest alpha the Gaussian
+is not drawn there."""
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance below which nothing more is drawn in a pixel (Kerbl et al. 2023)."""
 BLOCK_SIZE = 32

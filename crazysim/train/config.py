@@ -129,7 +129,7 @@ DEFAULT_RECIPES: dict[str, Recipe] = {
     "apg": Recipe("apg", n_worlds=64, config={"iterations": 200}, evaluate_every=40),
     "dagger": Recipe("dagger", n_worlds=256, evaluate_every=50),
 }
-"""Recipes by algorithm, for tasks without a recipe for it."""
+"""Recipes by algorithm, for tasks that have no recipe for this algorithm."""
 
 
 def find_recipe(task: str, algorithm: str | None = None) -> Recipe:
@@ -299,7 +299,7 @@ class TrainConfig:
         return dict(RECIPES.get(self.task, Recipe()).practice)
 
     def teacher_config(self) -> TrainConfig | None:
-        """Return the configuration of the teacher of the recipe; None if it has none, or if the run names a teacher."""
+        """Return the configuration of the recipe's teacher; None if it has none, or if the run names a teacher."""
         recipe = find_recipe(self.task, self.algorithm).teacher
         if recipe is None or self.config["teacher"]:
             return None

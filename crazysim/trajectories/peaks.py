@@ -34,7 +34,7 @@ class Quantity:
     orders: tuple[int, ...]
     """Orders of the derivatives that ``compute`` takes."""
     compute: Callable[..., Floats]
-    """Function from these derivatives of x, y, z and yaw, (..., 4) each, to the quantity (...)."""
+    """Function from derivatives of x, y, z and yaw in the order of ``orders``, (..., 4) each, to the quantity (...)."""
     sign: int = 1
     """1 if the largest value is limited, -1 if the smallest value is."""
 
@@ -50,7 +50,7 @@ def _thrust(acc: Floats) -> Floats:
 
 
 def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
-    """Return the angular speed of a drone that flies these derivatives exactly, rad/s. (...)"""
+    """Return the angular speed of a drone that flies a trajectory with these derivatives exactly, rad/s. (...)"""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
     small_batch, large_batch = BATCH_SIZES
@@ -144,7 +144,7 @@ def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
 
 
 def _find_candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
-    """Return piece and sample of each local maximum at or above its piece's threshold; one for a plateau. (n,) each"""
+    """Return piece and sample of local maxima at or above their piece's threshold; the first of a plateau. (n,) each"""
     padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
