@@ -487,6 +487,7 @@ def compilation_cache(folder: str) -> Iterator[None]:
 _n_cache_blocks = 0
 """Number of blocks with a compilation cache that are open now, of all threads."""
 _CACHE_LOCK = threading.Lock()
+"""Guards ``_n_cache_blocks`` and the closing of JAX's cache."""
 
 
 @contextlib.contextmanager

@@ -46,11 +46,11 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     )
     add("--motor-table", type=Path, metavar="FILE", help=motor_table_help)
     add("--pitch", type=float, metavar="M", help="pitch of the propellers; by default half the diameter")
-    add("--inertia", type=float, nargs=3, metavar="KGM2", help="moments; by default estimated")
-    add("--time-constant", type=float, metavar="S", help="of the rotors; by default estimated")
+    add("--inertia", type=float, nargs=3, metavar="KGM2", help="moments of inertia; by default estimated")
+    add("--time-constant", type=float, metavar="S", help="time constant of the rotors; by default estimated")
     add("--cells", type=int, metavar="N", help="battery cells in series; by default estimated")
-    add("--capacity", type=float, metavar="AH", help="of the battery, A h; by default estimated")
-    add("--resistance", type=float, metavar="OHM", help="of the whole battery; by default estimated")
+    add("--capacity", type=float, metavar="AH", help="charge of the battery, A h; by default estimated")
+    add("--resistance", type=float, metavar="OHM", help="resistance of the whole battery; by default estimated")
     add("--name", help="name of the airframe; by default the file's")
 
     text = "print what an airframe can do and what it lacks, and draw it"

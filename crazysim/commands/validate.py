@@ -34,7 +34,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "--data",
         type=Path,
         metavar="FOLDER",
-        help="folder with logs in idsia/ and nanobench/; policies/ in it keeps trainings",
+        help="folder with logs in idsia/ and nanobench/; trained policies are kept in its folder policies/",
     )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="sections; by default all")
     parser.add_argument("--out", type=Path, default=Path("validation.md"), metavar="FILE", help="page to write; its "

@@ -1,4 +1,4 @@
-"""Calls of methods of plugins by the integration: influences, derivatives of plugins' states, and constraints."""
+"""Checked calls of the methods of plugins that the integration uses: influences, derivatives and constraints."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def stack_vectors(vectors: list[Vector]) -> Vector:
 
 
 def axis_vector(axis: int, array: Array) -> Vector:
-    """Return the unit vector along an axis, with the batch shape of an array. (...)"""
+    """Return the unit vector along a coordinate axis, 0 to 2, with the batch shape of an array. (...)"""
     zero = jnp.zeros_like(array)
     return Vector(*(zero + 1 if k == axis else zero for k in range(3)))
 
