@@ -17,7 +17,7 @@ N_WORLDS, N_STEPS = 64, 20
 
 
 def run_steps(env, state, device):
-    """Return the states after each of some steps, after checking that they are on a device."""
+    """Return the state after each of ``N_STEPS`` steps, after checking that it is on a device."""
     step, states = jax.jit(env.step), []
     for seed in range(N_STEPS):
         state = step(state, random_action(state, seed))

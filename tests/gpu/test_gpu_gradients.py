@@ -19,12 +19,14 @@ ROUNDING = 1e-4
 
 
 def value_and_gradient(sim, n_steps=50, of_params=False):
-    """Return a function of states, commands and parameters to a loss and its gradient, and the point to evaluate it.
+    """Return a function and a point at which to evaluate it.
 
-    Parameters are None unless ``of_params``.
+    The function maps a tuple of states, commands and parameters to a loss and its gradient. The parameters are None
+    unless ``of_params``.
     """
     start, step = sim.data, sim.build_step_fn()
-    zeros = () if of_params else sim.step_fn.zeros(start)  # terms with a zero that may change are not left out
+    # With (), the step keeps the terms of parameters that are zero in ``start``, because the parameters vary.
+    zeros = () if of_params else sim.step_fn.zeros(start)
     level = sim.control.value
     send = getattr(F, f"{level}_control")
 
@@ -125,7 +127,7 @@ def test_tangents_equal_those_of_the_reference_on_the_cpu(n_drones):
 
 
 def test_gradients_are_equal_to_the_bit_in_any_run_and_with_little_memory(monkeypatch):
-    """With little memory, gradients are computed in intervals, and in fewer blocks of threads with more lanes each."""
+    """With little memory, gradients are computed in intervals of steps, and in fewer blocks with more lanes."""
     found = []
     for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
         monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
@@ -147,7 +149,10 @@ def test_a_vmapped_gradient_equals_gradients_one_by_one():
 
 @pytest.mark.parametrize("n_drones", [1, 12])
 def test_the_gradient_runs_where_the_state_is(n_drones):
-    """The step may be planned for another platform; CPU kernels support up to 8 drones that interact."""
+    """The step may have been planned for another platform than that of the state.
+
+    Kernels on the CPU support up to 8 drones that interact: 12 drones run without one.
+    """
     sims = {name: make_flying_sim(name, 2, n_drones, control="attitude") for name in NAMES}
     for sim in sims.values():
         insert_fn_before(sim.step_pipeline, "integration", repulsion)

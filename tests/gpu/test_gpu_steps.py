@@ -1,4 +1,4 @@
-"""Steps, their laws and queries on an accelerator, compared with the CPU."""
+"""Steps and queries of the scene on an accelerator, compared with the CPU, and laws of CONTRIBUTING.md there."""
 
 import os
 import subprocess
@@ -42,7 +42,7 @@ def test_simulations_agree_with_the_cpu(name):
 
 @pytest.mark.parametrize("n_drones", [3, 33, 256])
 def test_drones_that_act_on_each_other_fly_as_on_the_cpu(n_drones):
-    """Kernels exchange numbers within a warp, and within a block with fewer or all of its threads in use."""
+    """3 drones exchange numbers within a warp, 33 within a block with unused threads, and 256 within a full block."""
 
     def run(device):
         sim = make_flying_sim(device, 4, n_drones, [Downwash()], control="attitude")

@@ -1,4 +1,4 @@
-"""Law 3: the functional API does the same as ``Sim``, inside jit, scan, vmap and grad."""
+"""Law 3: the functional API (the core) does the same as ``Sim`` (its shell), inside jit, scan, vmap and grad."""
 
 import ast
 import importlib
@@ -111,10 +111,10 @@ def test_vmap_over_commands_is_a_loop(start):
     def run(command):
         return step(F.attitude_control(data, command), 5)
 
-    many, compiled = jax.device_get(jax.jit(jax.vmap(run))(commands)), jax.jit(run)
+    rollouts, compiled = jax.device_get(jax.jit(jax.vmap(run))(commands)), jax.jit(run)
     for i, command in enumerate(commands):
-        assert_close(jax.tree.map(lambda x, i=i: x[i], many), compiled(command))
-    spread = np.ptp(many.states.ang_vel, axis=0)
+        assert_close(jax.tree.map(lambda x, i=i: x[i], rollouts), compiled(command))
+    spread = np.ptp(rollouts.states.ang_vel, axis=0)
     assert np.all(spread.max(-1) > 1e-3)  # the commands did matter
 
 
@@ -146,10 +146,10 @@ def find_arithmetic(source):
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, (ast.BinOp, ast.AugAssign, ast.UnaryOp)):
-            types = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr)  # str | Path
-            plain = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
-            number = isinstance(node, ast.UnaryOp) and isinstance(node.operand, ast.Constant)  # -1
-            if not (types or plain or number or ast.unparse(node) in HOST_ARITHMETIC):
+            is_union = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr)  # str | Path
+            is_not = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+            is_negative_number = isinstance(node, ast.UnaryOp) and isinstance(node.operand, ast.Constant)  # -1
+            if not (is_union or is_not or is_negative_number or ast.unparse(node) in HOST_ARITHMETIC):
                 found.append(ast.unparse(node))
         elif isinstance(node, ast.Call):
             name = ast.unparse(node.func)

@@ -1,7 +1,7 @@
 """Law 5: the scene is synced when, and only when, something has changed since the last sync.
 
-No sync is computed without need, and no question is answered from an old scene. Fault 7 of Crazyflow, contacts that do
-not change after a teleport or a rebuild, is tested here.
+No sync is computed without need, and no query (contacts, an image) is answered from an old scene. Fault 7 of Crazyflow
+(see ``test_faults.py``), contacts that do not change after a teleport or a rebuild, is tested here.
 """
 
 import jax
@@ -179,7 +179,7 @@ def test_the_next_query_after_a_change_syncs_once(two_world_sim, syncs, change):
 
 
 def test_the_flag_of_the_data_follows(two_world_sim):
-    """``data.core.mjx_synced`` is set by a question, and cleared by whatever makes the scene stale."""
+    """``data.core.mjx_synced`` is set by a query, and cleared by whatever makes the scene stale."""
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     synced = two_world_sim.data
     changes = {
@@ -205,7 +205,7 @@ def test_the_flag_of_the_data_follows(two_world_sim):
 
 
 def test_the_next_query_after_an_edit_of_the_scene_syncs_once(syncs):
-    """An edit compiles the scene at the next question, and clears the one flag."""
+    """An edit compiles the scene at the next query, and clears the flag."""
     sim = Sim(n_worlds=2)
     edits = {
         "add": lambda: sim.scene.add("sphere", pos=(0.0, 0.0, 9.0)),
@@ -259,11 +259,11 @@ def test_results_of_a_sync_may_be_assigned(two_world_sim, syncs):
     assert len(syncs) <= 1
 
 
-# What does not --------------------------------------------------------------------------------------------------
+# What keeps the flag --------------------------------------------------------------------------------------------------
 
 
 def test_queries_share_a_sync_until_the_next_step(one_world_sim, syncs):
-    """Two questions after a step need one sync, and two syncs if there is a step between them."""
+    """Two queries after a step need one sync, and two syncs if there is a step between them."""
     one_world_sim.step(5)
     syncs.clear()
     one_world_sim.contacts()
@@ -303,7 +303,7 @@ def test_commands_leave_the_scene_fresh(two_world_sim, syncs):
     assert not syncs
 
 
-def test_wrong_questions_change_nothing(two_world_sim, syncs):
+def test_wrong_queries_change_nothing(two_world_sim, syncs):
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
     data, mjx_data = two_world_sim.data, two_world_sim.mjx_data
     for wrong in (
@@ -356,7 +356,7 @@ def test_no_scene_state_of_worlds_is_allocated_before_it_is_needed():
 
 
 def test_data_have_added_objects_before_the_scene_is_compiled(monkeypatch, syncs):
-    """Reading data, stepping, commands and resets compile no MuJoCo model; a question does, once for all edits.
+    """Reading data, stepping, commands and resets compile no MuJoCo model; a query does, once for all edits.
 
     The data has the objects and mocap ids that the model will have, between hand-made bodies too.
     """
@@ -483,7 +483,7 @@ class SceneMachine(RuleBasedStateMachine):
     @precondition(lambda self: hasattr(self, "ball"))
     @rule()
     def query_contacts(self):
-        assert bool(self.sim.data.core.mjx_synced) != self.changed, "the flag says whether a question syncs"
+        assert bool(self.sim.data.core.mjx_synced) != self.changed, "the flag says whether a query syncs"
         z = np.asarray(self.sim.data.states.pos[:, 0, 2]) + 0.02
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
         done = []

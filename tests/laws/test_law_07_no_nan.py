@@ -56,7 +56,7 @@ def tilt_command(data):
 
 FITTED_CASE = ("so_rpy_rotor_drag", "attitude", "auto")
 SLOW_PAIR = pytest.mark.slow("the state controller commands attitudes, which the fits follow in other cases")
-ENGINES = [
+ENGINE_CASES = [
     *((*pair, "stages") for pair in PAIRS[1:5]),
     *(
         pytest.param(
@@ -68,8 +68,10 @@ ENGINES = [
     (*PAIRS[0], "auto"),
     FITTED_CASE,
 ]
-"""Every pair of dynamics and level. Most run without an engine; the longest pipeline and one of fitted dynamics run on
-the default engine."""
+"""Dynamics, command level and engine of each case: every pair of dynamics and level.
+
+Most cases run without an engine. The longest pipeline and one of fitted dynamics run on the default engine.
+"""
 
 
 @functools.cache
@@ -103,7 +105,7 @@ def make_situations(dynamics, control, engine="auto"):
 
 @functools.cache
 def make_flight(dynamics, control, engine):
-    """Return a compiled flight: gradients of positions and velocities at its end, and the data there."""
+    """Return a compiled flight: a function to the gradient of the sum of its final states, and to the final data."""
     sim = make_situations(dynamics, control, engine)[0]
     step = build_stagewise_step(sim) if engine == "stages" else sim.build_step_fn()
 
@@ -125,7 +127,7 @@ def differentiated_inputs(data, commands):
 
 
 @pytest.mark.long("compiles the gradient of every dynamics and command level")
-@pytest.mark.parametrize("dynamics, control, engine", ENGINES)
+@pytest.mark.parametrize("dynamics, control, engine", ENGINE_CASES)
 def test_values_and_gradients_are_finite(dynamics, control, engine):
     """Law 7: every situation, every kind of dynamics and command, after 50 steps."""
     _, data, commands = make_situations(dynamics, control, engine)
@@ -231,7 +233,7 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
     assert (fastest == sim.freq).any() == (control in ("force_torque", "rotor_vel")), "some command reaches the limit"
 
 
-@pytest.mark.parametrize("dynamics, control, engine", ENGINES)
+@pytest.mark.parametrize("dynamics, control, engine", ENGINE_CASES)
 def test_a_bad_world_changes_no_other(dynamics, control, engine):
     """Law 7: NaN in world 1 changes no bit of other worlds and of their gradients, and only world 1 is flagged."""
     _, data, commands = make_situations(dynamics, control, engine)
@@ -243,8 +245,8 @@ def test_a_bad_world_changes_no_other(dynamics, control, engine):
         {"vel": (slice(None), np.inf), "ang_vel": ((0, 0), -np.inf)},
     ):
         changes = {name: np.array(getattr(states, name)) for name in bad_numbers}
-        for name, (place, value) in bad_numbers.items():
-            changes[name][1][place] = value
+        for name, (index, value) in bad_numbers.items():
+            changes[name][1][index] = value
         changes = jax.device_put(
             changes, jax.devices()[0]
         )  # on the device of the data, or the flight would be compiled again

@@ -44,10 +44,12 @@ def masses_after_resets(sim, *masks, seed=7):
 
 
 def test_a_world_draws_the_same_with_other_numbers_of_worlds(four_world_sim):
-    two = make_sim(2)
+    two_world_sim = make_sim(2)
     for n_resets in (1, 2, 3):
         masks = [None] * n_resets
-        np.testing.assert_array_equal(masses_after_resets(two, *masks), masses_after_resets(four_world_sim, *masks)[:2])
+        np.testing.assert_array_equal(
+            masses_after_resets(two_world_sim, *masks), masses_after_resets(four_world_sim, *masks)[:2]
+        )
 
 
 def test_a_world_draws_the_same_whichever_other_worlds_are_reset(four_world_sim):
@@ -101,6 +103,7 @@ def test_seed_survives_new_data(four_world_sim):
 
 
 def key_numbers(data, name="wind"):
+    """Return the numbers of the keys of a stage: of worlds (n_worlds, 2) and of drones (n_worlds, n_drones, 2)."""
     return leaf_on_host(world_keys(data, name)), leaf_on_host(drone_keys(data, name))
 
 
@@ -129,7 +132,9 @@ def test_keys_do_not_depend_on_the_time_of_another_world(four_world_sim):
 
 def test_two_devices_give_the_same_numbers_as_one(four_world_sim):
     assert len(jax.devices()) >= 2, "conftest forces four host devices"
-    split = make_sim(4, mesh=world_mesh(jax.devices()[:2]))
+    sharded_sim = make_sim(4, mesh=world_mesh(jax.devices()[:2]))
     for masks in ([None], [None, [True, False, True, False]]):
-        np.testing.assert_array_equal(masses_after_resets(split, *masks), masses_after_resets(four_world_sim, *masks))
-    assert len(split.data.params.mass.sharding.device_set) == 2
+        np.testing.assert_array_equal(
+            masses_after_resets(sharded_sim, *masks), masses_after_resets(four_world_sim, *masks)
+        )
+    assert len(sharded_sim.data.params.mass.sharding.device_set) == 2

@@ -23,9 +23,9 @@ def snapshot(tree):
 def assert_unchanged(tree, before):
     leaves = jax.tree.leaves(tree)
     assert len(leaves) == len(before) > 20
-    for x, kept in zip(leaves, before, strict=True):
+    for x, host_copy in zip(leaves, before, strict=True):
         assert not x.is_deleted()
-        np.testing.assert_array_equal(leaf_on_host(x), kept)
+        np.testing.assert_array_equal(leaf_on_host(x), host_copy)
 
 
 @pytest.mark.parametrize(
@@ -46,11 +46,11 @@ def assert_unchanged(tree, before):
 def test_held_data_stays_readable_and_unchanged(sim, operation):
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(5)
-    held, default = sim.data, sim.default_data
-    kept, kept_default = snapshot(held), snapshot(default)
+    data, default = sim.data, sim.default_data
+    copies, default_copies = snapshot(data), snapshot(default)
     operation(sim)
-    assert_unchanged(held, kept)
-    assert_unchanged(default, kept_default)
+    assert_unchanged(data, copies)
+    assert_unchanged(default, default_copies)
     assert sim.default_data is default
 
 
@@ -75,13 +75,13 @@ def test_a_command_array_stays_its_callers(sim):
 
 
 def test_default_data_survives_many_steps_and_resets(sim):
-    default, kept = sim.default_data, snapshot(sim.default_data)
+    default, copies = sim.default_data, snapshot(sim.default_data)
     for i in range(30):
         sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
         sim.step(2)
         sim.reset(np.array([True, i % 2 == 0]))
     assert sim.default_data is default
-    assert_unchanged(default, kept)
+    assert_unchanged(default, copies)
     np.testing.assert_array_equal(sim.data.states.pos[0], default.states.pos[0])
 
 

@@ -1,4 +1,4 @@
-"""Law 9 for masks: bool, one per world (or drone, or rotor), or an error; never a cast, never a broadcast."""
+"""Law 9 for masks: a mask that is not bool with one entry per world (or drone, or rotor) is an error."""
 
 import jax
 import jax.numpy as jnp

@@ -16,6 +16,7 @@ N_WORLDS, N_DRONES = 3, 2
 EIGHT, UP = figure_eight(period=4.0), line([0, 0, 1], [0, 1, 2], duration=1.0)
 START = np.array([[0.0, 0.1], [0.25, 0.0], [0.5, 1.0]])
 RATE = np.array([[1.0, 2.0], [0.5, 1.0], [1.5, 1.0]])
+"""Start times, s, and rates of the drones, which fly EIGHT and UP. (n_worlds, n_drones)"""
 evaluate = jax.jit(Trajectory.evaluate)
 
 
@@ -38,7 +39,7 @@ def flight():
     return sim, plugin, np.stack(commands)
 
 
-def expected(world, drone, t):
+def expected_setpoint(world, drone, t):
     """Return the setpoint of a drone at a time of its world, from the trajectory without the plugin."""
     rate = RATE[world, drone]
     s = jax.tree.map(np.asarray, evaluate([EIGHT, UP][drone], (t - START[world, drone]) * rate))
@@ -55,7 +56,7 @@ def test_setpoints_are_those_of_the_trajectory_at_each_tick(flight):
         for world in range(N_WORLDS):
             for drone in range(N_DRONES):
                 np.testing.assert_allclose(
-                    commands[step, world, drone], expected(world, drone, t).command(), rtol=1e-5, atol=2e-5
+                    commands[step, world, drone], expected_setpoint(world, drone, t).command(), rtol=1e-5, atol=2e-5
                 )
 
 

@@ -13,10 +13,10 @@ from crazysim.plugins.sensors import IMU, UWB, MotionCapture, OpticalFlow, TimeO
 
 ANCHORS = [(-3, -3, 0.2), (3, -3, 2.4), (3, 3, 0.2)]
 ERRORS = Triad(noise=1e-3, bias=0.01, scale=0.01, misalignment=0.02, instability=0.01, bandwidth=80.0)
-STEPS = 10
+N_STEPS = 10
 """Steps of 2 ms: two predictions of each filter, and a measurement of each sensor."""
-SMALL, DIFFERENCE = 1e-9, 1e-5
-"""Slope below which nothing is compared, and step of the differences as a multiple of the directions."""
+MIN_SLOPE, RELATIVE_STEP = 1e-9, 1e-5
+"""Largest slope that is not compared, and step of the differences as a multiple of the directions."""
 
 
 def create_filters():
@@ -56,8 +56,8 @@ def push_forward(stage):
         leaves, tree = jax.tree.flatten(data)
 
         def advance_floats(numbers):
-            rest = iter(numbers)
-            after = jax.tree.leaves(stage(tree.unflatten([next(rest) if is_float(x) else x for x in leaves])))
+            floats = iter(numbers)
+            after = jax.tree.leaves(stage(tree.unflatten([next(floats) if is_float(x) else x for x in leaves])))
             return [x for x in after if is_float(x)], after
 
         _, slopes, after = jax.jvp(advance_floats, ([x for x in leaves if is_float(x)],), (slopes,), has_aux=True)
@@ -105,19 +105,19 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
         _, slopes = jax.jvp(
             lambda x: [leaf for leaf in jax.tree.leaves(start_data(x)) if is_float(leaf)], (x,), (directions,)
         )
-        for _ in range(STEPS):
+        for _ in range(N_STEPS):
             for stage in stages:
                 data, slopes = stage(data, slopes)
         return {jax.tree_util.keystr(k): x for k, x in jax.tree.leaves_with_path(data) if is_float(x)}, slopes
 
     values, slopes = fly(start)
-    ends = [fly({k: x + h * directions[k] for k, x in start.items()})[0] for h in (DIFFERENCE, -DIFFERENCE)]
+    ends = [fly({k: x + h * directions[k] for k, x in start.items()})[0] for h in (RELATIVE_STEP, -RELATIVE_STEP)]
     compared = set()
     for (name, value), slope in zip(values.items(), slopes, strict=True):
-        difference = np.asarray(ends[0][name] - ends[1][name]) / (2 * DIFFERENCE)
+        difference = np.asarray(ends[0][name] - ends[1][name]) / (2 * RELATIVE_STEP)
         size = max(np.abs(x).max(initial=0.0) for x in (np.asarray(slope), difference))
-        rounding = 1e-15 * np.abs(value).max(initial=0.0) / DIFFERENCE
-        if size > SMALL:
+        rounding = 1e-15 * np.abs(value).max(initial=0.0) / RELATIVE_STEP
+        if size > MIN_SLOPE:
             assert np.abs(slope - difference).max() < 1e-6 * size + rounding, name
             compared.add(name)
     sensor_names = {name for name, plugin in sim.plugins.items() if hasattr(plugin, "channels")} | {"kalman", "eskf"}

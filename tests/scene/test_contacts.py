@@ -1,4 +1,4 @@
-"""Contact slots against distances from formulas, and against C MuJoCo, in many worlds at once."""
+"""MJX's contacts against distances from formulas, and against C MuJoCo, in many worlds at once."""
 
 import jax
 import mujoco

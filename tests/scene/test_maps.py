@@ -63,7 +63,7 @@ def obj():
     return f"# a test\n{vertices}vn 0 0 1\nf 1/1/1 2/1/1 3/1/1 4/1/1\nf -5//1 -4//1 -1//1\n".encode()
 
 
-FILES = {
+MAP_FILES = {
     **{f"{name}.ply": ply(CORNERS, SQUARE_AND_SIDE, name) for name in
        ("ascii", "binary_little_endian", "binary_big_endian")},
     "equal.ply": ply(CORNERS, TRIANGLES, "binary_little_endian"),
@@ -75,10 +75,10 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAP_FILES)
 def test_files_of_all_kinds_are_read(name, tmp_path):
     path = tmp_path / name
-    path.write_bytes(FILES[name])
+    path.write_bytes(MAP_FILES[name])
     points, triangles = read_map(path)
     if triangles is None:
         assert name.endswith(".pcd") or name == "cloud.ply"
@@ -88,10 +88,10 @@ def test_files_of_all_kinds_are_read(name, tmp_path):
         assert found == {tuple(map(tuple, t)) for t in CORNERS[TRIANGLES]}
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAP_FILES)
 def test_law_09_damaged_files_raise_one_kind_of_error(name, tmp_path, rng):
     """A file that is cut off, or has a changed byte, is read whole or refused by a ConfigError."""
-    path, content = tmp_path / name, FILES[name]
+    path, content = tmp_path / name, MAP_FILES[name]
     for cut in (0, 1, 5, len(content) // 2, len(content) - 9):
         path.write_bytes(content[:cut])
         if name.endswith((".obj", "text.stl")) and cut > 5:

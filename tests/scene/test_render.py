@@ -21,9 +21,10 @@ from crazysim.sim import Sim
 POSITIONS = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
 """Position of the drone of each world, m. (2, 1, 3)"""
 SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
+"""Arguments of ``render`` for the image from above."""
 
 
-def place(sim, pos):
+def set_positions(sim, pos):
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos)))
 
 
@@ -31,7 +32,7 @@ def place(sim, pos):
 def sim(opengl, plain_scene):
     """Return two worlds, each with a drone elsewhere over a plain floor, and a camera that looks straight down."""
     sim = Sim(n_worlds=2, xml_path=plain_scene)
-    place(sim, POSITIONS)
+    set_positions(sim, POSITIONS)
     yield sim
     sim.close()
 
@@ -39,13 +40,14 @@ def sim(opengl, plain_scene):
 @pytest.fixture(scope="module")
 def empty_image(sim):
     """Return the image from above without any drone in it."""
-    place(sim, POSITIONS + [100, 0, 0])
+    set_positions(sim, POSITIONS + [100, 0, 0])
     picture = sim.render(**SHOT)
-    place(sim, POSITIONS)
+    set_positions(sim, POSITIONS)
     return picture
 
 
 def difference(picture, empty_image):
+    """Return the pixels that differ from the image without drones. (height, width)"""
     return np.abs(picture.astype(int) - empty_image.astype(int)).sum(-1) > 30
 
 
@@ -74,16 +76,16 @@ def test_the_empty_image_is_plain_floor(empty_image):
     assert np.ptp(empty_image.reshape(-1, 3), axis=0).max() < 20
 
 
-def test_a_drone_that_moved_is_drawn_at_its_new_place(sim, empty_image):
+def test_a_drone_that_moved_is_drawn_at_its_new_set_positions(sim, empty_image):
     """The next image shows every change of the state."""
-    place(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
+    set_positions(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
     rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
-    place(sim, POSITIONS)
+    set_positions(sim, POSITIONS)
     np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel([0, 0.4, 0.3]), atol=1.0)
 
 
 def test_a_drone_that_rolled_shows_its_side(sim, empty_image):
-    """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, as long ahead."""
+    """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, but not shorter."""
 
     def widths(quat_xyzw):
         states = sim.data.states
@@ -91,8 +93,8 @@ def test_a_drone_that_rolled_shows_its_side(sim, empty_image):
         rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
         return np.ptp(rows), np.ptp(columns)
 
-    half = np.sqrt(0.5)
-    level, rolled, pitched = widths([0, 0, 0, 1.0]), widths([half, 0, 0, half]), widths([0, half, 0, half])
+    s = np.sqrt(0.5)
+    level, rolled, pitched = widths([0, 0, 0, 1.0]), widths([s, 0, 0, s]), widths([0, s, 0, s])
     widths([0, 0, 0, 1.0])
     assert rolled[0] < 0.6 * level[0]
     assert rolled[1] > 0.8 * level[1]
@@ -140,9 +142,9 @@ def test_the_free_camera_follows_cam_config(sim, empty_image):
     free = {"lookat": [0, 0, 0], "distance": CAMERA_HEIGHT, "azimuth": 90, "elevation": -90}
     sim.mj_model.vis.global_.fovy = FOVY
     shot = SHOT | {"camera": -1}
-    wait_for_color = difference(sim.render(**shot, cam_config=free), empty_image)
-    fixed = difference(sim.render(**SHOT), empty_image)
-    assert np.mean(wait_for_color == fixed) > 0.995
+    free_pixels = difference(sim.render(**shot, cam_config=free), empty_image)
+    fixed_pixels = difference(sim.render(**SHOT), empty_image)
+    assert np.mean(free_pixels == fixed_pixels) > 0.995
     moved = difference(sim.render(**shot, cam_config=free | {"lookat": [0.4, 0.2, 0]}), empty_image)
     rows, columns = np.nonzero(moved)
     x, y, z = POSITIONS[0, 0] - [0.4, 0.2, 0]
@@ -165,7 +167,7 @@ def test_the_onboard_camera_turns_with_the_drone(sim):
     np.testing.assert_allclose(depth[0], POSITIONS[0, 0, 2] - 0.03, atol=5e-3)  # the camera is 3 cm ahead of the centre
 
 
-# Arguments of each call (fault 12) -----------------------------------------------------------------------------------
+# Arguments of each call --------------------------------------------------------------------------------------------
 
 
 def test_every_call_uses_its_own_arguments(sim, empty_image):
@@ -277,7 +279,7 @@ def screen(tmp_path_factory):
     yield from virtual_screen(tmp_path_factory.mktemp("screen"))
 
 
-WINDOW = textwrap.dedent("""
+WINDOW_SCRIPT = textwrap.dedent("""
     import sys
     import numpy as np
     from crazysim.media import View
@@ -320,7 +322,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
     display, pixels = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": backend, "PYTHONWARNINGS": "error"}
     program = subprocess.Popen(
-        [sys.executable, "-c", WINDOW], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
+        [sys.executable, "-c", WINDOW_SCRIPT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
     )
 
     def wait_for_color(word):
@@ -346,10 +348,10 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         assert not blue.any()
         assert np.nonzero(red)[1].mean() > lit[1].mean() + 20, "x is right in a view from above"
         second, red, blue = wait_for_color("blue")
-        for picture, written in ((first, False), (second, True)):
+        for picture, has_text in ((first, False), (second, True)):
             shown = picture[lit[0].min() : lit[0].max() + 1, lit[1].min() : lit[1].max() + 1]
             for corner in (shown[-40:, -150:], shown[:40, :100]):
-                assert ((corner.max(-1) < 150).sum() > 500) == written, "letters stand on a dark ground"
+                assert ((corner.max(-1) < 150).sum() > 500) == has_text, "letters stand on a dark ground"
         assert blue.sum() > 100
         assert not red.any(), "marks are for one picture only"
         assert np.nonzero(blue)[1].mean() < lit[1].mean() - 20
@@ -363,10 +365,10 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
 
 
 CRAZYFLOW_CODE = textwrap.dedent("""
-    import crazysim.scene.mjx_scene as place
-    from crazysim.sim.sim import sync_sim2mjx as whole
+    import crazysim.scene.mjx_scene as mjx_scene
+    from crazysim.sim.sim import sync_sim2mjx as original_sync
     syncs = []
-    place.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
+    mjx_scene.sync_sim2mjx = lambda *args: syncs.append(1) or original_sync(*args)
 
     # The following code is from Crazyflow's documentation, with the name of the package replaced.
 

@@ -1,4 +1,4 @@
-"""Gaussian splats: files, frames, and images in plain JAX; the same with splax is tested on GPUs."""
+"""Gaussian splats: files, frames, and images in plain JAX. ``tests/gpu`` tests images by splax."""
 
 import sys
 import types
@@ -35,6 +35,7 @@ def draw_splats(sim):
 
 
 def gaussians_of(columns):
+    """Return the Gaussians of the columns of a file."""
     columns = {name: np.float32(x) for name, x in columns.items()}
     rest = sum(name.startswith("f_rest") for name in columns) // 3
     colors = [[columns[f"f_dc_{c}"], *(columns[f"f_rest_{c * rest + k}"] for k in range(rest))] for c in range(3)]
@@ -80,14 +81,14 @@ def test_many_splats_are_blended_from_near_to_far(sim, draw_splats, tmp_path):
     color = np.tile([0.1, 0.2, 0.3], (16, 24, 1))
     eye = jnp.float32(pos), jnp.float32(rot)
     center, (a, b, c), z, opacity = splat_images._project(g, *eye, focal_of(sim), **SIZE)
-    seen = np.asarray(splat_images._colors(g, eye[0]))
+    colors = np.asarray(splat_images._colors(g, eye[0]))
     y, x = np.mgrid[:16, :24] + 0.5
     for k in np.argsort(-np.asarray(z)):  # from far to near: each is painted over those behind it
         dx, dy = float(center[0][k]) - x, float(center[1][k]) - y
         sigma = (float(a[k]) * dx**2 + float(c[k]) * dy**2) / 2 + float(b[k]) * dx * dy
         alpha = np.minimum(0.999, float(opacity[k]) * np.exp(-sigma))
         alpha = np.where(alpha < 1 / 255, 0, alpha)[..., None]
-        color = (1 - alpha) * color + alpha * seen[k]
+        color = (1 - alpha) * color + alpha * colors[k]
     np.testing.assert_allclose(image.color[1, 1], np.clip(color, 0, 1), atol=3e-4)  # it stops at 1e-4
 
 
@@ -172,13 +173,13 @@ def test_cameras_of_a_list_have_the_images_of_their_drones(sim, draw_splats, tmp
     np.testing.assert_allclose(chosen.color[:, ::-1], image.color, atol=1e-5)
 
 
-def fake_splax(record):
-    """Return a module with the signature of splax 0.2.3, which draws with the plain renderer."""
+def fake_splax(calls):
+    """Return a module with the signature of splax 0.2.3 that draws with the plain renderer and records its calls."""
 
     def render(
         means, log_scales, quats, colors, logits, *, viewmat, background, img_shape, f, clip_thresh, render_depth
     ):
-        record.append((img_shape, f, clip_thresh, render_depth))
+        calls.append((img_shape, f, clip_thresh, render_depth))
         axes = viewmat[:3, :3] * jnp.array([[1.0], [-1.0], [-1.0]])
         pos = -viewmat[:3, :3].T @ viewmat[:3, 3]
         g = Gaussians(means, jnp.roll(quats, -1, axis=-1), log_scales, colors, logits)
@@ -191,12 +192,12 @@ def fake_splax(record):
 
 def test_splax_gets_the_cameras_of_the_plain_renderer(sim, draw_splats, tmp_path, monkeypatch):
     write_splats(tmp_path / "a.ply", n=9, n_colors=4)
-    g, record = SplatScene(tmp_path / "a.ply").gaussians, []
-    monkeypatch.setitem(sys.modules, "splax", fake_splax(record))
+    g, calls = SplatScene(tmp_path / "a.ply").gaussians, []
+    monkeypatch.setitem(sys.modules, "splax", fake_splax(calls))
     choose = splat_images._choose_renderer
     monkeypatch.setattr(splat_images, "_choose_renderer", lambda renderer, platform: choose(renderer, "gpu"))
     by_splax = sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3), renderer="splax")(sim.data, g)
-    (shape, focal, near, depth), expected = record[0], draw_splats(sim.data, g)
+    (shape, focal, near, depth), expected = calls[0], draw_splats(sim.data, g)
     assert (shape, near, depth) == ((16, 24), splat_images.MIN_DEPTH, True)
     np.testing.assert_allclose(focal, focal_of(sim), rtol=1e-6)
     for x, y in zip(jax.tree.leaves(by_splax), jax.tree.leaves(expected), strict=True):

@@ -10,7 +10,7 @@ from crazysim import ConfigError, ContactResponse, Sim
 from crazysim.core.stage import as_stages, stage
 from crazysim.engine import Step
 
-HALF = 0.02
+HALF_HEIGHT = 0.02
 """Half the height of the collision box of a cf21B_500, m."""
 GRAVITY = 9.81
 
@@ -46,7 +46,7 @@ def test_a_drone_on_the_floor_rests():
     sim = build(4)
     yaw = np.array([0, 0.3, 1.0, 2.0])
     quat = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)[:, None]
-    set_states(sim, pos=np.tile([0.3, -0.2, HALF - 1e-4], (4, 1, 1)), quat=quat)
+    set_states(sim, pos=np.tile([0.3, -0.2, HALF_HEIGHT - 1e-4], (4, 1, 1)), quat=quat)
     sim.rotor_vel_control(np.full((4, 1, 4), 0.5 * 15864.0) * np.array([0, 0, 1, 1])[:, None, None])
     sim.step(500)
     first = sim.data.states
@@ -54,26 +54,26 @@ def test_a_drone_on_the_floor_rests():
     last = sim.data.states
     assert np.abs(last.pos - first.pos).max() < 1e-5
     assert np.abs(last.quat - first.quat).max() < 1e-5
-    assert np.abs(np.asarray(last.pos)[..., 2] - HALF).max() < 1e-3
+    assert np.abs(np.asarray(last.pos)[..., 2] - HALF_HEIGHT).max() < 1e-3
     np.testing.assert_allclose(np.asarray(last.pos)[..., :2], np.tile([0.3, -0.2], (4, 1, 1)), atol=1e-4)
 
 
 def test_a_drone_takes_off_once_its_thrust_exceeds_its_weight():
     sim = Sim(control="attitude")
     sim.add(ContactResponse())
-    set_states(sim, pos=[[[0, 0, HALF]]])
+    set_states(sim, pos=[[[0, 0, HALF_HEIGHT]]])
     sim.attitude_control(np.array([[[0, 0, 0, 0.3]]]))  # less than its weight of 0.426 N
     sim.step(500)
-    assert float(sim.data.states.pos[0, 0, 2]) == pytest.approx(HALF, abs=1e-3)
+    assert float(sim.data.states.pos[0, 0, 2]) == pytest.approx(HALF_HEIGHT, abs=1e-3)
     sim.attitude_control(np.array([[[0, 0, 0, 0.55]]]))
     sim.step(500)
     assert float(sim.data.states.pos[0, 0, 2]) > 0.5
 
 
 def test_friction_stops_a_slide():
-    """After v^2 / (2 mu g), within 3%, with steps of 2 ms and the slow separation of overlaps."""
+    """The drone slides v^2 / (2 mu g), up to 3% for steps of 2 ms and the slow separation of overlaps."""
     sim = build(2, friction=0.4)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.tile(np.float32([0, 0, HALF]), (2, 1, 1))))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.tile(np.float32([0, 0, HALF_HEIGHT]), (2, 1, 1))))
     set_states(sim, vel=[[[1.0, 0, 0]], [[0, 2.0, 0]]])
     sim.step(1500)
     pos = np.asarray(sim.data.states.pos)[:, 0]
@@ -84,10 +84,10 @@ def test_friction_stops_a_slide():
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
 def test_the_height_of_a_bounce_follows_from_the_restitution(restitution):
     sim = build(restitution=restitution)
-    set_states(sim, pos=[[[0, 0, 0.5 + HALF]]])
-    z = track(sim, 600)[0][:, 0, 0, 2] - HALF
-    fell = int(np.argmax(z < 0.002))
-    apex = z[fell + 20 :].max()
+    set_states(sim, pos=[[[0, 0, 0.5 + HALF_HEIGHT]]])
+    z = track(sim, 600)[0][:, 0, 0, 2] - HALF_HEIGHT
+    first_contact = int(np.argmax(z < 0.002))
+    apex = z[first_contact + 20 :].max()
     # Within the 6 mm of the fall in one step: contact acts at the end of the step in which the drone reached the floor.
     assert apex == pytest.approx(restitution**2 * 0.5, rel=0.03, abs=0.007)
 
@@ -113,10 +113,10 @@ def test_a_contact_creates_no_energy(rng):
         plugins={"contact_response": response.replace(restitution=values, friction=2 * values[::-1] ** 2)}
     )
     quat = rng.normal(size=(n, 1, 4))
-    places = np.array([[0, 0, 0.03], [0.56, 0, 0.5], [0, 0.48, 0.5], [-0.6, 0, 0.22]])[rng.integers(0, 4, n)]
+    contact_pos = np.array([[0, 0, 0.03], [0.56, 0, 0.5], [0, 0.48, 0.5], [-0.6, 0, 0.22]])[rng.integers(0, 4, n)]
     set_states(
         sim,
-        pos=(places + rng.uniform(-0.04, 0.04, (n, 3)))[:, None],
+        pos=(contact_pos + rng.uniform(-0.04, 0.04, (n, 3)))[:, None],
         quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
         vel=2 * rng.normal(size=(n, 1, 3)),
         ang_vel=10 * rng.normal(size=(n, 1, 3)),
@@ -138,7 +138,7 @@ def course_sim():
 
 
 def test_tumbling_drones_lose_energy_as_they_bounce(course_sim, rng):
-    """Potential and kinetic energy together."""
+    """The sum of potential and kinetic energy falls."""
     sim, n = course_sim, 12
     sim.reset()
     sim.replace(ContactResponse(restitution=0.6))
@@ -189,7 +189,7 @@ def test_a_drone_lands_on_a_moving_pad_and_rides_on_it():
     set_states(sim, pos=[[[0, 0, 0.6]]])
     sim.step(600)
     states = sim.data.states
-    assert float(states.pos[0, 0, 2]) == pytest.approx(0.5 + HALF, abs=2e-3)
+    assert float(states.pos[0, 0, 2]) == pytest.approx(0.5 + HALF_HEIGHT, abs=2e-3)
     assert float(states.vel[0, 0, 0]) == pytest.approx(speed, abs=1e-3)
     assert "not fused" not in sim.explain()
 
@@ -216,16 +216,16 @@ def test_drop_and_slide_as_in_mujoco():
         mujoco.mj_step(model, data)
     pos = np.asarray(sim.data.states.pos)[0, 0]
     assert pos[2] == pytest.approx(data.qpos[2], abs=1e-3)
-    # How the impact changes the sideways velocity depends on which corner touches first: the ways agree within 10 %.
+    # How the impact changes the sideways velocity depends on which corner touches first: x agrees within 10 %.
     assert pos[0] == pytest.approx(data.qpos[0], rel=0.1)
     assert np.abs(sim.data.states.vel).max() < 1e-3
 
 
 def test_the_place_where_a_drone_stops_has_a_gradient():
-    """The derivative of that place by the speed of a throw equals the difference quotient."""
+    """The derivative of that place by the initial speed equals the difference quotient."""
     sim = build(friction=0.5)
     stages = as_stages(sim.step_pipeline)
-    data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[0, 0, HALF + 0.01]]])))
+    data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[0, 0, HALF_HEIGHT + 0.01]]])))
 
     def step(data, _):
         for apply in stages:

@@ -103,7 +103,7 @@ def test_law_07_nothing_breaks_at_the_border_of_the_terrain():
 
 
 def test_a_drone_on_a_slope_rests_with_contact_response_where_friction_holds_it():
-    """On a slope of 0.3 it rests with a friction of 0.6, not with 0.05; it turns into the plane."""
+    """On a slope of 0.3 the drone lies in the plane and rests with a friction of 0.6, and slides with 0.05."""
     slope = 0.3 * np.linspace(0, 4, 21)[None].repeat(16, axis=0)
     for friction, holds in ((0.6, True), (0.05, False)):
         sim, _ = build(slope, n_worlds=1, n_drones=1, pos=(0.5, 0.2, 0.83))
@@ -140,12 +140,12 @@ def test_loads_rest_on_terrain():
     sim.build_step_fn()
     sim.step(100)
     np.testing.assert_allclose(np.asarray(load.read(sim.data).pos)[0, 0, 2], 0.43, atol=1e-3)
-    hook = Sim(control="rotor_vel")
-    hook.data = with_states(hook.data, pos=[0.5, 0.0, 2.0])
-    hook.add(Terrain(flat(0.4), SIZE))
-    plugin = hook.add(Hook(0.01, load_at=(0.5, 0, 1.0), size=0.03, ring=0.05))
-    hook.step(600)
-    np.testing.assert_allclose(np.asarray(plugin.read(hook.data).pos)[0, 0, 2], 0.48, atol=1e-5)
+    hook_sim = Sim(control="rotor_vel")
+    hook_sim.data = with_states(hook_sim.data, pos=[0.5, 0.0, 2.0])
+    hook_sim.add(Terrain(flat(0.4), SIZE))
+    hook = hook_sim.add(Hook(0.01, load_at=(0.5, 0, 1.0), size=0.03, ring=0.05))
+    hook_sim.step(600)
+    np.testing.assert_allclose(np.asarray(hook.read(hook_sim.data).pos)[0, 0, 2], 0.48, atol=1e-5)
 
 
 def test_ground_effect_and_wind_use_the_height_above_ground():
@@ -258,11 +258,11 @@ def test_heights_can_be_replaced():
 ])  # fmt: skip
 def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, message):
     sim = Sim()
-    geoms = len(sim.scene.spec.worldbody.geoms)
+    n_geoms = len(sim.scene.spec.worldbody.geoms)
     with pytest.raises(ConfigError, match=message):
         sim.add(Terrain(*args, **kwargs))
     assert sim.data.plugins == {}
-    assert len(sim.scene.spec.worldbody.geoms) == geoms
+    assert len(sim.scene.spec.worldbody.geoms) == n_geoms
     assert "clip_floor_pos" in sim.step_pipeline
 
 

@@ -39,7 +39,7 @@ def rotor_power(rotor_vel):
 
 
 def test_voltage_and_current_under_load_by_hand():
-    """At 4 V and 0.5 ohm, 6 W are 3 V and 2 A. The most is 8 W, at half the voltage; 100 W give the same."""
+    """A battery of 4 V and 0.5 ohm supplies 6 W at 3 V and 2 A. At most it supplies 8 W, at half the voltage."""
     as_arrays = lambda *x: [np.float32([v]) for v in x]  # noqa: E731
     for power, expected in ((0, (4, 0)), (6, (3, 2)), (8, (2, 4)), (100, (2, 4))):
         np.testing.assert_allclose(
@@ -72,16 +72,18 @@ def test_energy_is_balanced():
 def test_a_low_voltage_slows_the_rotors_and_leaves_the_command():
     """The rotors settle at the airframe's largest speed times V / V_full, here V / 4 V."""
     sim = build(capacity=10.0, resistance=0.5, full_speed_voltage=4.0)
-    top = np.float32(sim.data.params.rotor_vel_max[0])
-    sim.rotor_vel_control(np.full((2, 2, 4), 1.5 * top))
+    max_rotor_vel = np.float32(sim.data.params.rotor_vel_max[0])
+    sim.rotor_vel_control(np.full((2, 2, 4), 1.5 * max_rotor_vel))
     sim.step(600)
     speed = np.asarray(sim.data.states.rotor_vel, np.float64)
     v = np.asarray(record(sim).voltage, np.float64)
     v0 = ocv(np.asarray(record(sim).charge, np.float64))
     np.testing.assert_allclose(v, 0.5 * (v0 + np.sqrt(v0**2 - 4 * 0.5 * rotor_power(speed))), rtol=1e-4)
-    np.testing.assert_allclose(speed, np.broadcast_to(v / 4.0 * top, speed.shape), rtol=1e-4)  # slow discharge
+    np.testing.assert_allclose(
+        speed, np.broadcast_to(v / 4.0 * max_rotor_vel, speed.shape), rtol=1e-4
+    )  # slow discharge
     assert v.max() < 3.9
-    np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((2, 2, 4), top))
+    np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((2, 2, 4), max_rotor_vel))
 
 
 def test_without_compensation_all_speeds_follow_the_voltage():

@@ -125,6 +125,7 @@ STAGES = (
     "battery", "downwash", "latency", "motors", "randomize_begin", "wind", "wind_field_begin", "wind_field",
     "integration",
 )  # fmt: skip
+"""Stages of all effects, and the integration, which they influence."""
 
 
 @pytest.fixture(scope="module")
@@ -201,8 +202,8 @@ def test_every_effect_is_fused(sim_with_effects):
     assert program.unfused_stages == ()
     fused = {name for s in program.fused_segments for name in s.stages}
     assert {*STAGES} <= fused
-    own = set(sim_with_effects.step_pipeline) - set(make_hovering_sim(engine="interpret").step_pipeline)
-    assert own == {*STAGES} - {"integration"}, "an effect's stages are listed in STAGES"
+    effect_stages = set(sim_with_effects.step_pipeline) - set(make_hovering_sim(engine="interpret").step_pipeline)
+    assert effect_stages == {*STAGES} - {"integration"}, "an effect's stages are listed in STAGES"
     assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "before"), ("drone", "each")]
 
 
@@ -255,8 +256,8 @@ def test_a_reset_restores_the_records_of_its_worlds_only(sim_with_effects):
 def test_law_07_values_and_gradients_are_finite(sim_with_effects):
     """Drones on the floor, at one place, upside down, nose up and at rest, with saturated commands and a failure."""
     sim = sim_with_effects
-    half = np.sqrt(0.5)
-    quat = np.array([[[0, 0, 0, 1], [0, 0, 0, 1]], [[1, 0, 0, 0], [0, half, 0, half]], [[0, 0, 0, 1], [0, 0, 0, 1]]])
+    s = np.sqrt(0.5)
+    quat = np.array([[[0, 0, 0, 1], [0, 0, 0, 1]], [[1, 0, 0, 0], [0, s, 0, s]], [[0, 0, 0, 1], [0, 0, 0, 1]]])
     pos = np.array([[[0, 0, 0], [0, 0, -0.001]], [[0, 0, 1], [0, 0, 2]], [[0, 0, 3], [0, 0, 3]]])
     data = with_states(sim.data, pos=pos, quat=quat, rotor_vel=0.0)
     command = np.stack(

@@ -1,4 +1,4 @@
-"""Downwash: a value calculated by hand, the laws of a jet, and which drones it reaches."""
+"""Downwash: speeds by hand, momentum and symmetry of the jet, and which drones it reaches."""
 
 import functools
 
@@ -18,7 +18,7 @@ POS = np.array([
     [[0, 0, 1.0], [-0.5, 0, 1.0], [0, 0, 0.5]],
     [[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0]],
 ])  # fmt: skip
-HALF = np.sqrt(0.5)
+SQRT_HALF = np.sqrt(0.5)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def sim():
     sim = Sim(n_worlds=4, n_drones=3, control="rotor_vel")
     quat = np.zeros((4, 3, 4))
     quat[..., 3] = 1.0
-    quat[2, 0] = 0, HALF, 0, HALF
+    quat[2, 0] = 0, SQRT_HALF, 0, SQRT_HALF
     sim.data = with_states(sim.data, pos=POS, quat=quat, rotor_vel=hover_rotor_state(sim.data))
     sim.add(Downwash())
     return sim
@@ -38,25 +38,25 @@ def air(sim):
     return np.asarray(air_velocity(sim, sim.data), np.float64)
 
 
-compiled = functools.cache(jax.jit)
+jit_once = functools.cache(jax.jit)
 
 
 def air_velocity(sim, data):
     """Return the velocity of the air at the drones. (n_worlds, n_drones, 3)"""
-    return np.asarray(compiled(sim.step_pipeline["downwash"])(data).plugins["downwash"].air_vel)
+    return np.asarray(jit_once(sim.step_pipeline["downwash"])(data).plugins["downwash"].air_vel)
 
 
-def jet_speed(below, off, thrust=0.0434 * 9.81):
+def jet_speed(below, radius, thrust=0.0434 * 9.81):
     """Return the speed of the jet of a Crazyflie 2.1 Brushless, d = sqrt(8) 27.5 mm = 77.8 mm, at sea level, m/s.
 
     Args:
         below: Distance below the drone, m.
-        off: Distance from the axis of the jet, m.
+        radius: Distance from the axis of the jet, m.
         thrust: Thrust of the drone, N.
     """
     d = 0.07778
     start = np.sqrt(4 * thrust / (np.pi * 1.225)) / d
-    return start / (1 + below / (5.8 * d)) / (1 + 0.41421 * (off / (0.094 * (below + 5.8 * d))) ** 2) ** 2
+    return start / (1 + below / (5.8 * d)) / (1 + 0.41421 * (radius / (0.094 * (below + 5.8 * d))) ** 2) ** 2
 
 
 def test_the_speed_of_the_jet_by_hand(air):

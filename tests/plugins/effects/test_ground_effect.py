@@ -9,6 +9,7 @@ from crazysim import ConfigError, GroundEffect, Sim
 from crazysim.plugins.effects import ground_effect
 
 R = 0.0275
+"""Radius of a propeller, m."""
 
 
 thrust_gain = jax.jit(ground_effect.thrust_gain)
@@ -20,8 +21,8 @@ def gain(height, upright=1.0):
 
 def test_the_gain_is_that_of_cheeseman_and_bennett_from_one_radius_on():
     for z in (1.0, 1.5, 2.0, 4.0):
-        theirs = 1 / (1 - (1 / (4 * z)) ** 2)
-        assert theirs - 0.0145 < gain(z * R) <= theirs
+        expected = 1 / (1 - (1 / (4 * z)) ** 2)
+        assert expected - 0.0145 < gain(z * R) <= expected
     np.testing.assert_allclose(gain(4 * R), 1 / (1 - 1 / 256), rtol=1e-4)
     np.testing.assert_allclose(gain(R), 1 / (1 - 1 / 16 / 1.25), rtol=1e-6)
     np.testing.assert_allclose(gain(1.0), 1.0, atol=1e-4)
@@ -31,8 +32,8 @@ def test_the_gain_is_bounded_on_the_floor_below_it_and_upside_down():
     for z in (0.0, -0.001, -1.0):
         np.testing.assert_allclose(gain(z), 4 / 3, rtol=1e-6)
     assert gain(0.0, -1.0) == 1
-    heights = np.array([gain(z) for z in np.linspace(0, 0.2, 50)])
-    assert np.all(np.diff(heights) < 0)
+    gains = np.array([gain(z) for z in np.linspace(0, 0.2, 50)])
+    assert np.all(np.diff(gains) < 0)
 
 
 def test_a_drone_that_hovers_near_the_floor_is_lifted_and_levelled():

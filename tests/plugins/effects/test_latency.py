@@ -8,7 +8,8 @@ from cases import FITTED_DYNAMICS, LEVELS, hover_command, hover_rotor_state, rep
 from crazysim import ConfigError, Latency, MotorFailure, Sim
 
 DELAY = np.array([[0, 1], [3, 7], [7, 2]])
-STEPS = 24
+"""Delay of the commands of each drone, steps. (n_worlds, n_drones)"""
+N_STEPS = 24
 
 
 def command_of(sim, step):
@@ -16,7 +17,7 @@ def command_of(sim, step):
     return repeat_command(sim.data, hover_command(sim.data) + (1 + step) * 1e-4)
 
 
-def fly(sim, n_steps=STEPS):
+def fly(sim, n_steps=N_STEPS):
     """Send another command before every step, and return the states. (n_steps, n_worlds, n_drones, 13 + n_rotors)"""
     track = []
     for step in range(n_steps):
@@ -46,7 +47,7 @@ def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
     for k in np.unique(DELAY):
         sim.data = sim.default_data
         track = []
-        for step in range(STEPS):
+        for step in range(N_STEPS):
             command = initial if step < k else command_of(sim, step - k)
             getattr(sim, f"{control}_control")(command)
             sim.step()
@@ -62,7 +63,7 @@ def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
         others = [j for j in undelayed if j != k]
         assert all(np.abs(undelayed[j] - undelayed[k])[-1, world, drone].max() > 1e-5 for j in others)
     sent = sim.data.controls.rotor_vel if control == "rotor_vel" else getattr(sim.data.controls, control).staged_cmd
-    np.testing.assert_array_equal(sent, command_of(sim, STEPS - 1).astype(np.float32))
+    np.testing.assert_array_equal(sent, command_of(sim, N_STEPS - 1).astype(np.float32))
 
 
 def initial_command(sim):

@@ -56,10 +56,10 @@ def test_factors_act_as_changed_parameters(thousand_worlds):
     """Drones fly as in a simulation whose parameters and wind are set to the drawn values."""
     sim, plugin = thousand_worlds
     record = jax.tree.map(np.asarray, plugin.read(sim.data))
-    other = Sim(1000, control="rotor_vel", engine="interpret")
-    p, f = other.data.params, record.factors[..., None]
-    other.data = with_states(other.data, pos=[0, 0, 2.0], rotor_vel=hover_rotor_state(other.data))
-    other.data = other.data.replace(
+    changed_sim = Sim(1000, control="rotor_vel", engine="interpret")
+    p, f = changed_sim.data.params, record.factors[..., None]
+    changed_sim.data = with_states(changed_sim.data, pos=[0, 0, 2.0], rotor_vel=hover_rotor_state(changed_sim.data))
+    changed_sim.data = changed_sim.data.replace(
         params=p.replace(
             mass=f[..., 0, :] * p.mass,
             J=f[..., 1:2, :] * p.J,
@@ -70,18 +70,18 @@ def test_factors_act_as_changed_parameters(thousand_worlds):
             rpm2thrust=record.thrust_factors[..., None] * p.rpm2thrust,
         )
     )
-    other.add(Wind(record.air_vel))
-    command = 1.05 * np.asarray(other.data.states.rotor_vel)
-    again, plugin_again = build(1000, 1, **RANGES)
-    for s in (other, again):
+    changed_sim.add(Wind(record.air_vel))
+    command = 1.05 * np.asarray(changed_sim.data.states.rotor_vel)
+    random_sim, random_plugin = build(1000, 1, **RANGES)
+    for s in (changed_sim, random_sim):
         s.rotor_vel_control(command)
         s.step(20)
-    np.testing.assert_array_equal(plugin_again.read(again.data).factors, record.factors)
+    np.testing.assert_array_equal(random_plugin.read(random_sim.data).factors, record.factors)
     for name in ("pos", "vel", "ang_vel", "rotor_vel"):
         # float32 over 20 steps
-        found, expected = (np.asarray(getattr(x.data.states, name)) for x in (again, other))
+        found, expected = (np.asarray(getattr(x.data.states, name)) for x in (random_sim, changed_sim))
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5, err_msg=name)
-    assert again.data.params.mass.shape == (1,)
+    assert random_sim.data.params.mass.shape == (1,)
 
 
 def test_law_10_numbers_depend_on_the_episode_and_not_on_other_worlds():
@@ -186,11 +186,13 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
         sim.step(5)
         return sim
 
-    drawn, reset = fly_with(), fly_with(restart_episode)
-    phases = [[s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (drawn, reset)]
+    constant_sim, restarted_sim = fly_with(), fly_with(restart_episode)
+    phases = [
+        [s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (constant_sim, restarted_sim)
+    ]
     assert phases[0] == ["before", "each"]
     assert "before" not in phases[1]
-    assert np.any(drawn.data.plugins["randomize"].factors != reset.data.plugins["randomize"].factors)
+    assert np.any(constant_sim.data.plugins["randomize"].factors != restarted_sim.data.plugins["randomize"].factors)
 
 
 @pytest.mark.parametrize("setting, remedy", [

@@ -10,9 +10,11 @@ from crazysim.plugins.effects.residual import N_INPUTS
 RNG = np.random.default_rng(3)
 LINEAR = RNG.normal(size=(6, N_INPUTS)) * np.repeat([1e-2, 1e-5], 3)[:, None]
 HIDDEN, OUTPUT = RNG.normal(size=(5, N_INPUTS)), RNG.normal(size=(6, 5)) * np.repeat([1e-2, 1e-5], 3)[:, None]
+"""Coefficients of the linear and the hidden terms; the first three rows are forces, and the others torques."""
 
 
 def drone(**residual):
+    """Return an airframe with the coefficients of a residual."""
     return {"base": "cf21B_500", "residual": {key: x.tolist() for key, x in residual.items()}}
 
 
@@ -40,9 +42,9 @@ def test_the_wrench_is_that_of_the_coefficients():
     )
     sim.add(Residual())
     s, p = sim.data.states, sim.data.params
-    for flown in (plain, sim):
-        flown.rotor_vel_control(np.asarray(s.rotor_vel))
-        flown.step()
+    for simulation in (plain, sim):
+        simulation.rotor_vel_control(np.asarray(s.rotor_vel))
+        simulation.step()
     x, y, z, w = np.moveaxis(np.asarray(s.quat, np.float64), -1, 0)
     rot = np.stack(
         [
@@ -58,8 +60,8 @@ def test_the_wrench_is_that_of_the_coefficients():
         c[0, 0] + rpm * (c[0, 1] + rpm * c[0, 2]) for c in (np.asarray(p.rpm2thrust), np.asarray(p.rpm2torque))
     ]
     mixing, mass, arm = np.asarray(p.mixing_matrix, np.float64), float(p.mass[0]), float(p.L[0])
-    load = mass * 9.81
-    torque = np.concatenate([thrust @ mixing[:2].T / load, drag @ mixing[2:].T / (load * arm)], -1)
+    weight = mass * 9.81
+    torque = np.concatenate([thrust @ mixing[:2].T / weight, drag @ mixing[2:].T / (weight * arm)], -1)
     constant = np.ones((3, 2, 1))
     inputs = np.concatenate(
         [
@@ -67,7 +69,7 @@ def test_the_wrench_is_that_of_the_coefficients():
             vel,
             vel * np.linalg.norm(vel, axis=-1, keepdims=True),
             np.asarray(s.ang_vel),
-            thrust.sum(-1, keepdims=True) / load,
+            thrust.sum(-1, keepdims=True) / weight,
             torque,
         ],
         -1,

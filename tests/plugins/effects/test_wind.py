@@ -9,7 +9,7 @@ from cases import with_states
 from crazysim import ConfigError, Sim, Wind
 from crazysim.plugins.effects import wind
 
-HALF = np.sqrt(0.5)
+SQRT_HALF = np.sqrt(0.5)
 DT = 1 / 500
 
 
@@ -25,7 +25,7 @@ def build(velocity=(0.0, 0.0, 0.0), n_worlds=2, n_drones=2, **kwargs):
 def steady_wind_sim():
     """Return four drones in winds of 3 m/s along x, y and z, and in calm air; nose up, so that body z lies along x."""
     sim = build(np.array([[[3, 0, 0], [0, 3, 0]], [[0, 0, 3], [0, 0, 0.0]]]))
-    sim.data = with_states(sim.data, quat=[0, HALF, 0, HALF])
+    sim.data = with_states(sim.data, quat=[0, SQRT_HALF, 0, SQRT_HALF])
     return sim
 
 
@@ -67,6 +67,7 @@ def test_the_force_of_the_user_stays_and_is_added(steady_wind_sim):
 
 
 N, LAGS = 32768, (0, 8, 20, 40)
+"""Number of worlds, and lags of the samples of their gusts, steps."""
 WIND = np.array([12.0, 16.0, 0.0])
 
 
@@ -79,11 +80,11 @@ def samples():
 
     @jax.jit
     def run(data):
-        def one(data, _):
+        def step(data, _):
             data = sim.step_pipeline["wind"](data)
             return sim.step_pipeline["increment_steps"](data), data.plugins["wind"].gust[:, 0]
 
-        return jax.lax.scan(one, data, length=LAGS[-1] + 1)[1]
+        return jax.lax.scan(step, data, length=LAGS[-1] + 1)[1]
 
     x = np.asarray(run(sim.data), np.float64)[list(LAGS)]
     return np.stack([0.6 * x[..., 0] + 0.8 * x[..., 1], -0.8 * x[..., 0] + 0.6 * x[..., 1], x[..., 2]], axis=-1)

@@ -81,12 +81,12 @@ def test_loads_feel_the_air_at_their_own_positions():
     load = sim.add(SlungLoad(0.01, 1.6, drag=0.05))
     sim.step()
     np.testing.assert_allclose(np.asarray(load.read(sim.data).wind_vel)[0, 0], [0.8, 0, 0.4], rtol=1e-5)
-    still = build(Grid(np.zeros((1, 1, 1, 3))))
-    still.data = with_states(still.data, pos=[0, 0, 3.0])
-    still.add(SlungLoad(0.01, 1.6, drag=0.05))
-    still.step()
+    still_sim = build(Grid(np.zeros((1, 1, 1, 3))))
+    still_sim.data = with_states(still_sim.data, pos=[0, 0, 3.0])
+    still_sim.add(SlungLoad(0.01, 1.6, drag=0.05))
+    still_sim.step()
     # implicit: dt b / (m + dt b) of the air's velocity
-    push = np.asarray(load.read(sim.data).vel) - np.asarray(still.data.plugins["load"].vel)
+    push = np.asarray(load.read(sim.data).vel) - np.asarray(still_sim.data.plugins["load"].vel)
     np.testing.assert_allclose(push[..., 0], 0.8 * 0.05 / 500 / (0.01 + 0.05 / 500), rtol=0.02)  # the cable's pull too
     sim.remove("wind_field")
     sim.step()

@@ -12,9 +12,9 @@ def errors(sim, name):
     """Return a filter's errors of position (world frame), velocity and attitude (body frame). (n_worlds, 9)"""
     e, s = sim.data.plugins[name].estimate, sim.data.states
     vel = rotation.rotate_inverse(s.quat, s.vel) - e.vel
-    turn = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
-    turn = turn[..., :3] * jnp.sign(turn[..., 3:])
-    return np.asarray(jnp.concatenate([s.pos - e.pos, vel, turn], axis=-1))[:, 0]
+    att_error = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
+    att_error = att_error[..., :3] * jnp.sign(att_error[..., 3:])
+    return np.asarray(jnp.concatenate([s.pos - e.pos, vel, att_error], axis=-1))[:, 0]
 
 
 def assert_chi_squared(values, k):

@@ -55,11 +55,13 @@ def float_array(x):
 
 
 LOOPS, SAMPLE_PERIOD, GRAVITY = 4000, 100, 9.81
+"""Number of loops of 1 ms, loops between recorded outputs, and gravity, m/s^2."""
 PIXELS = 35 / 0.71674
 """Pixels per rad of the flow sensor (mm_flow.c)."""
 ANCHORS = np.float32([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
 STATIONS = np.float32([[-3.5, -3.0, 2.4], [3.5, 3.0, 2.4]])
 DIODE = np.float32([0.015, 0.0075, 0.0])
+"""Positions of UWB anchors and lighthouse stations, world frame, and of the light sensor, body frame, m."""
 
 
 def station_attitude(pos):
@@ -70,6 +72,7 @@ def station_attitude(pos):
 
 
 FRAMES = np.stack([station_attitude(pos) for pos in STATIONS])
+"""Attitudes of the stations. (2, 3, 3)"""
 
 
 def flight():
@@ -89,8 +92,8 @@ def flight():
     y = np.cross(z, ahead)
     y /= np.linalg.norm(y, axis=-1, keepdims=True)
     rot = np.stack([np.cross(y, z), y, z], axis=-1)
-    turn = np.einsum("kji,kjl->kil", rot, np.gradient(rot, 1e-3, axis=0))
-    rate = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=-1)
+    skew = np.einsum("kji,kjl->kil", rot, np.gradient(rot, 1e-3, axis=0))
+    rate = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
     return [x[5:-5] for x in (pos, vel, rot, rate, np.einsum("kji,kj->ki", rot, force))]
 
 
@@ -113,7 +116,7 @@ def inertial_measurements(flight_states, is_flying, rng):
 
 
 def run(lib, kind, flight_states, inertial):
-    """Return the measurements of each loop, and the outputs."""
+    """Run the filter with one kind of measurements, and return the measurements of each loop and the outputs."""
     rng = np.random.default_rng(7)
     inputs, out = [], []
     lib.k_init(*[c_float(x) for x in (0.05, -0.05, 1.25, 0.0)])
@@ -133,8 +136,8 @@ def run(lib, kind, flight_states, inertial):
             m[3:7] = q / np.linalg.norm(q)
             lib.k_pose(float_array(m[:3]), float_array(m[3:7]), c_float(0.01), c_float(0.05))
         if kind in ("flow", "range") and k % 10 == 0:
-            moved = (rot.T @ vel)[:2] * rot[2, 2] / pos[2] + [-rate[1], rate[0]]
-            m[:2] = 10 * (0.01 * PIXELS * moved + 0.2 * rng.normal(size=2))
+            flow = (rot.T @ vel)[:2] * rot[2, 2] / pos[2] + [-rate[1], rate[0]]
+            m[:2] = 10 * (0.01 * PIXELS * flow + 0.2 * rng.normal(size=2))
             degrees = float_array(np.degrees(gyro.astype(np.float64)))
             lib.k_flow(c_float(m[0]), c_float(m[1]), c_float(2.0), c_float(2.0), c_float(0.01), degrees)
         if kind == "range" and k % 25 == 10:

@@ -44,8 +44,8 @@ def flown_sim():
 def test_drones_fly_on_the_estimate(flown_sim):
     """Attitudes agree within some degrees (the accelerometer shows thrust, not gravity), heights within centimetres."""
     record, s = flown_sim.data.plugins["complementary"], flown_sim.data.states
-    down, true = (np.asarray(rotation.matrix(q))[..., 2, :] for q in (record.quat, s.quat))
-    tilt = np.degrees(np.arccos(np.clip(np.sum(down * true, axis=-1), -1, 1)))
+    estimated_z, true_z = (np.asarray(rotation.matrix(q))[..., 2, :] for q in (record.quat, s.quat))
+    tilt = np.degrees(np.arccos(np.clip(np.sum(estimated_z * true_z, axis=-1), -1, 1)))
     assert 1e-3 < tilt.max() < 5
     assert np.abs(np.asarray(record.height - s.pos[..., 2:])).max() < 0.1
     assert np.abs(np.asarray(s.quat)[..., 3]).min() > 0.9
@@ -55,7 +55,7 @@ def test_drones_fly_on_the_estimate(flown_sim):
 
 
 def test_gradients_of_the_estimate_equal_central_differences(x64):
-    """With respect to rates and forces, away from the kinks at the dead band and at fresh measurements."""
+    """Gradients are with respect to body rates and specific forces, away from the kinks of the dead band."""
     quat = jnp.array([0.1, -0.2, 0.05, 0.97])
     quat = quat / jnp.linalg.norm(quat)
 

@@ -27,7 +27,7 @@ def test_the_filter_agrees_with_the_compiled_firmware(kind):
 
 
 def test_flow_is_two_updates_from_one_prediction(x64):
-    """In closed form: both updates use the innovations of the first estimate, the second gain the new covariance."""
+    """Both updates use the innovations of the first estimate. The second gain uses the covariance after the first."""
     rng = np.random.default_rng(1)
     root = 0.3 * rng.normal(size=(9, 9))
     level, vel = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([3.0, -2.0, 0.5])

@@ -21,7 +21,10 @@ def build(height=5.0, integrator="euler", **settings):
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_picking_up_keeps_momentum(integrator, x64):
-    """Without a mass at the hook, P = (q.u - q.v) / (1/m + 1/m_L), and q' = (I - q q^T) (u - v) / L."""
+    """Without a mass of the hook, P = (q.u - q.v) / (1/m + 1/m_L), and q' = (I - q q^T) (u - v) / L.
+
+    P is the impulse along the rod's direction q, u and v are the velocities of load and drone, L is the rod's length.
+    """
     sim, hook = build(integrator=integrator, hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
     sim.data = with_states(hook.command(sim.data, True), vel=np.array([0.1, 0.0, 0.0]))
     record = hook.read(sim.data)
@@ -36,8 +39,8 @@ def test_picking_up_keeps_momentum(integrator, x64):
     assert load.attached
     impulse = (q @ u - q @ v) / (1 / MASS + 1 / LOAD)
     np.testing.assert_allclose(states.vel, v + impulse * q / MASS, atol=1e-12)
-    swing = (load.vel - states.vel) / 0.4
-    np.testing.assert_allclose(swing, (u - v - q * (q @ (u - v))) / 0.4, atol=1e-9)
+    direction_rate = (load.vel - states.vel) / 0.4
+    np.testing.assert_allclose(direction_rate, (u - v - q * (q @ (u - v))) / 0.4, atol=1e-9)
     np.testing.assert_allclose(MASS * states.vel + LOAD * load.vel, MASS * v + LOAD * u, atol=1e-12)
 
 
@@ -52,8 +55,8 @@ def test_conditions_of_picking_up_and_release():
         (0, 0.2, False, False),
         (0, 0.2, True, True),
     ):
-        near = record.replace(pos=broadcast_like(pos - [0, 0, drop], pos), vel=broadcast_like([vel, 0, 0], pos))
-        sim.data = hook.command(hook.write(start, near), grip)
+        moved = record.replace(pos=broadcast_like(pos - [0, 0, drop], pos), vel=broadcast_like([vel, 0, 0], pos))
+        sim.data = hook.command(hook.write(start, moved), grip)
         sim.step()
         assert np.asarray(hook.read(sim.data).attached)[0, 0] == is_attached, (drop, vel, grip)
     sim.step(50)

@@ -10,8 +10,10 @@ from crazysim.plugins.payloads import SlungLoad
 from crazysim.plugins.payloads.load_flatness import load_flat_state
 
 LENGTH, LOAD = 0.4, 0.2
+"""Length of the rod, m, and mass of the load, kg."""
 DT = 1e-5
 TIMES = (0.7 - DT, 0.7, 0.7 + DT, 0.0, 0.4, 1.3)
+"""Times of the flat states, s; the first three are for central differences."""
 REST_POS = np.array([1.0, 2.0, 3.0])
 """Position of a load at rest, m."""
 

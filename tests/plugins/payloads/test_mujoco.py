@@ -10,7 +10,9 @@ from crazysim import Sim
 from crazysim.plugins.payloads import Hook
 
 FREQ, SECONDS, LENGTH, LOAD, HOOK = 500, 5, 0.4, 0.2, 0.0203
+"""Rate, Hz, duration, s, length of the rod, m, and masses of load and hook, kg."""
 MASS, INERTIA = 0.605, (1.5e-3, 1.45e-3, 2.66e-3)
+"""Mass, kg, and moments of inertia, kg m^2, of the drone."""
 START = np.array([0.3, -0.2, 2.0])
 
 
@@ -44,7 +46,7 @@ def feedback(pos, vel, quat, ang_vel):
     return np.array([[0, 0, force @ up], 1.2 * rot.reshape(3, 3).T @ tilt - 0.15 * ang_vel])
 
 
-def simulate_in_mujoco(dof, attach, damping, angles, ang_vel, law):
+def simulate_in_mujoco(dof, attach, damping, angles, ang_vel, control_law):
     """Return positions of drone and tip after every tenth step, m, (n, 2, 3), and the start of the tip."""
     m = create_model(dof, attach, damping)
     d = mujoco.MjData(m)
@@ -54,7 +56,7 @@ def simulate_in_mujoco(dof, attach, damping, angles, ang_vel, law):
     mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_SITE, 0, tip_vel, 0)
     start, positions = (d.site_xpos[0].copy(), tip_vel[3:].copy()), []
     for k in range(FREQ * SECONDS):
-        forces = law(d.qpos[:3], d.qvel[:3], np.roll(d.qpos[3:7], -1), d.qvel[3:6])
+        forces = control_law(d.qpos[:3], d.qvel[:3], np.roll(d.qpos[3:7], -1), d.qvel[3:6])
         d.xfrc_applied[1] = np.ravel(forces @ d.xmat[1].reshape(3, 3).T)
         mujoco.mj_step(m, d)
         if k % 10 == 9:
@@ -71,7 +73,7 @@ def simulate_in_crazysim(dof, cases, starts):
         cases: Entries of ``CASES``.
         starts: Position and velocity of the tip of each case.
     """
-    n, laws = len(cases), [case[-1] for case in cases]
+    n, control_laws = len(cases), [case[-1] for case in cases]
     attach, damping, ang_vel = (np.array([case[k] for case in cases])[:, None] for k in (1, 2, 4))
     sim = Sim(n, drone="bumblebee", control="rotor_vel", integrator="rk4", freq=FREQ, engine="fused", strict=True)
     sim.data = with_params(sim.data, rpm2torque=0 * np.asarray(sim.data.params.rpm2torque))
@@ -86,9 +88,9 @@ def simulate_in_crazysim(dof, cases, starts):
         s = sim.data.states
         pos, vel, quat, w = (np.asarray(x)[:, 0] for x in (s.pos, s.vel, s.quat, s.ang_vel))
         forces = np.zeros((2, n, 1, 3))
-        for i, law in enumerate(laws):
+        for i, control_law in enumerate(control_laws):
             mujoco.mju_quat2Mat(rot, np.roll(quat[i], 1))
-            forces[:, i, 0] = law(pos[i], vel[i], quat[i], w[i]) @ rot.reshape(3, 3).T
+            forces[:, i, 0] = control_law(pos[i], vel[i], quat[i], w[i]) @ rot.reshape(3, 3).T
         sim.data = sim.data.replace(states=s.replace(force=forces[0], torque=forces[1]))
         sim.step()
         if k % 10 == 9:
@@ -98,7 +100,7 @@ def simulate_in_crazysim(dof, cases, starts):
 
 
 CASES = {
-    # degrees of freedom, joint, damping, initial angles, initial body rates, forces
+    # degrees of freedom, position of the joint, damping, initial angles and body rates, control control_law
     "swing": (2, (0, 0, 0), 0.0, (0.6, 0.3), (0, 0, 0), constant_thrust),
     "swing, hinge": (1, (0, 0, 0), 0.001, (0.8, 0.0), (0.3, 0, 0.5), feedback),
     "hover": (2, (0.01, 0, -0.02), 0.001, (0.3, 0.2), (0, 0, 0.5), feedback),

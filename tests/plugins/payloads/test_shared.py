@@ -9,6 +9,7 @@ from crazysim.plugins.payloads import SharedLoad, SlungLoad
 
 SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
 CORNERS = np.array([[0.3, 0.3, 5.0], [-0.3, 0.3, 5.0], [-0.3, -0.3, 5.0], [0.3, -0.3, 5.0]])
+"""Start positions of the drones, m."""
 
 
 def build(n_drones, integrator, engine="fused", **settings):
@@ -58,9 +59,9 @@ def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
 def test_slack_and_released_cables_do_not_pull(x64):
     """The first drone has released the load, and the third is so near that its cable is slack."""
     sim, load = build(3, "symplectic_euler", "interpret")
-    lower = np.array(CORNERS[:3])
-    lower[2] = [0.0, 0.0, 4.5]
-    sim.data = load.release(with_states(sim.data, pos=lower), [[True, False, False]])
+    start_pos = np.array(CORNERS[:3])
+    start_pos[2] = [0.0, 0.0, 4.5]
+    sim.data = load.release(with_states(sim.data, pos=start_pos), [[True, False, False]])
     start = np.asarray(sim.data.states.pos)[0]
     sim.step(10)
     moved = np.asarray(sim.data.states.pos)[0] - start

@@ -15,7 +15,9 @@ from crazysim.plugins.payloads import SlungLoad, direction
 from crazysim.plugins.payloads.link import LinkParams, end_relative_motion
 
 MASS, LOAD = 0.605, 0.2
+"""Masses of drone and load, kg."""
 OFFSET = (0.02, 0.01, -0.03)
+"""Position of an attachment off the centre of mass, body frame, m."""
 
 
 def build(n_worlds=1, n_drones=1, height=500.0, **kwargs):
@@ -176,7 +178,7 @@ def test_the_order_of_convergence_is_that_of_the_integrator(x64):
 
 @pytest.mark.parametrize("cable", [False, True])
 def test_law_08_gradients_are_central_differences(cable, x64):
-    """In forward mode for a rod, in reverse mode for a cable."""
+    """Gradients are in forward mode for a rod, and in reverse mode for a cable."""
     sim = build(height=2.0, engine="plain")
     load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
     sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
@@ -206,7 +208,7 @@ def test_law_08_gradients_are_central_differences(cable, x64):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_law_07_no_nan(integrator):
-    """For 10 s: upside down with the load above, a load at its attachment, fast rotation, on the floor."""
+    """Five drones for 10 s: upside down below the load, a load at its attachment, fast rotation, on the floor."""
     for cable in (False, True):
         sim = build(5, integrator=integrator, height=0.5, engine="auto")
         load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, cable=cable, damping=0.001, drag=0.05, in_scene=False))

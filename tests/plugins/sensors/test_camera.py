@@ -58,24 +58,24 @@ def test_outputs_agree_with_rays_of_c_mujoco_in_the_frame_of_the_camera(flight):
     assert names == ("floor", "wall:0", "sphere:0")
     sim.scene.sync_one(sim.data, 1)
     mount = np.asarray(rotation.matrix(rotation.from_rpy(jnp.array([0.1, 0.4, -0.2]))))
-    group, geom, names_hit = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
+    group, geom, hit_names = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
     for drone in range(2):
         body = np.asarray(rotation.matrix(sim.data.states.quat[1, drone]))
         eye = np.asarray(sim.data.states.pos[1, drone]) + body @ sim.airframe.value("shape.fpv_camera")
         for row, column in np.ndindex(6, 9):
             ray, normal = camera.rays[row, column], np.zeros(3)
             assert ray[0] == pytest.approx(1 / np.sqrt(1 + (ray[1] / ray[0]) ** 2 + (ray[2] / ray[0]) ** 2))
-            along = body @ mount @ ray
-            far = mujoco.mj_ray(sim.mj_model, sim.mj_data, eye, along, group, 1, -1, geom, normal)
-            far = far if far >= 0 else np.inf
-            assert images["distance"][1, drone, row, column] == pytest.approx(min(far, 10.0), rel=1e-5)
-            assert images["depth"][1, drone, row, column] == pytest.approx(min(far * ray[0], 10.0), rel=1e-5)
+            direction = body @ mount @ ray
+            distance = mujoco.mj_ray(sim.mj_model, sim.mj_data, eye, direction, group, 1, -1, geom, normal)
+            distance = distance if distance >= 0 else np.inf
+            assert images["distance"][1, drone, row, column] == pytest.approx(min(distance, 10.0), rel=1e-5)
+            assert images["depth"][1, drone, row, column] == pytest.approx(min(distance * ray[0], 10.0), rel=1e-5)
             root = sim.mj_model.body(sim.mj_model.body_rootid[sim.mj_model.geom_bodyid[geom[0]]]).name
-            names_hit.add(name := "nothing" if far == np.inf else root if root != "world" else "floor")
+            hit_names.add(name := "nothing" if distance == np.inf else root if root != "world" else "floor")
             index = images["segmentation"][1, drone, row, column]
             assert (names[index] if index >= 0 else "nothing") == name
             np.testing.assert_allclose(images["normal"][1, drone, row, column], (body @ mount).T @ normal, atol=1e-4)
-    assert names_hit >= {"floor", "wall:0", "sphere:0"}
+    assert hit_names >= {"floor", "wall:0", "sphere:0"}
     # A pixel on the left of the image is on the left of the camera, a pixel in the upper row above it.
     assert camera.rays[0, 0, 1] > 0 > camera.rays[0, -1, 1]
     assert camera.rays[0, 0, 2] > 0 > camera.rays[-1, 0, 2]

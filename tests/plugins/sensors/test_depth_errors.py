@@ -10,6 +10,7 @@ from crazysim import Camera, ConfigError, Lidar, Sim
 from crazysim.plugins.sensors import Distortion, StereoNoise
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.006, "k3": 0.01}
+"""Coefficients of a lens, as in OpenCV."""
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +40,10 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(wall_images):
     np.testing.assert_allclose(errors.std(axis=(1, 2)), expected, rtol=4 / np.sqrt(2 * n))
     assert np.all(np.abs(errors.mean(axis=(1, 2))) < 4 * expected / np.sqrt(n))
     np.testing.assert_allclose(images["distance"] * camera.rays[..., 0], images["depth"], rtol=1e-5)
-    standard = errors / expected[:, None, None]
-    assert len(np.unique(standard.round(5))) > 0.95 * standard.size, "worlds and pixels have different random numbers"
+    normalised = errors / expected[:, None, None]
+    assert len(np.unique(normalised.round(5))) > 0.95 * normalised.size, (
+        "worlds and pixels have different random numbers"
+    )
 
 
 def test_depth_has_a_resolution_and_a_smallest_value(wall_images):
@@ -70,9 +73,9 @@ def test_a_lidar_has_noise_and_lost_returns(wall_images):
     distance, true = images["distance"][:, 0], np.arange(1.0, 7.0)[:, None, None] / lidar.rays[..., 0]
     lost = distance == 9.0
     assert abs(lost.mean() - 0.25) < 4 * np.sqrt(0.25 * 0.75 / lost.size)
-    standard = ((distance - true) / (0.02 + 0.01 * true))[~lost]
-    assert abs(standard.mean()) < 4 / np.sqrt(standard.size)
-    assert standard.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * standard.size))
+    normalised = ((distance - true) / (0.02 + 0.01 * true))[~lost]
+    assert abs(normalised.mean()) < 4 / np.sqrt(normalised.size)
+    assert normalised.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * normalised.size))
 
 
 def test_noise_of_a_world_does_not_depend_on_other_worlds_and_changes_with_the_step(wall_images):

@@ -150,8 +150,8 @@ def test_an_unbalanced_rotor_shakes_at_its_own_frequency():
     t = np.arange(300) / 5000
 
     def amplitude(x):
-        wave = np.stack([np.cos(omega * t), np.sin(omega * t), np.ones_like(t), t], axis=-1)
-        c, s = np.linalg.lstsq(wave, np.asarray(x, float), rcond=None)[0][:2]
+        basis = np.stack([np.cos(omega * t), np.sin(omega * t), np.ones_like(t), t], axis=-1)
+        c, s = np.linalg.lstsq(basis, np.asarray(x, float), rcond=None)[0][:2]
         return np.hypot(c, s)
 
     expected = imbalance * omega**2 / 0.0434
@@ -163,6 +163,7 @@ def test_an_unbalanced_rotor_shakes_at_its_own_frequency():
 
 
 N, FREQ = 20_000, 100
+"""Number of samples at rest, and their rate, Hz."""
 NOISE, RANDOM_WALK, INSTABILITY, CORRELATION_TIME = 0.02, 0.01, 0.05, 0.5
 
 
@@ -186,12 +187,12 @@ def measurements_at_rest():
 
     @jax.jit
     def run(data):
-        def once(data, _):
+        def sample(data, _):
             for name in names:
                 data = sim.step_pipeline[name](data)
             return data, data.plugins["imu"].samples.value[:, 0]
 
-        return jax.lax.scan(once, data, length=N)[1]
+        return jax.lax.scan(sample, data, length=N)[1]
 
     x = np.asarray(run(sim.data), np.float64) - [0, 0, 0, 0, 0, 9.81]
     return np.moveaxis(x.reshape(N, 3, n * 6), 0, -1)

@@ -12,6 +12,7 @@ from crazysim.plugins.sensors.barometer import pressure_altitude, pressure_at
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, sweep_angle
 
 N = 2000
+"""Number of worlds for statistics."""
 
 
 def build(*plugins, n_worlds=1, n_drones=1, **states):
@@ -157,7 +158,7 @@ def test_barometer_has_its_errors():
 
 
 def test_magnetometer_by_hand():
-    """Yaw 90 degrees: north is on the right of a drone that looks west, at -y; here the drone's x axis looks north."""
+    """At a yaw of 90 degrees the drone's x axis points north, along the world's y axis."""
     quat = np.float32([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
     sim = build(sensors.Magnetometer((0, 2e-5, -4e-5), sensors.Triad(bias=(0, 1e-6, 0))), quat=quat)
     sim.step()
@@ -202,9 +203,9 @@ def test_ranges_and_their_detours_by_hand():
     sim = build(sensors.UWB(anchors, outliers=0.2, detour=0.5), n_worlds=N)
     sim.step()
     excess = (read(sim, "uwb.distance")[:, 0] - [3, 4, 5]).ravel()
-    far = excess > 1e-3
-    assert abs(far.mean() - 0.2 * np.exp(-1e-3 / 0.5)) < 4 * np.sqrt(0.16 / (3 * N))
-    np.testing.assert_allclose(excess[far].mean(), 0.501, atol=4 * 0.5 / np.sqrt(far.sum()))
+    is_detour = excess > 1e-3
+    assert abs(is_detour.mean() - 0.2 * np.exp(-1e-3 / 0.5)) < 4 * np.sqrt(0.16 / (3 * N))
+    np.testing.assert_allclose(excess[is_detour].mean(), 0.501, atol=4 * 0.5 / np.sqrt(is_detour.sum()))
 
 
 def test_sweep_angles_by_hand(x64):
@@ -276,19 +277,19 @@ def test_a_multi_ranger_has_the_rays_of_its_range_finder():
 def test_observations_of_other_plugins_use_measured_states():
     """A plugin observes measured states in place of the true ones; observations of sensors do not change."""
     sim = build(sensors.MotionCapture(pos=(0, 0, 0.5)), RangeFinder(directions=[(0, 0, -1)]))
-    sim.add(Relative())
+    sim.add(HeightObserver())
     sim.step()
-    true, seen = (sim.plugins.observations(sim.data, measured=m) for m in (False, True))
+    true, measured = (sim.plugins.observations(sim.data, measured=m) for m in (False, True))
     np.testing.assert_allclose(
-        np.asarray(seen["relative.height"]) - np.asarray(true["relative.height"]), 0.5, atol=1e-6
+        np.asarray(measured["height_observer.height"]) - np.asarray(true["height_observer.height"]), 0.5, atol=1e-6
     )
-    np.testing.assert_array_equal(seen["motion_capture.pos"], true["motion_capture.pos"])
+    np.testing.assert_array_equal(measured["motion_capture.pos"], true["motion_capture.pos"])
 
 
-class Relative(Plugin):
+class HeightObserver(Plugin):
     """Observe the height of the drone."""
 
-    name: str = "relative"
+    name: str = "height_observer"
 
     def observations(self, data):
         return {"height": data.states.pos[2:]}

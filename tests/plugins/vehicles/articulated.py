@@ -7,9 +7,10 @@ from crazysim.plugins.vehicles import VehicleModel, ackermann
 
 TIMESTEP = 0.001
 WHEELS = {"fl": (1, 1), "fr": (1, -1), "rl": (-1, 1), "rr": (-1, -1)}
+"""Whether each wheel is in front (1) or at the rear (-1), and on the left (1) or on the right (-1)."""
 
 
-def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
+def create_mjcf(vehicle: VehicleModel, trailer: bool = False) -> str:
     """Return MJCF of the car, and of its trailer."""
     number = vehicle.number
     radius = number("wheels.radius")
@@ -61,19 +62,19 @@ def _trailer(vehicle: VehicleModel) -> str:
             {axle(-number("trailer.axle_distance"))}</body></body></body>"""
 
 
-class Articulated:
-    """The simulated car, driven by the lab's torque law or by torques."""
+class ArticulatedCar:
+    """The car in MuJoCo, driven by torques, or by motor references and the torque law of the vehicle model."""
 
     def __init__(self, vehicle: VehicleModel, trailer: bool = False):
         self.vehicle = vehicle
-        self.model = mujoco.MjModel.from_xml_string(articulated_car(vehicle, trailer))
+        self.model = mujoco.MjModel.from_xml_string(create_mjcf(vehicle, trailer))
         self.data = mujoco.MjData(self.model)
         for _ in range(500):
             mujoco.mj_step(self.model, self.data)
         self.start = self.data.time
 
     def drive(self, reference: float) -> None:
-        """Set the torques of the lab's law for a motor reference."""
+        """Set the torques of the vehicle model's law for a motor reference."""
         gain, damping, friction = self.vehicle.value("drive.torque")
         speed, limit = self.body_vel[0], self.vehicle.number("drive.torque_max")
         self.torque(np.clip(gain * reference - damping * speed - friction * np.tanh(speed / 0.1), -limit, limit))

@@ -10,7 +10,7 @@ import functools
 import jax
 import numpy as np
 import pytest
-from articulated import WHEELS, Articulated
+from articulated import WHEELS, ArticulatedCar
 
 from crazysim.plugins.vehicles import CarParams, CarState, kinematic, load_vehicle, single_track
 
@@ -44,7 +44,7 @@ def _path(model, start, command, car, n_steps):
 @pytest.mark.parametrize(("reference", "steer"), [(0.1, 0.2), (0.2, 0.1), (0.2, 0.3), (0.3, -0.2)])
 def test_steady_circles_agree(reference, steer):
     """Speed, yaw rate and radius agree within 1%: MuJoCo's slip is about 0.01 rad at 3 m/s^2."""
-    car = Articulated(vehicle())
+    car = ArticulatedCar(vehicle())
     car.steer(steer)
     while car.time < 4:
         car.drive(reference)
@@ -62,7 +62,7 @@ def test_yaw_rates_after_a_step_of_the_steering_agree():
 
     The servos differ: MuJoCo's servo turns the wheels at once, ours at 3.2 rad/s at most.
     """
-    car = Articulated(vehicle())
+    car = ArticulatedCar(vehicle())
     while car.time < 3:
         car.drive(0.15)
         car.step()
@@ -82,7 +82,7 @@ def test_yaw_rates_after_a_step_of_the_steering_agree():
 @pytest.mark.parametrize("torque", [-0.5, -1.0, -2.0])
 def test_braking_with_the_motors_agrees(torque):
     """Distance and time agree within 0.5%: wheels roll, with the inertia of wheels and motors."""
-    car = Articulated(vehicle())
+    car = ArticulatedCar(vehicle())
     while car.body_vel[0] < 1.5:
         car.torque(2.0)
         car.step()
@@ -100,7 +100,7 @@ def test_braking_with_the_motors_agrees(torque):
 def test_braking_with_locked_wheels_agrees():
     """On ground of friction 0.3 distances agree within 2%: ``v^2 / (2 friction g)``, and the lock takes 20 ms."""
     slippery = vehicle(friction=0.3, armature=1e-4)
-    car = Articulated(slippery)
+    car = ArticulatedCar(slippery)
     while car.body_vel[0] < 2.0:
         car.torque(0.03)
         car.step()
@@ -123,7 +123,7 @@ def test_joint_angles_of_a_trailer_agree():
 
     Trailer axles roll without slip in both. MuJoCo's trailer has little mass, as only its kinematics are compared.
     """
-    car = Articulated(vehicle(), trailer=True)
+    car = ArticulatedCar(vehicle(), trailer=True)
     car.steer(0.2)
     angles = []
     while car.time < 6:

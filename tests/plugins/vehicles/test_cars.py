@@ -68,9 +68,9 @@ def test_cars_follow_a_path(name):
     distances, lags = [], []
     for k in range(20):
         sim.step(150)
-        found = deviations(sim.data.plugins["cars"], np.float32((3000 + 150 * (k + 1)) / 500))
-        distances.append(found[0])
-        lags.append(found[1])
+        distance, lag = deviations(sim.data.plugins["cars"], np.float32((3000 + 150 * (k + 1)) / 500))
+        distances.append(distance)
+        lags.append(lag)
     assert np.shape(lags) == (20, 3)
     assert np.max(distances) < {"pursuit": 0.06, "stanley": 0.1, "lpv": 0.05, "lqr": 0.03}[name]
     assert np.abs(lags).max() < 0.15

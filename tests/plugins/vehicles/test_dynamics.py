@@ -14,6 +14,7 @@ from crazysim.plugins.vehicles.single_track import drive_force, tyre_force
 
 MODELS = {"single_track": single_track, "kinematic": kinematic}
 RATES = {name: jax.jit(model) for name, model in MODELS.items()}
+"""Functions from state, command and parameters of a vehicle to the time derivatives of its state."""
 
 
 @functools.cache
@@ -22,6 +23,7 @@ def params(name="f1tenth_ros", trailer=False):
 
 
 def create_state(speed=0.0, side=0.0, yaw_rate=0.0, steer=0.0, yaw=0.0, joints=None) -> CarState:
+    """Return the state of a vehicle at the origin; ``side`` is its speed to the left, m/s."""
     vel = np.array([speed, side], float)
     yaw, yaw_rate, steer, zero = (np.array([x], float) for x in (yaw, yaw_rate, steer, 0.0))
     return CarState(np.zeros(3), yaw, vel, yaw_rate, steer, zero, joints)

@@ -101,10 +101,10 @@ def test_timing_is_that_of_the_trajectory():
     for t, s in ((-1.0, 0.0), (9.0, float(path.length[0]))):
         arc, speed = path.time_reference(0, jnp.float32(t))
         np.testing.assert_allclose([arc[0], speed[0]], [s, 0.0], atol=1e-5)
-    rounds = Path.of_points(SQUARE, speed=2.0, closed=True)
+    lap_path = Path.of_points(SQUARE, speed=2.0, closed=True)
     for n_laps in (3.25, -1.25):
-        arc, speed = rounds.time_reference(0, n_laps * rounds.duration[0])
-        np.testing.assert_allclose([arc[0], speed[0]], [n_laps * rounds.length[0], 2.0], rtol=1e-4)
+        arc, speed = lap_path.time_reference(0, n_laps * lap_path.duration[0])
+        np.testing.assert_allclose([arc[0], speed[0]], [n_laps * lap_path.length[0], 2.0], rtol=1e-4)
 
 
 def test_backwards_paths_have_negative_speeds():
@@ -127,7 +127,7 @@ def test_slots_hold_paths_of_any_length():
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("create_path", "message"),
     [
         (lambda: Path.of_points([(0, 0), (1, 1)]), "at least three points"),
         (lambda: Path.of_points([(0, 0, 0), (1, 1, 0), (2, 0, 0)]), "(n_points, 2)"),
@@ -148,6 +148,6 @@ def test_slots_hold_paths_of_any_length():
         ),
     ],
 )  # fmt: skip
-def test_wrong_paths_are_errors(make, message):
+def test_wrong_paths_are_errors(create_path, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        make()
+        create_path()
