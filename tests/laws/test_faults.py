@@ -68,9 +68,9 @@ def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
 def test_fault_02_a_zero_quaternion_means_yaw_zero(dynamics):
     """A setpoint of zeros, as from ``np.zeros``, means: fly to the origin with yaw zero."""
     data, step, _ = build_program(dynamics, "state")
-    half = 0.4
+    half_yaw = 0.4
     hover_speeds = hover_rotor_state(data)
-    data = with_states(data, pos=[0, 0, 0.2], quat=[0, 0, np.sin(half), np.cos(half)], rotor_vel=hover_speeds)
+    data = with_states(data, pos=[0, 0, 0.2], quat=[0, 0, np.sin(half_yaw), np.cos(half_yaw)], rotor_vel=hover_speeds)
     zeros = np.zeros((3, 2, 16))
     level = zeros.copy()
     level[..., 12] = 1.0
@@ -103,9 +103,9 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
         np.testing.assert_array_equal(poisoned.core.nonfinite[:, 0], [False, True, False], err_msg=f"{component}")
         for x, y in zip(jax.tree.leaves(poisoned.states), jax.tree.leaves(clean.states), strict=True):
             np.testing.assert_array_equal(x[::2], y[::2])  # the other worlds are not affected
-    still = run_steps(step, send(poisoned, good), 1)
-    assert still.core.nonfinite[1, 0], "only a reset clears the flag"
-    healed = reset(still, data, jnp.asarray([False, True, False]))
+    flagged = run_steps(step, send(poisoned, good), 1)
+    assert flagged.core.nonfinite[1, 0], "only a reset clears the flag"
+    healed = reset(flagged, data, jnp.asarray([False, True, False]))
     assert not healed.core.nonfinite.any()
     healed = run_steps(step, send(healed, good), 20)
     assert not healed.core.nonfinite.any()
@@ -241,8 +241,7 @@ def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(in
     """A side force of half its weight and a yaw torque act on it, and its rotors carry half its weight."""
     data, step, _ = build_program("first_principles", "rotor_vel", integrator=integrator)
     hover, m = hover_rotor_state(data), float(data.params.mass[0])
-    half = 0.3
-    tilt = [0.1, -0.05, np.sin(half), 0.0]
+    tilt = [0.1, -0.05, np.sin(0.3), 0.0]
     tilt[3] = np.sqrt(1 - np.sum(np.square(tilt)))
     data = with_states(
         data,
@@ -311,15 +310,15 @@ def test_fault_16_a_full_reset_restores_all_worlds_and_shared_leaves(used_data):
     per_world = dict(zip(named_leaves(full), (n_batch_axes(s) > 0 for s in jax.tree.leaves(scopes(full))), strict=True))
     masked, full, start, before = (named_leaves(x) for x in (masked, full, default, used))
     assert len(full) > 40
-    shared = 0
+    n_changed = 0
     for name, value in full.items():
         if per_world[name]:
             np.testing.assert_array_equal(masked[name], value, err_msg=name)
         elif name not in (".core.rng_key", ".core.mjx_synced"):
             np.testing.assert_array_equal(value, start[name], err_msg=name)
             np.testing.assert_array_equal(masked[name], before[name], err_msg=name)
-            shared += not np.array_equal(before[name], start[name])
-    assert shared >= 2, "gravity and an undeclared array were changed"
+            n_changed += not np.array_equal(before[name], start[name])
+    assert n_changed >= 2, "gravity and an undeclared array were changed"
     one_by_one = used
     for world in range(3):
         one_by_one = reset(one_by_one, default, jnp.arange(3) == world)
@@ -336,20 +335,20 @@ def test_fault_16_a_masked_reset_changes_its_worlds_only(used_data):
         named_leaves(reset(used, default, jnp.asarray(mask))),
         named_leaves(default),
     )
-    batched = [
+    world_leaves = [
         name
         for name, x in before.items()
         if x.shape[:2] in ((3, 2), (3, 1)) and name not in (".plugins['undeclared']",)
     ]
-    assert {".params.mass", ".plugins['queue'].waiting", ".plugins['queue'].seen", ".states.pos"} <= set(batched)
-    assert len(batched) > 20
-    for name in batched:
+    assert {".params.mass", ".plugins['queue'].waiting", ".plugins['queue'].seen", ".states.pos"} <= set(world_leaves)
+    assert len(world_leaves) > 20
+    for name in world_leaves:
         np.testing.assert_array_equal(after[name][~mask], before[name][~mask], err_msg=name)
         if name != ".core.episode":
             default_value = np.broadcast_to(default_leaves[name], before[name].shape)
             np.testing.assert_array_equal(after[name][mask], default_value[mask], err_msg=name)
     np.testing.assert_array_equal(after[".core.episode"][:, 0], mask)
-    for name in set(before) - set(batched) - {".core.mjx_synced"}:
+    for name in set(before) - set(world_leaves) - {".core.mjx_synced"}:
         np.testing.assert_array_equal(
             after[name], before[name], err_msg=f"{name} is shared or opaque: no masked reset changes it"
         )

@@ -32,8 +32,8 @@ MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation
 
 def public_functions(module):
     """Return the public functions of a module that return arrays."""
-    own = [f for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
-    return [f for f in own if "Array" in f.__annotations__["return"] and not f.__name__.startswith("_")]
+    functions = [f for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
+    return [f for f in functions if "Array" in f.__annotations__["return"] and not f.__name__.startswith("_")]
 
 
 CASES = [
@@ -124,16 +124,16 @@ def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model,
         assert not per_drone
         batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone=True)
     compiled = jax.jit(lambda batched: function(**batched, **shared_arguments))
-    whole = jax.tree.leaves(jax.device_get(compiled(batched)))
-    assert whole
+    batch_results = jax.tree.leaves(jax.device_get(compiled(batched)))
+    assert batch_results
     for i in np.ndindex(BATCH):
-        single = jax.tree.leaves(jax.device_get(compiled(jax.tree.map(lambda x, i=i: x[i], batched))))
-        for many, one in zip(whole, single, strict=True):
-            assert many.shape == (*BATCH, *one.shape)
-            assert np.all(np.isfinite(one))
+        drone_results = jax.tree.leaves(jax.device_get(compiled(jax.tree.map(lambda x, i=i: x[i], batched))))
+        for of_batch, of_drone in zip(batch_results, drone_results, strict=True):
+            assert of_batch.shape == (*BATCH, *of_drone.shape)
+            assert np.all(np.isfinite(of_drone))
             # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
-            scale = 1e-13 * max(1.0, float(np.abs(many).max()))
-            np.testing.assert_allclose(many[i], one, rtol=1e-12, atol=scale)
+            scale = 1e-13 * max(1.0, float(np.abs(of_batch).max()))
+            np.testing.assert_allclose(of_batch[i], of_drone, rtol=1e-12, atol=scale)
 
 
 @pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in ("load_lqr", "tracking_lqr")])
@@ -143,28 +143,30 @@ def test_drones_in_a_batch_fly_like_single_drones(name, rng):
     Controllers that need a load or a trajectory of their own are compared in tests/control.
     """
 
-    def fly(sim, data, drawn):
-        states = data.states.replace(**{key: jnp.asarray(x, np.float32) for key, x in drawn.items()})
+    def fly(sim, data, drawn_states):
+        states = data.states.replace(**{key: jnp.asarray(x, np.float32) for key, x in drawn_states.items()})
         sim.data = data.replace(states=states)
         setpoint = np.zeros((sim.n_worlds, sim.n_drones, 16))
-        setpoint[..., :3], setpoint[..., 15] = drawn["pos"] + drawn["vel"], 1.0
+        setpoint[..., :3], setpoint[..., 15] = drawn_states["pos"] + drawn_states["vel"], 1.0
         setpoint[..., 12:14] = [0.6, 0.8]  # a yaw
         sim.state_control(setpoint)
         sim.step(25)
         return [np.asarray(x) for x in jax.tree.leaves(sim.data.states)]
 
     quat = np.array([0, 0, 0, 1.0]) + 0.2 * rng.normal(size=(*BATCH, 4))
-    drawn = {
+    drawn_states = {
         "pos": rng.uniform(0.5, 1.5, (*BATCH, 3)),
         "quat": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
         "vel": 0.3 * rng.normal(size=(*BATCH, 3)),
         "ang_vel": 0.5 * rng.normal(size=(*BATCH, 3)),
         "rotor_vel": rng.uniform(1.2e4, 1.6e4, (*BATCH, 4)),
     }
-    many, one = (Sim(*counts, control="state", controller=name, engine="interpret") for counts in (BATCH, (1, 1)))
-    batch, start = fly(many, many.data, drawn), one.data
+    batch_sim, single_sim = (
+        Sim(*counts, control="state", controller=name, engine="interpret") for counts in (BATCH, (1, 1))
+    )
+    batch, start = fly(batch_sim, batch_sim.data, drawn_states), single_sim.data
     for i in [(0, 0), (2, 1)]:
-        single = fly(one, start, {key: x[i][None, None] for key, x in drawn.items()})
+        single = fly(single_sim, start, {key: x[i][None, None] for key, x in drawn_states.items()})
         for x, y in zip(batch, single, strict=True):
             # float32 rounding, which 25 steps of feedback with gains of PWM amplify
             np.testing.assert_allclose(x[i], y[0, 0], rtol=1e-3, atol=1e-4 * max(1.0, float(np.abs(y).max())))
@@ -177,8 +179,8 @@ def test_the_cases_cover_dynamics_and_control():
     ``test_c_firmware`` compares. Modules that controllers import count as covered by them.
     """
     covered = {m.__name__ for m in MODULES}
-    for place in CONTROLLERS.values():
-        module = importlib.import_module(place.partition(":")[0])
+    for path in CONTROLLERS.values():
+        module = importlib.import_module(path.partition(":")[0])
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
     names = ("__init__", "levels", "models", "parameters", "parameter_tables")
     names += ("protocol", "controllers", "setpoint", "switch", "firmware")

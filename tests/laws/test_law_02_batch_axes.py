@@ -81,11 +81,11 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
 def test_scopes_determine_the_axes(dynamics, control):
     """Law 2: drone leaves are (n_worlds, n_drones, *core), world leaves (n_worlds, 1, *core), shared ones core."""
     sim = shared_sim(dynamics=dynamics, control=control)
-    one = make_data(sim, 1, 1)
+    single_data = make_data(sim, 1, 1)
     counts = dict.fromkeys(("drone", "world", "shared"), 0)
     for n_worlds, n_drones in SIZES:
         data = make_data(sim, n_worlds, n_drones)
-        for scope, x, single in zip(*map(jax.tree.leaves, (scopes(data), data, one)), strict=True):
+        for scope, x, single in zip(*map(jax.tree.leaves, (scopes(data), data, single_data)), strict=True):
             batch = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1), "shared": ()}[scope]
             core = single.shape[len(batch) :]
             is_ids = x is data.core.drone_mocap_ids  # shared, with one number per drone

@@ -19,7 +19,9 @@ from crazysim.sim.visualize import (
 
 HEIGHT, WIDTH = 180, 240
 FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
+"""Focal length of the camera, pixels."""
 DRONES = np.array([[0.3, 0.0, 1.4], [-0.3, 0.0, 1.4]])
+"""Positions of the drones, m."""
 RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 

@@ -65,14 +65,14 @@ def test_quality_settings_change_only_while_a_context_is_made(monkeypatch):
 
 def test_a_fast_image_shows_the_same_scene_with_jagged_edges(opengl, monkeypatch):
     images = {}
-    for chosen in ("full", "fast"):
-        monkeypatch.setenv(software.QUALITY_VARIABLE, chosen)
+    for quality in ("full", "fast"):
+        monkeypatch.setenv(software.QUALITY_VARIABLE, quality)
         sim = Sim()
         sim.scene.add("pole", count=1, pos=[[0.0, 0.5, 0.0]], height=1.0, radius=0.05)
         config = {"lookat": [0, 0, 0.3], "distance": 1.5, "azimuth": 90, "elevation": -20}
-        images[chosen] = sim.render("rgb_array", cam_config=config, width=240, height=180).astype(int)
+        images[quality] = sim.render("rgb_array", cam_config=config, width=240, height=180).astype(int)
         sim.close()
     difference = np.abs(images["full"] - images["fast"]).max(-1)
     assert np.mean(difference > 24) < 0.05, "edges and shadows differ, and nothing else"
-    n_colors = {chosen: len(np.unique(image.reshape(-1, 3), axis=0)) for chosen, image in images.items()}
+    n_colors = {quality: len(np.unique(image.reshape(-1, 3), axis=0)) for quality, image in images.items()}
     assert n_colors["fast"] < n_colors["full"], "samples of a pixel mix the colours at edges"

@@ -46,6 +46,7 @@ DERIVED = (
     *("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos"),
     "cam_xmat",
 )
+"""Fields of MuJoCo's data that a sync computes from the poses."""
 
 
 @pytest.fixture(scope="module", params=["", '<joint type="hinge"/>'], ids=["fixed", "joint"])

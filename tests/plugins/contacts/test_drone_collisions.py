@@ -1,4 +1,4 @@
-"""Drones that collide: impulses by hand, laws, engines, and wrong input."""
+"""Drones that collide: speeds by hand, momentum, energy, resets, and wrong input."""
 
 import numpy as np
 import pytest

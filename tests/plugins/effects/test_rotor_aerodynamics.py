@@ -13,14 +13,16 @@ from crazysim import ConfigError, RotorAerodynamics, Sim, Wind, load_airframe, s
 from crazysim.dynamics import inflow
 
 R, RHO = 0.0275, 1.225
+"""Radius of a propeller, m, and density of the air, kg/m^3."""
 WEIGHT = 0.0434 * 9.81
 HOVER = 1661.27  # rad/s: 4.407354891648379e-10 n^2 - 3.133427287299859e-7 n = 0.0434 * 9.81 / 4 at n = 15,864 rpm
 DRAG_XY, DRAG_Z = 0.021643637770852733, 0.02477138502714662
+"""Linear drag of the airframe across and along its z axis, N s/m."""
 QUAD = {"control": "rotor_vel", "engine": "interpret"}
 
 
 def hover(n_worlds=1, drone="cf21B_500", **settings):
-    """Return a simulation of hovering drones with rotors in moving air."""
+    """Return a simulation of hovering drones, and its plugin of rotors in moving air."""
     sim = Sim(n_worlds, drone=drone, **QUAD)
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
     return sim, sim.add(RotorAerodynamics(**settings))
@@ -55,12 +57,14 @@ def compiled_thrust():
 
 
 def thrust(static, ang_vel, axial, across, blade, factor=1.0):
+    """Return the thrust, N, of a rotor with a static thrust, at speeds, m/s, along its axis and across it."""
     with jax.enable_x64(True):
         values = [np.float64(x) for x in (static, ang_vel, axial, across**2, blade, R, RHO, factor)]
         return float(compiled_thrust()(*values))
 
 
 def blade():
+    """Return the blade coefficient of a rotor of the airframe."""
     disc = inflow.disc_factor(R, RHO)
     return float(inflow.blade_coefficient(DRAG_Z / 4, WEIGHT / 4, HOVER, disc))
 
@@ -197,9 +201,9 @@ def test_wind_acts_as_the_opposite_velocity_of_the_drone(quad):
     windy, in_wind = hover()
     windy.add(Wind(air))
     force, torque = wrench(calm, plugin, vel=-air)
-    found, turned = wrench(windy, in_wind)
-    np.testing.assert_allclose(found[0], force[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(turned[0], torque[0], rtol=1e-4, atol=1e-9)
+    force_in_wind, torque_in_wind = wrench(windy, in_wind)
+    np.testing.assert_allclose(force_in_wind[0], force[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(torque_in_wind[0], torque[0], rtol=1e-4, atol=1e-9)
 
 
 def test_a_vertical_gust_lifts_with_the_time_constant_of_the_inflow():

@@ -26,6 +26,7 @@ from crazysim.plugins.sensors import (
 GYRO = Triad(noise=2.4e-4, bias_spread=0.0175, random_walk=1e-4)
 ACCEL = Triad(noise=2e-3, bias_spread=0.2, random_walk=1e-3)
 POS, ANGLE = 0.01, 0.02
+"""Standard deviations of measured positions, m, and attitudes, rad."""
 
 
 def add_error(estimate, error):
@@ -84,6 +85,7 @@ def image_motion(state, cos_tilt):
 
 
 def differences(state):
+    """Return the differences of the distances to the anchors from the distance to the first one, m. (3,)"""
     distance = jnp.linalg.norm(state.pos - ANCHORS, axis=-1)
     return distance[1:] - distance[0]
 
@@ -103,6 +105,7 @@ UPDATES = {
     "ray": lambda state, z, rot, std: updates.update_ray(state, z[0], std),
     "differences": lambda state, z, rot, std: updates.update_differences(state, ANCHORS, z, std),
 }
+"""Updates of a state by a measurement, by kind."""
 
 
 @pytest.mark.parametrize("kind", MEASURED)

@@ -100,7 +100,7 @@ def simulate_in_crazysim(dof, cases, starts):
 
 
 CASES = {
-    # degrees of freedom, position of the joint, damping, initial angles and body rates, control control_law
+    # degrees of freedom, position of the joint, damping, initial angles and body rates, control law
     "swing": (2, (0, 0, 0), 0.0, (0.6, 0.3), (0, 0, 0), constant_thrust),
     "swing, hinge": (1, (0, 0, 0), 0.001, (0.8, 0.0), (0.3, 0, 0.5), feedback),
     "hover": (2, (0.01, 0, -0.02), 0.001, (0.3, 0.2), (0, 0, 0.5), feedback),

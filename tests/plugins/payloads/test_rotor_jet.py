@@ -13,8 +13,11 @@ from crazysim.plugins.payloads import Hook, JetTable, load_jet_table, rotor_jet
 from crazysim.plugins.payloads.panels import shape_panels
 
 RPM = 60 / (2 * np.pi)
+"""Speed of 1 rad/s, rpm."""
 SIZE = (0.2, 0.1, 0.04)
+"""Lengths of the load, a box, m."""
 DEPTH = 0.5
+"""Distance of the load below its drone, m."""
 
 
 @pytest.mark.parametrize("shape, area", [(Shape("box", (0.1, 0.05, 0.02)), 0.064), (Shape("sphere", (0.1,)), 0.12566)])
@@ -75,13 +78,13 @@ def test_moving_air_passes_its_momentum_to_the_sides_that_face_it():
     velocity = np.broadcast_to([1.0, 0.0, -5.0], (1, 5, 5, 11, 3))
     table = JetTable([1000.0], None, velocity, (-0.2, -0.2, -1.0), 0.1)
     sim, _plugin = build(table=table, air_density=1.2)
-    force = jax.tree.map(np.asarray, jet_record(sim))
+    record = jax.tree.map(np.asarray, jet_record(sim))
     expected = 1.2 * np.array([1.0, 0, -5.0]) * (5.0 * 0.2 * 0.1 + 1.0 * 0.1 * 0.04)
-    np.testing.assert_allclose(force.force[1, 0], expected, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(record.force[1, 0], expected, rtol=1e-5, atol=1e-7)
     # the force of the side acts at (-0.1, 0, 0), that of the top at (0, 0, 0.02)
     side, top = 1.2 * 0.1 * 0.04 * np.array([1, 0, -5.0]), 1.2 * 5 * 0.02 * np.array([1, 0, -5.0])
     torque = np.cross([-0.1, 0, 0], side) + np.cross([0, 0, 0.02], top)
-    np.testing.assert_allclose(force.torque[1, 0], torque, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(record.torque[1, 0], torque, rtol=1e-4, atol=1e-7)
 
 
 def test_outside_the_box_of_the_table_there_is_no_jet():

@@ -16,12 +16,13 @@ from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.envs import AutoReset, Task, flying, make
 from crazysim.pytree import PyTree, leaf
 
-SMALL = {"size": (20.0, 16.0), "center": (4.0, -2.0), "free": [[4.0, -2.0, 2.0]]}
+SMALL_FOREST = {"size": (20.0, 16.0), "center": (4.0, -2.0), "free": [[4.0, -2.0, 2.0]]}
+"""Settings of a forest of 20 cells with a free disc in its middle."""
 
 
 def build(n_worlds=3, n_drones=2, **settings):
     sim = Sim(n_worlds, n_drones, control="rotor_vel", rng_key=5)
-    forest = sim.add(Forest(**SMALL | settings))
+    forest = sim.add(Forest(**SMALL_FOREST | settings))
     sim.reset()
     return sim, forest
 
@@ -48,7 +49,7 @@ def test_trees_stand_in_their_cells_at_the_requested_density():
     assert radii.max() == pytest.approx(0.3)
     assert len(np.unique(radii)) == 8
     middle = np.concatenate([m.pos for m in forest.models()])[:, :2]
-    np.testing.assert_allclose(middle.mean(axis=0), SMALL["center"])
+    np.testing.assert_allclose(middle.mean(axis=0), SMALL_FOREST["center"])
     offset = np.asarray(forest.poses(sim.data)[0])[..., :2] - middle
     reach = (4.0 - 0.6) / 2 - radii
     assert np.all(np.abs(offset[..., 0]) <= reach + 1e-5)
@@ -74,7 +75,7 @@ def test_law_10_a_layout_depends_on_world_and_episode():
 
 def test_worlds_that_were_not_reset_draw_in_their_first_step():
     sim = Sim(3, control="rotor_vel", rng_key=5)
-    forest = sim.add(Forest(**SMALL))
+    forest = sim.add(Forest(**SMALL_FOREST))
     sim.step(2)
     assert len(np.unique(forest.read(sim.data).words[..., 0])) == 3
 
@@ -137,7 +138,7 @@ def test_difficulty_is_the_fraction_of_trees_that_stand():
     np.testing.assert_allclose(np.mean(fraction), 0.4, atol=0.03)
     assert np.corrcoef(fraction, difficulty)[0, 1] > 0.6
     stage_before = sim.step_pipeline["forest_begin"]
-    sim.replace(Forest(**SMALL | {"difficulty": 0.0, "free": np.zeros((0, 3))}))
+    sim.replace(Forest(**SMALL_FOREST | {"difficulty": 0.0, "free": np.zeros((0, 3))}))
     assert sim.step_pipeline["forest_begin"] is stage_before  # no stage was built
     sim.reset()
     assert not any(len(trees) for trees, _ in standing_trees(sim, forest))
@@ -188,7 +189,7 @@ class Gap(PyTree):
 @pytest.mark.parametrize("engine", ["fused", "interpret"])
 def test_a_stage_of_one_drone_can_compute_the_clearance(engine):
     sim = Sim(3, 2, control="rotor_vel", rng_key=5, engine=engine)
-    forest = sim.add(Forest(**SMALL))
+    forest = sim.add(Forest(**SMALL_FOREST))
     sim.reset()
     sim.data = with_states(sim.data, pos=np.random.default_rng(2).uniform([-4, -8, 1], [12, 4, 3], (3, 2, 3)))
 
@@ -276,4 +277,4 @@ def test_law_09_wrong_settings_are_errors(case):
 def test_a_forest_with_other_trees_needs_another_name(half_forest):
     sim, _ = half_forest
     with pytest.raises(ConfigError, match="use another name="):
-        sim.replace(Forest(**SMALL | {"radii": (0.2, 0.4)}))
+        sim.replace(Forest(**SMALL_FOREST | {"radii": (0.2, 0.4)}))

@@ -104,17 +104,19 @@ def test_law_08_gradients_are_central_differences(x64):
         """Return the sums, their slopes along the directions by forward and by reverse derivatives, and the sizes."""
         sums, linear, sizes = jax.linearize(measure, x, has_aux=True)
         transposed = jax.vmap(lambda row: jax.linear_transpose(linear, x)(row)[0])(jnp.eye(len(all_sensors)))
-        along = sum(jnp.sum(transposed[k] * directions[k], axis=range(1, 4)) for k in names)
-        return sums, linear(directions), along, sizes
+        reverse_slopes = sum(jnp.sum(transposed[k] * directions[k], axis=range(1, 4)) for k in names)
+        return sums, linear(directions), reverse_slopes, sizes
 
     h = 1e-4
-    (_, slopes, along, sizes), *ends = (
+    (_, slopes, reverse_slopes, sizes), *ends = (
         derivatives({k: x + sign * h * directions[k] for k, x in start.items()}) for sign in (0, 1, -1)
     )
     differences = (ends[0][0] - ends[1][0]) / (2 * h)
-    for name, slope, back, difference, size in zip(SENSORS, slopes, along, differences, sizes, strict=True):
+    for name, slope, reverse_slope, difference, size in zip(
+        SENSORS, slopes, reverse_slopes, differences, sizes, strict=True
+    ):
         assert abs(difference) > 1e-6 * size, name
-        np.testing.assert_allclose([slope, back], difference, rtol=1e-5, err_msg=name)  # h^2 of the difference
+        np.testing.assert_allclose([slope, reverse_slope], difference, rtol=1e-5, err_msg=name)  # h^2 of the difference
 
 
 def test_gradients_pass_through_rounding(x64):

@@ -104,7 +104,7 @@ def test_single_track_tends_to_the_gym_at_small_angles(seed):
             own_state = CarState(np.zeros(3), zero, vel, w, d, zero)
             ours = jax.tree.map(np.asarray, own_rates(own_state, np.zeros(2), car))
             # Rate of the angle of a velocity (x, y): (x y' - y x') / (x^2 + y^2).
-            turn = (vel[0] * ours.body_vel[1] - vel[1] * ours.body_vel[0]) / speed**2
-            errors.append([ours.yaw_rate[0] - theirs.yaw_rate[0], turn - theirs.slip[0]])
+            slip_rate = (vel[0] * ours.body_vel[1] - vel[1] * ours.body_vel[0]) / speed**2
+            errors.append([ours.yaw_rate[0] - theirs.yaw_rate[0], slip_rate - theirs.slip[0]])
         slopes = np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
         assert np.all(slopes > 2.7), (slopes, errors)
