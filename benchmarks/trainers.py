@@ -3,10 +3,11 @@
     python benchmarks/trainers.py --device gpu --worlds 1024 65536 --seeds 3
     python benchmarks/trainers.py --worlds 64 --iterations 8 --trainers crazysim brax
 
-All train the task with the hyperparameters of its recipe: the same worlds, steps, epochs, minibatches, networks with
-tanh, initial learning rate, discount and clipping. The learning rate decreases linearly to zero in crazysim, and is
-constant in Brax and RSL-RL. Other settings are the defaults of each library. Brax steps the environment by ``BraxEnv``,
-within its compiled program. RSL-RL steps it with one compiled call a step, and shares arrays with Torch.
+All three libraries train the task with the hyperparameters of its recipe: the same worlds, steps, epochs, minibatches,
+networks with tanh, initial learning rate, discount and clipping. The learning rate decreases linearly to zero in
+crazysim, and is constant in Brax and RSL-RL. Other settings are the defaults of each library. Brax steps the
+environment by ``BraxEnv``, within its compiled program. RSL-RL steps it with one compiled call a step, and shares
+arrays with Torch.
 
 There is a JSON line for each trainer and number of worlds. It has the environment steps per second, the median over the
 seeds, and the success of each seed on 1,000 held-out starts after the same number of steps. The rate is measured over

@@ -1,8 +1,8 @@
 """Comparison of crazysim with Crazyflow 0.4.0, which runs in a virtual environment that this script creates.
 
-Each program runs in its own process with the same JAX. The programs alternate batch by batch, so that the noise of a
-shared machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients are
-measured with each controller of ``--controllers``; ``crazyflow`` is the controller of Crazyflow. The cases:
+Each program runs in its own process with the same JAX. Batches of calls of the two programs alternate, so that the
+noise of a shared machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients
+are measured with each controller of ``--controllers``; ``crazyflow`` is the controller of Crazyflow. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds

@@ -52,7 +52,7 @@ def _add_selection(
     def copy_body(n_extra: int) -> tuple[Builder, list[Value], list[Element]]:
         """Return the builder of a copy of the body, its last inputs, and its candidates.
 
-        The copy has further inputs for published integers, before the input that marks the drone itself.
+        The copy has ``n_extra`` further inputs for published integers, before the input that marks the drone itself.
         """
         inner = Builder(builder)
         new_inputs = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_extra)]
