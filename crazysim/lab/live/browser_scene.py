@@ -137,13 +137,13 @@ class BrowserScene:
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
         distances = self._ray_distances(picture, origin, direction)
         if np.isfinite(distances).any():
-            world, mocap = np.unravel_index(distances.argmin(), distances.shape)
-            return int(world), self._bodies.items[self._bodies.owner[mocap]], None
+            shown_index, mocap = np.unravel_index(distances.argmin(), distances.shape)
+            return int(shown_index), self._bodies.items[self._bodies.owner[mocap]], None
         if direction[2] > -1e-6:
             return 0, None, None
         point = origin - direction * origin[2] / direction[2]
-        world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
-        return world, None, point - self.offsets[world]
+        shown_index = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
+        return shown_index, None, point - self.offsets[shown_index]
 
     def _ray_distances(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
         """Return the distance between a ray and the origin of each body in n shown worlds, m. (n, n_mocap)

@@ -55,13 +55,13 @@ class SceneBodies:
             sim: Simulation.
             shapes: Visible geoms, for the sizes of the bodies.
         """
-        names = _list_mocap_names(sim)
+        kinds_and_numbers = _list_kinds_and_numbers(sim)
         parts = {part: base for plugin in sim.plugins.values() for part, base in _find_parts(plugin.moved_kinds or ())}
-        counts = Counter(kind for kind, _ in names)
+        counts = Counter(kind for kind, _ in kinds_and_numbers)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
         items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_list_drones(sim))]
         mocap_ids = {body.mocap for body in items}
-        for mocap, (kind, k) in enumerate(names):
+        for mocap, (kind, k) in enumerate(kinds_and_numbers):
             if mocap not in mocap_ids and kind not in parts:
                 member_names = members.get(kind, ())
                 name = member_names[k] if k < len(member_names) else kind if counts[kind] == 1 else f"{kind} {k}"
@@ -69,12 +69,12 @@ class SceneBodies:
         self.items = tuple(items)
         item_indices = {(body.kind, body.index): i for i, body in enumerate(items)}
         index_of_mocap = {body.mocap: i for i, body in enumerate(items)}
-        self.owner = np.array([index_of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
+        self.owner = np.array([index_of_mocap.get(mocap, -1) for mocap in range(len(kinds_and_numbers))], int)
         for mocap in np.flatnonzero(self.owner < 0):
-            kind, k = names[mocap]
+            kind, k = kinds_and_numbers[mocap]
             base = parts[kind]  # parts are in the order of their bodies, equally many for each
             self.owner[mocap] = item_indices[base, k * counts[base] // counts[kind]]
-        self.low, self.high = _bounding_boxes(len(names), shapes)
+        self.low, self.high = _bounding_boxes(len(kinds_and_numbers), shapes)
 
     @property
     def trail_mocap_ids(self) -> NDArray:
@@ -113,15 +113,15 @@ def _list_drones(sim: Sim) -> list[tuple[str, int]]:
     return list(zip(sim.drone_names, np.asarray(sim.data.core.drone_mocap_ids).tolist(), strict=True))
 
 
-def _list_mocap_names(sim: Sim) -> list[tuple[str, int]]:
+def _list_kinds_and_numbers(sim: Sim) -> list[tuple[str, int]]:
     """Return kind and number of every mocap body, by mocap id; a body without a number in its name gets 0."""
     model = sim.mj_model
-    names: list[tuple[str, int]] = [("", 0)] * model.nmocap
+    kinds_and_numbers: list[tuple[str, int]] = [("", 0)] * model.nmocap
     for body in np.flatnonzero(model.body_mocapid >= 0):
         text = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(body)) or f"body {body}"
         kind, _, number = text.rpartition(":")
-        names[model.body_mocapid[body]] = (kind, int(number)) if kind and number.isdigit() else (text, 0)
-    return names
+        kinds_and_numbers[model.body_mocapid[body]] = (kind, int(number)) if kind and number.isdigit() else (text, 0)
+    return kinds_and_numbers
 
 
 def _find_parts(kinds: Sequence[str]) -> list[tuple[str, str]]:

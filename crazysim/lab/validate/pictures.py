@@ -36,7 +36,7 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
     colors = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
     has_names = isinstance(rows[0].x, str)
     figure = Figure(figsize=(9, 4 if has_names else 4.8), layout="constrained")
-    for axis, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
+    for ax, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
         unit_rows = [row for row in rows if row.unit == unit]
         x_values = list(dict.fromkeys(row.x for row in unit_rows))
         for series in dict.fromkeys(row.series for row in unit_rows):
@@ -45,19 +45,19 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
             ]
             line = "" if has_names else "--" if series.startswith("published") else "-"
             style = {"marker": "o", "linestyle": line, "markersize": 4, "linewidth": 1.2}
-            axis.plot(*zip(*points, strict=True), label=series, color=colors[series], **style)
+            ax.plot(*zip(*points, strict=True), label=series, color=colors[series], **style)
         if has_names:
-            axis.set_xticks(range(len(x_values)), x_values, rotation=90 if len(x_values) > 12 else 20, fontsize=7)
+            ax.set_xticks(range(len(x_values)), x_values, rotation=90 if len(x_values) > 12 else 20, fontsize=7)
             low, high = next(row.bound for row in unit_rows if row.bound is not None)
-            axis.axhspan(max(low, 0), high, color="0.93", zorder=0, label="passes")
-            axis.legend(fontsize=7)
+            ax.axhspan(max(low, 0), high, color="0.93", zorder=0, label="passes")
+            ax.legend(fontsize=7)
         else:
-            axis.set(yscale="log", xticks=x_values, xticklabels=[f"{x:g}" for x in x_values])
-            axis.yaxis.set_major_formatter("{x:g}")
-            axis.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
-            axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))
-        axis.set(xlabel=section.axes[0], ylabel=f"{section.axes[1]}, {unit}".removesuffix(", "))
-        axis.grid(alpha=0.3)
+            ax.set(yscale="log", xticks=x_values, xticklabels=[f"{x:g}" for x in x_values])
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+            ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+        ax.set(xlabel=section.axes[0], ylabel=f"{section.axes[1]}, {unit}".removesuffix(", "))
+        ax.grid(alpha=0.3)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=110)
     path.parent.mkdir(exist_ok=True)
