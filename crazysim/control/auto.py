@@ -9,7 +9,7 @@ All gains follow from one rate ``a`` about each axis. If the thrusts follow thei
 and kd are the gains per inertia on attitude and body rate, the characteristic polynomial is
 ``s^3 / a + s^2 + kd s + kp``. With
 
-    kd = 0.6 a,   kp = 0.12 a^2,   and at most half of the rate of roll and pitch about yaw,
+    kd = 0.6 a,   kp = 0.12 a^2,   where a about yaw is at most half of the rate that the lag allows,
 
 body rates follow with a damping ratio of 0.65, which overshoots a step by 7%. Attitudes follow with a pole at -0.31 a
 and a pair of poles with a damping ratio of 0.55, without overshoot. The attitude loop delays a slow command by
@@ -23,8 +23,8 @@ drone along the line kp e + kd e' = 0, on which the rotors must brake with the a
 in alternating directions, and it never settles.
 
 A rotor that speeds up also turns the body the other way. Let I be the inertia of a rotor, and q the slope of its drag
-torque over its speed. A drag torque y then causes the yaw torque y + z y', with z = I / q, which is up to 0.13 s for
-the built-in airframes. Under feedback, this lead would reverse the demand on the rotors at every tick. Therefore only
+torque over its speed. A drag torque y then causes the yaw torque y + z y', with z = I / q. For the built-in airframes
+z is up to 0.13 s. Under feedback, this lead would reverse the demand on the rotors at every tick. Therefore only
 the fraction 1 / (1 + r z) of the missing drag torque is demanded, with the rate r of the rotors. The transfer function
 from desired to actual yaw torque is then
 

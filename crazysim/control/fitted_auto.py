@@ -88,7 +88,7 @@ class FittedAuto(Controller):
         specific_thrust, memory = specific_force(s.pos, s.vel, known_acc, command, memory, self.freq, p.position)  # type: ignore
         specific_thrust = keep_upright(specific_thrust - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
 
-        forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])
+        forward, left = rotation.heading(data.controls.state.cmd[..., 9:13])  # of the commanded quaternion
         advanced_thrust = specific_thrust + p.lead[..., :1] * command.jerk + p.lead[..., 1:] * command.snap
         angles = p.angle_ratio * rotation.rpy_from_axes(*rotation.axes_from_z(advanced_thrust, forward, left))
         thrust = (model.mass * dot(specific_thrust, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef

@@ -89,7 +89,8 @@ class INDIMemory(PyTree):
     momentum: Array = leaf("drone", 1)
     """Angular momentum of body and rotors at the last tick, body frame, N m s. (n_worlds, n_drones, 3)"""
     filter: Array = leaf("drone", 1)
-    """Two states of the filter for each of its 12 signals. (n_worlds, n_drones, 24)"""
+    """Two states of the filter for each of its 12 signals: components of acceleration, acceleration by the rotors, rate
+    of change of the momentum, and torque of the rotors. (n_worlds, n_drones, 24)"""
     started: Array = leaf("drone", 1)
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
 

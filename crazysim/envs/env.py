@@ -250,7 +250,7 @@ class Env(ABC):
         return f"{step}\nrays: {rays}" if rays else step
 
     def target(self, state: EnvState) -> Array | None:
-        """Return the target position of each drone, or several marks per drone, to draw in images, m; None without one.
+        """Return the target position of each drone, or several marks per drone, to draw in images, m; None if none.
 
         Returns:
             (n_worlds, n_drones, 3) or (n_worlds, n_drones, n_marks, 3)

@@ -1,4 +1,4 @@
-"""Rules of when and how new episodes begin within a step."""
+"""Rules of when and how new episodes begin within a step. They have nothing to do with policies that choose actions."""
 
 from __future__ import annotations
 

@@ -52,7 +52,8 @@ class EnvStepper:
     def state(self) -> EnvState | None:
         """The state; None before the first assignment.
 
-        Results of steps, except for ``terminated`` and ``truncated``, may still have the values of the assigned state.
+        ``terminated`` and ``truncated`` have the values of the last step. The other results of steps
+        (``RESULT_FIELDS``) may still have the values of the assigned state, because steps do not store them.
         """
         return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 

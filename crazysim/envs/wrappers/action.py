@@ -16,7 +16,7 @@ class ActionQueue(PyTree):
     """Memory of ``ActionDelay``."""
 
     actions: Array = leaf("drone", 2)
-    """Actions that have not arrived yet, the oldest first. (n_worlds, n_drones, n, k)"""
+    """The n actions that have not arrived yet, the oldest first. (n_worlds, n_drones, n, k)"""
 
 
 class ActionDelay(Wrapper):

@@ -168,7 +168,7 @@ class Frames(PyTree):
     """Memory of ``FrameStack``."""
 
     obs: Obs = leaf("drone", 2)
-    """The last observations, the oldest first. (n_worlds, n_drones, n, k) each"""
+    """The last n observations, the oldest first. (n_worlds, n_drones, n, k) each"""
 
 
 class FrameStack(Wrapper):
