@@ -35,7 +35,7 @@ class BodyGeom:
     size: NDArray
     """Half sizes or radii as in MJCF, m. (3,)"""
     pos: NDArray
-    """Centre, m. (3,)"""
+    """Centre, or the near end of a capsule with ``end``, m. (3,)"""
     material: str = ""
     """Name of the material; each drone has its own copy of the materials in ``LED_MATERIALS``."""
     end: NDArray | None = None

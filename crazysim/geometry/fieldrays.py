@@ -118,6 +118,7 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     tolerance = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
     def visit_cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
+        """Intersect a ray with the two triangles of its cell; return the next cell and the nearest hit so far."""
         column, row, hit = carry
         is_inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
