@@ -126,7 +126,6 @@ def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered_course):
     full_report = jax.device_get(sim.contact_report())
     contacts_in_world = sim.scene.contact_fn()
     contacts_of_drone = sim.scene.contact_fn(drones=False)
-    states = {}
 
     @stage("world")
     def world(data):

@@ -13,8 +13,6 @@ from crazysim.lab.validate import firmware_filters
 from crazysim.plugins.estimators import Kalman, error_state, updates
 from crazysim.plugins.sensors import IMU, Barometer, MotionCapture, Triad
 
-ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
-
 
 @pytest.mark.parametrize("kind", firmware_filters.MEASUREMENT_KINDS)
 def test_the_filter_agrees_with_the_compiled_firmware(kind):

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from crazysim import ConfigError, Sim
 from crazysim.plugins.payloads import Hook
 
-MASS, LOAD, HOOK = 0.605, 0.2, 0.0203
+MASS, LOAD = 0.605, 0.2
+"""Masses of drone and load, kg."""
 SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
 
 
