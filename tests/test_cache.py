@@ -90,7 +90,7 @@ def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkey
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = [getattr(jax.config, name) for name in names]
 
-    def kept():
+    def kept_programs():
         return {path.name.split("-")[0] for path in default_folder().glob("*-cache")}
 
     with keep_programs():
@@ -98,17 +98,17 @@ def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkey
             jax.jit(_inner)(jnp.ones(7))
         jax.jit(_after)(jnp.ones(7))
     jax.jit(_outside)(jnp.ones(7))
-    assert {"jit__inner", "jit__after"} <= kept()
-    assert "jit__outside" not in kept()
+    assert {"jit__inner", "jit__after"} <= kept_programs()
+    assert "jit__outside" not in kept_programs()
     assert [getattr(jax.config, name) for name in names] == before
-    own = tmp_path / "own"
-    jax.config.update("jax_compilation_cache_dir", str(own))  # JAX opens a cache once a process
+    user_folder = tmp_path / "own"
+    jax.config.update("jax_compilation_cache_dir", str(user_folder))  # JAX opens a cache once a process
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     with keep_programs():
         jax.jit(_of_user)(jnp.ones(7))
-    assert [path.name.split("-")[0] for path in own.glob("jit__of_user*-cache")] == ["jit__of_user"]
-    assert "jit__of_user" not in kept()
+    assert [path.name.split("-")[0] for path in user_folder.glob("jit__of_user*-cache")] == ["jit__of_user"]
+    assert "jit__of_user" not in kept_programs()
 
 
 def test_a_block_leaves_the_cache_of_a_block_of_another_thread_open(settings, monkeypatch, tmp_path):

@@ -198,11 +198,11 @@ def test_an_array_of_the_host_is_put_on_a_device(dtype):
     x = np.arange(6).reshape(2, 3).astype(dtype)
     for device in jax.devices()[:2]:
         sharding = jax.sharding.SingleDeviceSharding(device)
-        ours, theirs = jaxcompat.put_host_array(x.copy(), sharding), jax.device_put(x, sharding)
-        assert (ours.aval, ours.committed, ours.devices()) == (theirs.aval, True, {device})
-        np.testing.assert_array_equal(ours, x)
+        array, expected = jaxcompat.put_host_array(x.copy(), sharding), jax.device_put(x, sharding)
+        assert (array.aval, array.committed, array.devices()) == (expected.aval, True, {device})
+        np.testing.assert_array_equal(array, x)
         doubled = jax.jit(lambda x: x * 2)
-        np.testing.assert_array_equal(doubled(ours), doubled(theirs))
+        np.testing.assert_array_equal(doubled(array), doubled(expected))
         assert jaxcompat.n_compilations(doubled) == 1
 
 

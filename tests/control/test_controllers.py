@@ -108,8 +108,10 @@ def test_gains_of_crazyflow_are_set_under_crazyflows_names():
     doubled = ctrl.params.replace(kR=2 * ctrl.params.kR)
     sim.data = sim.data.replace(controls=controls.replace(attitude=ctrl.replace(params=doubled)))
     np.testing.assert_array_equal(sim.data.controls.controller.params.kR, 2 * ctrl.params.kR)
-    own = sim.data.controls.controller
-    sim.data = sim.data.replace(controls=sim.data.controls.replace(controller=own.replace(params=ctrl.params)))
+    controller_data = sim.data.controls.controller
+    sim.data = sim.data.replace(
+        controls=sim.data.controls.replace(controller=controller_data.replace(params=ctrl.params))
+    )
     np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, ctrl.params.kR)
     fitted = Sim(dynamics="so_rpy").data.controls
     assert fitted.controller is fitted.attitude.controller is fitted.attitude.params is None
@@ -521,7 +523,7 @@ def test_ten_steps_and_commands_trace_once():
 )
 def test_missing_gains_are_listed_all_at_once(controller, control):
     """With the values that the message lists, and no others, the airframe flies."""
-    whole = load_airframe("cf2x_L250")
+    complete = load_airframe("cf2x_L250")
     light = {"base": "cf2x_L250", "name": "light", "rigid_body": {"mass": 0.03}}
     with pytest.raises(ConfigError) as error:
         Sim(drone=light, control=control, controller=controller)
@@ -534,5 +536,5 @@ def test_missing_gains_are_listed_all_at_once(controller, control):
         table = light
         for part in path[1:].split("."):
             table = table.setdefault(part, {})
-        table |= {key: whole.value(f"{path[1:]}.{key}") for key in keys.split(", ")}
+        table |= {key: complete.value(f"{path[1:]}.{key}") for key in keys.split(", ")}
     Sim(drone=light, control=control, controller=controller)

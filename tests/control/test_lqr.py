@@ -115,11 +115,11 @@ def test_tracking_lqr_needs_the_setpoints_of_a_trajectory():
 
 
 @pytest.mark.parametrize(
-    "shape, dt, got", [((), 0.1, r"shape \(3,\) and 0.1"), ((4,), np.nan, r"shape \(4, 3\) and nan")]
+    "shape, dt, described_input", [((), 0.1, r"shape \(3,\) and 0.1"), ((4,), np.nan, r"shape \(4, 3\) and nan")]
 )
-def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, got):
+def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, described_input):
     setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), zero_setpoint())
-    with pytest.raises(ConfigError, match=f"got positions of {got}"):
+    with pytest.raises(ConfigError, match=f"got positions of {described_input}"):
         TrackingLQR(setpoints=setpoints, dt=dt).params(load_airframe("bumblebee"))
 
 

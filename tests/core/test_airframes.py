@@ -61,17 +61,17 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
     mixed.step(25)
     flown = jax.device_get(mixed.data.states)
     for k, airframe in enumerate(fleet):
-        own = set_flying(
+        single_sim = set_flying(
             Sim(drone=airframe, control=control, controller=controller, engine="interpret"), pos[:, k : k + 1]
         )
-        own.step(25)
-        n, own_states = own.airframe.n_rotors, jax.device_get(own.data.states)
+        single_sim.step(25)
+        n, single_states = single_sim.airframe.n_rotors, jax.device_get(single_sim.data.states)
         for name in STATES:
-            expected, got = getattr(own_states, name)[0, 0], getattr(flown, name)[0, k]
-            np.testing.assert_allclose(got, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
-        expected, got = own_states.rotor_vel[0, 0], flown.rotor_vel[0, k]
-        np.testing.assert_allclose(got[:n], expected, rtol=1e-3)
-        np.testing.assert_array_equal(got[n:], 0)
+            expected, found = getattr(single_states, name)[0, 0], getattr(flown, name)[0, k]
+            np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
+        expected, found = single_states.rotor_vel[0, 0], flown.rotor_vel[0, k]
+        np.testing.assert_allclose(found[:n], expected, rtol=1e-3)
+        np.testing.assert_array_equal(found[n:], 0)
 
 
 @pytest.mark.parametrize("name", ["bumblebee", "hexarotor"])
@@ -99,10 +99,10 @@ def test_fitted_models_may_be_mixed(dynamics):
     mixed = set_flying(Sim(2, drone=fleet, dynamics=dynamics, engine="interpret"), pos)
     mixed.step(50)
     for k, airframe in enumerate(fleet):
-        own = set_flying(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
-        own.step(50)
-        expected, got = np.asarray(own.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
-        np.testing.assert_allclose(got, expected, rtol=1e-6)
+        single_sim = set_flying(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
+        single_sim.step(50)
+        expected, found = np.asarray(single_sim.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_equal_airframes_share_their_parameters():
@@ -174,16 +174,16 @@ def test_effects_take_the_numbers_of_each_airframe():
     for effect in effects:
         sim.add(effect)
     for k, airframe in enumerate(fleet):
-        own = Sim(2, drone=airframe, engine="interpret")
+        single_sim = Sim(2, drone=airframe, engine="interpret")
         for effect in effects:
-            record, mixed = own.add(effect).read(own.data), effect.read(sim.data)
+            record, mixed = single_sim.add(effect).read(single_sim.data), effect.read(sim.data)
             for name in ("full_speed_voltage", "propeller_radius", "rotor_pos", "diameter"):
                 if hasattr(record, name):
                     expected = np.asarray(getattr(record, name))
-                    got = np.asarray(getattr(mixed, name))
-                    got = got[0, k] if got.ndim > expected.ndim else got
-                    got = got[: len(expected)]  # rows of rotors that it lacks follow
-                    np.testing.assert_allclose(got, expected, rtol=1e-6, err_msg=name)
+                    found = np.asarray(getattr(mixed, name))
+                    found = found[0, k] if found.ndim > expected.ndim else found
+                    found = found[: len(expected)]  # rows of rotors that it lacks follow
+                    np.testing.assert_allclose(found, expected, rtol=1e-6, err_msg=name)
     sim.step(2)
     assert np.all(np.isfinite(sim.data.states.pos))
 

@@ -70,8 +70,8 @@ def make_crowd_sim(n_worlds, n_drones, *plugins):
     physics = set(sim.step_pipeline) - {"increment_steps"}
     for plugin in plugins:
         sim.add(plugin)
-    own = {name: fn for name, fn in sim.step_pipeline.items() if name not in physics}
-    sim.step_pipeline = {"crowd": crowd, "move": move_by_force, **own}
+    other_stages = {name: fn for name, fn in sim.step_pipeline.items() if name not in physics}
+    sim.step_pipeline = {"crowd": crowd, "move": move_by_force, **other_stages}
     return sim
 
 
@@ -124,9 +124,9 @@ def test_law_07_a_bad_world_does_not_change_another(n_drones):
     sim = make_crowd_sim(3, n_drones)
     pos = np.array(sim.data.states.pos)
     pos[1, 0] = np.nan
-    bad = with_states(sim.data, pos=pos)
+    invalid_data = with_states(sim.data, pos=pos)
     step = Step(sim.step_pipeline)
-    a, b = step(sim.data, jnp.int32(2)), step(bad, jnp.int32(2))
+    a, b = step(sim.data, jnp.int32(2)), step(invalid_data, jnp.int32(2))
     np.testing.assert_array_equal(np.asarray(b.states.pos)[[0, 2]], np.asarray(a.states.pos)[[0, 2]])
     assert np.asarray(b.core.nonfinite).ravel().tolist() == [False, True, False]
     assert np.isnan(np.asarray(b.states.force)[1, :, 0]).all()

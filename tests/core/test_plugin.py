@@ -109,8 +109,8 @@ def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, 
     system = np.array([[0, 1, 0, 0], [0, 0, -0.8 / float(p.mass[0]), 1], [0, 1, -6.0, 0], [0, 0, 0, 0]])
     for axis, (start, g) in enumerate(zip([0, 0, 10.0], [0, 0, -9.81], strict=True)):
         exact = expm(DURATION * system) @ [start, v0[axis], 0.0, g]
-        for found, wanted in ((states.pos, exact[0]), (states.vel, exact[1]), (wake_vel, exact[2])):
-            errors = np.abs(np.asarray(found)[0, :, axis] - wanted)
+        for found, expected in ((states.pos, exact[0]), (states.vel, exact[1]), (wake_vel, exact[2])):
+            errors = np.abs(np.asarray(found)[0, :, axis] - expected)
             assert np.all(errors > 1e-14), "rounding hides the order"
             slope = np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
             assert abs(slope - Integrator(integrator).order) < 0.3, (axis, errors)

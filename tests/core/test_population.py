@@ -64,8 +64,8 @@ def test_a_member_moves_like_a_single_member():
     keep_mass_stages(single_sim)
     mass, start = single_sim.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
     for world, member in ((0, 0), (2, 1), (1, 3)):
-        own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
-        single_sim.data = single_sim.plugins["springs"].write(single_sim.default_data, own)
+        member_record = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
+        single_sim.data = single_sim.plugins["springs"].write(single_sim.default_data, member_record)
         single_sim.step(9)
         pos = np.asarray(single_sim.data.plugins["springs"].pos)[0, 0]
         np.testing.assert_allclose(pos, record.pos[world, member], rtol=1e-6)
@@ -108,8 +108,8 @@ def test_gradients_pass_through_populations():
 
     def loss(cmd):
         data = sim.data
-        for population, own in zip(sim.plugins.values(), cmd, strict=True):
-            data = population.with_command(data, own)
+        for population, population_cmd in zip(sim.plugins.values(), cmd, strict=True):
+            data = population.with_command(data, population_cmd)
         data = step(data, 5)
         return sum(jnp.sum(record.pos**2) for record in data.plugins.values()) + jnp.sum(data.states.pos)
 
@@ -181,8 +181,8 @@ def test_random_numbers_are_those_of_world_and_member():
     assert len(np.unique(drawn[0])) == drawn[0].size
     data = sim.data
     core = jax.tree.map(lambda x: x.reshape(-1)[0], data.core)
-    own = data.plugins["springs"].replace(member_id=np.asarray(data.plugins["springs"].member_id)[0, 0])
-    member_data = data.replace(core=core, plugins={"springs": own})
+    member_record = data.plugins["springs"].replace(member_id=np.asarray(data.plugins["springs"].member_id)[0, 0])
+    member_data = data.replace(core=core, plugins={"springs": member_record})
     assert world_key(member_data, "kick") != member_key(member_data, "springs", "kick")
 
 

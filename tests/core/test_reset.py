@@ -98,9 +98,11 @@ def test_metadata_on_a_field_that_holds_a_record_are_refused(counting_sim):
 def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
     sim = Sim(n_worlds=N_WORLDS, control="attitude")
     key = jax.random.key_data(sim.data.core.rng_key)
-    params, own = sim.data.params, sim.data.controls.controller
+    params, controller_data = sim.data.params, sim.data.controls.controller
     heavy = params.replace(mass=2 * params.mass, gravity_vec=0 * params.gravity_vec)
-    stiff = own.replace(params=own.params.replace(stiffness=3 * own.params.stiffness))
+    stiff = controller_data.replace(
+        params=controller_data.params.replace(stiffness=3 * controller_data.params.stiffness)
+    )
     changed = sim.data.replace(params=heavy, controls=sim.data.controls.replace(controller=stiff))
     sim.data = changed
     sim.seed(7)
@@ -110,7 +112,7 @@ def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
     sim.reset()
     np.testing.assert_array_equal(sim.data.params.mass, params.mass)
     np.testing.assert_array_equal(sim.data.params.gravity_vec, params.gravity_vec)
-    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, own.params.stiffness)
+    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, controller_data.params.stiffness)
     assert not np.array_equal(jax.random.key_data(sim.data.core.rng_key), key), "the seed stays"
 
 

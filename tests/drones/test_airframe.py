@@ -605,9 +605,9 @@ def test_another_body_inherits_no_gains(changes):
     np.testing.assert_array_equal(heir.value("drag.coefficients"), base.value("drag.coefficients"))
     same = load_airframe({"base": "cf2x_L250", "rigid_body": {"mass": float(base.value("rigid_body.mass"))}})
     assert set(same.values) == set(base.values)
-    own = load_airframe({"base": "cf2x_L250", **changes, "controller": {"mass": 0.04}})
-    assert float(own.value("controller.mass")) == 0.04
-    assert "controller.mass_thrust" not in own.values
+    with_gain = load_airframe({"base": "cf2x_L250", **changes, "controller": {"mass": 0.04}})
+    assert float(with_gain.value("controller.mass")) == 0.04
+    assert "controller.mass_thrust" not in with_gain.values
 
 
 @pytest.mark.parametrize("name", supported_drones("first_principles"))

@@ -102,8 +102,8 @@ def run_kernel(program, leaves, n_steps):
 )
 def test_a_stage_may_write_random_keys(run_steps):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
-    own = Draws(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
-    data = sim.data.replace(plugins={"own": own})
+    draws = Draws(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
+    data = sim.data.replace(plugins={"own": draws})
     program = optimise(lower_stages([draw], data))
     assert isinstance(program.segments[0], Segment)
     written, _ = run_steps(program, jax.tree.leaves(data), 2)

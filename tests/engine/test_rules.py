@@ -115,10 +115,10 @@ def test_a_refused_operation_is_named_with_its_stage(data, name):
 
 def test_a_refused_stage_runs_without_fusion(data):
     """The stage splits the step."""
-    mine = {"mine": stage("drone")(REFUSED_STAGES["eigh"][0])}
-    expected = mine["mine"](mine["mine"](data)).states.pos
+    stages = {"mine": stage("drone")(REFUSED_STAGES["eigh"][0])}
+    expected = stages["mine"](stages["mine"](data)).states.pos
     with pytest.warns(EngineWarning, match="stage 'mine' is not fused: primitive 'eigh' has no rule"):
-        found = Step(mine)(data, jnp.int32(2)).states.pos
+        found = Step(stages)(data, jnp.int32(2)).states.pos
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -148,15 +148,15 @@ def pitch_rate(data):
 def test_a_nan_in_one_drone_stays_in_that_drone():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     data = scatter_drones(sim)
-    bad = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
+    data_with_nan = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
     step = Step(sim.step_pipeline)
-    good, after = step(data, jnp.int32(5)), step(bad, jnp.int32(5))
+    expected_data, after = step(data, jnp.int32(5)), step(data_with_nan, jnp.int32(5))
     np.testing.assert_array_equal(np.asarray(after.core.nonfinite)[:, 0], [False, True, False])
     for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
-        mine, theirs = np.asarray(getattr(after.states, name)), np.asarray(getattr(good.states, name))
+        found, expected = np.asarray(getattr(after.states, name)), np.asarray(getattr(expected_data.states, name))
         is_other = np.ones((3, 2), bool)
         is_other[1, 0] = False
-        np.testing.assert_array_equal(mine[is_other], theirs[is_other])
+        np.testing.assert_array_equal(found[is_other], expected[is_other])
 
 
 # Stages of the user -------------------------------------------------------------------------------------------------

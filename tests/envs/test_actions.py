@@ -129,7 +129,9 @@ def test_drones_of_several_airframes_have_actions_of_their_own(control):
     actions = actions_of(fleet, params, Control(control))
     commands = actions.command(jnp.full((2, actions.size), 0.3))
     for k, airframe in enumerate(fleet):
-        own = actions_of(airframe, create_params(Dynamics.first_principles, airframe), Control(control))
-        np.testing.assert_allclose(commands[k], own.command(jnp.full(own.size, 0.3)), rtol=1e-6)
+        airframe_actions = actions_of(airframe, create_params(Dynamics.first_principles, airframe), Control(control))
+        np.testing.assert_allclose(
+            commands[k], airframe_actions.command(jnp.full(airframe_actions.size, 0.3)), rtol=1e-6
+        )
     equal_actions = actions_of([fleet[0]] * 2, create_params(Dynamics.first_principles, fleet[0]), Control(control))
     assert equal_actions.centre.ndim == 1

@@ -124,11 +124,11 @@ def test_a_rollout_is_a_loop_of_steps(hover):
             action, memory, extras = act(gain, state.obs, memory, key)
             state = env.step(state, action)
             memory = jnp.where(state.done, 0.0, memory)
-            kept = state.reward, state.done, state.info["error"], state.info["final_obs"]["pos"], extras, action
-            return (state, memory), kept
+            recorded = state.reward, state.done, state.info["error"], state.info["final_obs"]["pos"], extras, action
+            return (state, memory), recorded
 
-        (state, memory), kept = jax.lax.scan(step, (start, jnp.zeros(N_WORLDS)), jax.random.split(key, 20))
-        return state, memory, kept
+        (state, memory), recorded = jax.lax.scan(step, (start, jnp.zeros(N_WORLDS)), jax.random.split(key, 20))
+        return state, memory, recorded
 
     actual, expected = jax.jit(fly)(1.0), jax.jit(loop)(1.0)
     assert_close(actual, expected)
@@ -197,8 +197,8 @@ class WithInfo(Wrapper):
         self.has_wrong_entry = has_wrong_entry
 
     def after_step(self, state):
-        own = {"n": jnp.float32(2), "each": state.data.states.pos}
-        return state.replace(info=state.info | own | ({"three": jnp.zeros(3)} if self.has_wrong_entry else {}))
+        extra_info = {"n": jnp.float32(2), "each": state.data.states.pos}
+        return state.replace(info=state.info | extra_info | ({"three": jnp.zeros(3)} if self.has_wrong_entry else {}))
 
 
 def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
@@ -461,9 +461,9 @@ def test_law_10_worlds_over_devices_step_by_the_same_kernel_to_the_same_numbers(
         for _ in range(5):
             state = step(state, action)
         policy = lambda obs, memory, key: (jnp.asarray(action), memory, ())  # noqa: E731
-        _, _, kept = jax.jit(lambda state: envs.rollout(env, state, policy, jax.random.key(1), 3))(state)
+        _, _, recorded = jax.jit(lambda state: envs.rollout(env, state, policy, jax.random.key(1), 3))(state)
         assert env.explain().startswith("engine: fused")
-        return start_state, state, kept
+        return start_state, state, recorded
 
     unsharded, sharded = fly_on(), fly_on(mesh=world_mesh(jax.devices()[:2]))
     assert all(len(x.devices()) == 2 for x in (sharded[0].obs["pos"], sharded[1].obs["pos"]))
