@@ -173,7 +173,7 @@ FN u32 shift_right_arithmetic_(u32 a, u32 b) { return u32(shift_right_arithmetic
 CONVERT(f32) CONVERT(f64) CONVERT(i32) CONVERT(u32) CONVERT(b1)
 #define TO_INTEGER(T) FN i32 to_i32(T x) { return i32(x); } FN u32 to_u32(T x) { return u32(x); }
 TO_INTEGER(i32) TO_INTEGER(u32) TO_INTEGER(b1)
-// Floats become the nearest representable integer, and NaN becomes zero, as in XLA.
+// As in XLA, floats are rounded towards zero and limited to the range of the type, and NaN becomes zero.
 FN i32 to_i32(f64 x) { return x != x ? 0 : x >= 2147483647.0 ? 2147483647 : x <= -2147483648.0 ? -2147483647 - 1 : i32(x); }
 FN u32 to_u32(f64 x) { return x != x ? 0u : x >= 4294967295.0 ? 0xffffffffu : x <= 0.0 ? 0u : u32(x); }
 FN i32 to_i32(f32 x) { return x != x ? 0 : x >= 2147483648.0f ? 2147483647 : x <= -2147483648.0f ? -2147483647 - 1 : i32(x); }
