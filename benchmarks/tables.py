@@ -8,7 +8,7 @@ from typing import Any
 from measure import round_digits
 
 Line = dict[str, Any]
-"""JSON line of a benchmark, or record of a figure."""
+"""JSON line of a benchmark, or dict of a figure: its name, its machine, its lines, ..."""
 
 
 def pivot(
@@ -82,7 +82,7 @@ def loops(lines: list[Line]) -> str:
             return f"{duration_text(line['crazysim_call_s'])}, {round_digits(line['ratio'], 2):g}"
         return duration_text(line["iteration_s"])
 
-    names = {"loop/jax": "a compiled sum, read", "loop/mj_step": "C MuJoCo, one box"}
+    names = {"loop/jax": "one compiled addition, with its result in NumPy", "loop/mj_step": "C MuJoCo, one box"}
 
     def row_of(line: Line) -> str:
         return names[line["benchmark"]] if line["benchmark"] in names else case_text(line).replace(", Euler", "")
@@ -172,7 +172,7 @@ depths = columns(
 sight = columns(
     Case=lambda x: {
         "policy": "`forest` with its convolution, environment steps a second",
-        "lidar": "a lidar at 10 Hz, times real time of one world",
+        "lidar": "a lidar at 10 Hz, real-time factor of each world",
     }[x["case"]],
     Image=lambda x: f"{x['image'][0]} x {x['image'][1]}, {x['n_worlds']:,} worlds",
     Rate=lambda x: si_text(x["env_steps_per_s"] if x["case"] == "policy" else x["realtime"]),
@@ -269,9 +269,10 @@ def first_results(lines: list[Line]) -> str:
 def control(lines: list[Line]) -> str:
     """Return the flights of all controllers with all airframes.
 
-    The docstring of ``controllers.py`` defines the entries of a line, such as ``home`` and ``lost_178``, the height
-    that a drone loses from a roll of 178 degrees. A rate of ``levels`` means that the controller levels the drone
-    instead of following a command of body rates.
+    The docstring of ``controllers.py`` defines the entries of a line, such as ``home``, the fraction of the flights
+    from random attitudes that return to the setpoint, and ``lost_178``, the height that a drone loses from a roll of
+    178 degrees. A rate of ``levels`` means that the controller levels the drone instead of following a command of body
+    rates.
     """
 
     def metres(value: float | None) -> str:
@@ -337,7 +338,7 @@ def readme(records: list[Line]) -> str:
     head = ["", "two CPU cores (AVX2)", "one NVIDIA H100"]
 
     def lines_of(name: str, device: str, **case: Any) -> list[Line]:
-        """Return the lines of the records of a figure on a device that contain the entries of ``case``."""
+        """Return the lines that contain the entries of ``case``, of one figure, measured on one device."""
         lines = [
             line
             for record in records

@@ -4,10 +4,11 @@
     python benchmarks/trainers.py --worlds 64 --iterations 8 --trainers crazysim brax
 
 All three libraries train the task with the hyperparameters of its recipe: the same worlds, steps, epochs, minibatches,
-networks with tanh, initial learning rate, discount and clipping. The learning rate decreases linearly to zero in
-crazysim, and is constant in Brax and RSL-RL. Other settings are the defaults of each library. Brax steps the
-environment by ``BraxEnv``, within its compiled program. RSL-RL steps it with one compiled call a step, and shares
-arrays with Torch.
+networks with tanh, initial learning rate, discount, ``gae_lambda``, weight of the entropy, largest norm of the gradient
+and clipping. RSL-RL also uses the weight of the value loss and the initial standard deviation of the recipe. Other
+settings are the defaults of each library. The learning rate decreases linearly to zero in crazysim, and is constant in
+Brax and RSL-RL. Brax steps the environment by ``BraxEnv``, within its compiled program. RSL-RL steps it with one
+compiled call a step, and shares arrays with Torch.
 
 There is a JSON line for each trainer and number of worlds. It has the environment steps per second, the median over the
 seeds, and the success of each seed on 1,000 held-out starts after the same number of steps. The rate is measured over
@@ -103,7 +104,7 @@ def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
     if not hasattr(jax, "device_put_replicated"):  # Brax 0.14.2 calls this function, which jax 0.10 removed
         jax.device_put_replicated = _device_put_replicated  # type: ignore[attr-defined]
-    times: list[float] = []
+    quarter_times: list[float] = []  # s, before the training and after each quarter of it
     n_worlds = env.sim.n_worlds
     _, (normalizer, policy, _), _ = train.train(
         BraxEnv(env),  # type: ignore[arg-type]
@@ -132,13 +133,13 @@ def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
         num_evals=QUARTERS + 1,
         num_eval_envs=n_worlds,
         run_evals=False,
-        policy_params_fn=lambda *_: times.append(time.perf_counter()),
+        policy_params_fn=lambda *_: quarter_times.append(time.perf_counter()),
     )
     weights = policy["params"]
     *hidden, (weight, bias) = ((weights[name]["kernel"], weights[name]["bias"]) for name in sorted(weights))
     n_actions = env.actions.size  # the first outputs are means, the others standard deviations
     layers = [*hidden, (weight[:, :n_actions], bias[:n_actions])]
-    return times[-1] - times[1], PeerPolicy(normalizer.mean, normalizer.std, layers, True)
+    return quarter_times[-1] - quarter_times[1], PeerPolicy(normalizer.mean, normalizer.std, layers, True)
 
 
 def _device_put_replicated(tree: Any, devices: Any) -> Any:

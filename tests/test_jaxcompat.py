@@ -84,7 +84,7 @@ def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
     (lambda read: {}["mine"], KeyError), (lambda read: np.zeros(3).nothing, AttributeError),
     (lambda read: read.nothing, AttributeError), (lambda read: 1 / 0, ZeroDivisionError),
 ])  # fmt: skip
-def test_a_mistake_in_a_rule_is_not_taken_for_a_new_jax(mistake, kind):
+def test_other_errors_of_a_rule_do_not_become_unsupported_errors(mistake, kind):
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
     with pytest.raises(kind), jaxcompat.read_equation(eqn) as read:
         mistake(read)
@@ -108,8 +108,8 @@ def test_a_call_keeps_its_own_derivative():
     eqn = equation(lambda x: f(x), 1.0)
     for read in (eqn, dataclasses.replace(jaxcompat.Equation(eqn.primitive, eqn.invars, eqn.outvars,
                                                              jaxcompat.Parameters("f", eqn.params)))):  # fmt: skip
-        single = jaxcompat.as_function(read)
-        (out,), (slope,) = jax.jvp(lambda x, f=single: jax.tree.leaves(f(x)), (3.0,), (1.0,))
+        call_f = jaxcompat.as_function(read)
+        (out,), (slope,) = jax.jvp(lambda x, f=call_f: jax.tree.leaves(f(x)), (3.0,), (1.0,))
         assert (out, slope) == (6.0, 100.0)
 
 
@@ -163,12 +163,13 @@ def test_a_primitive_is_lowered_as_the_function_of_its_platform():
 
 
 def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
+    """The parameter ``n_nonlinear`` is the number of first operands in which the primitive is not linear."""
     p = jaxcompat.primitive_by_platform(
         "product",
         lambda x, y, n_nonlinear: [jax.ShapeDtypeStruct(y.shape, y.dtype)],
         {"": lambda x, y, n_nonlinear: [x * y]},
         differentiable_fn=lambda x, y, n_nonlinear: [5.0 * x * y],
-        transpose_rule=lambda fixed, seeds, n_nonlinear: [7.0 * fixed[0] * seeds[0]],
+        transpose_rule=lambda fixed, cotangents, n_nonlinear: [7.0 * fixed[0] * cotangents[0]],
         batching_rule=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
     )
     apply = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
@@ -223,7 +224,7 @@ def test_memory_that_numpy_views_outlives_donation():
 
 
 def test_an_argument_is_donated():
-    """Fallbacks donate nothing."""
+    """The fallback of ``jit_donating``, for a JAX without donation on the host, donates nothing."""
     x = jnp.arange(3.0)
     np.testing.assert_array_equal(jaxcompat.jit_donating(lambda x, y: x + y)(x, 1.0), [1.0, 2.0, 3.0])
     assert x.is_deleted() != jaxcompat.FALLBACKS
@@ -343,13 +344,16 @@ def test_only_one_module_goes_beyond_the_public_interface():
         for word in private
         if path.name != "jaxcompat.py" and word in path.read_text()
     }
-    # Methods of ours by that name, for the tests of law 6.
+    # Methods of ours by that name, for the tests of law 6 of CONTRIBUTING.md, no silent retrace.
     assert found == {"engine/step.py: _cache_size", "engine/backends/plain.py: _cache_size"}
 
 
 @pytest.mark.long("runs tests in another process")
 def test_the_engine_runs_without_functions_that_jax_may_remove():
-    """Every fallback, and steps on them: in a kernel, split by a stage, of all engines, and with commands."""
+    """Chosen tests pass with the fallbacks of ``jaxcompat``: tests of each fallback, and tests of the step.
+
+    The step runs in one kernel, split by an unfused stage, with each engine, and with commands.
+    """
     tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/engine/test_stepper.py"]
     chosen = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
             " or commands_to_flattened")  # fmt: skip
@@ -371,6 +375,6 @@ def test_digamma_at_zero_is_that_of_this_version():
 def test_a_single_process_is_its_only_host():
     """``tests/train/test_hosts.py`` tests several hosts."""
     assert jaxcompat.connected_hosts() is None
-    assert not jaxcompat.is_stop_requested(1)
+    assert not jaxcompat.is_stop_requested(step=1)
     assert [jaxcompat.broadcast_from_first(flag) for flag in (True, False)] == [True, False]
     np.testing.assert_array_equal(jaxcompat.gather_from_hosts([jax.numpy.arange(3)])[0], np.arange(3))

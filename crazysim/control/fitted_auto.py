@@ -26,9 +26,9 @@ class FittedParams(PyTree):
     model: Params
     """Parameters of the fitted model that the controller assumes."""
     angle_ratio: Array = leaf("parameter", 1)
-    """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, 1. (3,)"""
+    """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, dimensionless. (3,)"""
     lead: Array = leaf("parameter", 1)
-    """Factors on jerk, s, and snap, s^2, which advance the attitude command by the delay of the response. (2,)"""
+    """Factors on jerk (s) and on snap (s^2). They advance the attitude command by the delay of the response. (2,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
 
@@ -78,6 +78,7 @@ class FittedAuto(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
     ) -> tuple[Array, PositionMemory]:
         s, p, model = data.states, params, params.model
+        # Fitted models with a lag of the thrust store the thrust, N, in ``rotor_vel``; ``acc_coef`` is a thrust too.
         thrust_state = data.controls.attitude.cmd[..., 3:] if model.thrust_dyn_coef is None else s.rotor_vel[..., :1]
         matrix = rotation.matrix(s.quat)
         force = rotation.along_z((model.acc_coef + model.cmd_f_coef * thrust_state)[..., 0])

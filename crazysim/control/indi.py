@@ -33,7 +33,7 @@ MAX_FEEDBACK_STEP = 0.5
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: about half of gravity."""
 TORQUE_MAX = 0.5
-"""Largest disturbance torque that is compensated, as the rotation error with a feedback torque of that size, rad."""
+"""Rotation error whose feedback torque is as large as the largest disturbance torque that is compensated, rad."""
 
 
 class INDIParams(PyTree):
@@ -46,7 +46,7 @@ class INDIParams(PyTree):
     lead: Array = leaf("parameter", 1)
     """Factor on the difference between commanded and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
-    """Ratio of the changes of a rotor's angular momentum and drag torque around hover, s. (1,)"""
+    """Change of a rotor's angular momentum per change of its drag torque as its speed changes around hover, s. (1,)"""
     drag_torque_share: Array = leaf("parameter", 1, (1,))
     """Fraction of the missing yaw torque that is demanded from rotor drag, 1. The reaction to spin-up gives the rest.
     (1,)"""
@@ -70,6 +70,7 @@ class INDIParams(PyTree):
         params = GeometricParams.create(airframe, freq)
         rotor_lag_rate, reaction = rotor_rate(airframe), momentum_per_torque(airframe)
         lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        # INDI compensates the reaction to accelerating rotors, which therefore does not limit the bandwidth.
         gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * rotor_lag_rate, limits_reaction=False))
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
@@ -222,7 +223,7 @@ class INDI(Controller):
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
-        # Velocity and momentum in the memory are older than the last tick.
+        # The memory is as old as the last tick of this controller; another controller has flown since then.
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:

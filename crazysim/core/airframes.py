@@ -24,7 +24,8 @@ ROTOR_MASK = "rotors"
 """Name of the field of a record that masks rotors: True for the rotors that a drone has. The field is None if all
 drones have the same number of rotors."""
 PER_ROTOR_FIELDS = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
-"""Fields in which missing rotors repeat the value of the last rotor; all other fields are zero for missing rotors."""
+"""Fields in which missing rotors repeat the value of the last rotor; all other fields are zero for missing rotors.
+``L`` is the arm of the rotors."""
 
 
 Airframes = Airframe | Sequence[Airframe]
@@ -116,9 +117,9 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
     for airframe, structure in zip(distinct_airframes, structures, strict=True):
         if structure != structures[0]:
             raise ConfigError(
-                f"expected airframes with the same numbers for {type(records[0]).__name__}, got "
-                f"{distinct_airframes[0].name!r} and {airframe.name!r}, of which one lacks some. Add "
-                f"them, with the key 'base', or use another controller."
+                f"expected airframes that define the same fields of {type(records[0]).__name__}, got "
+                f"{distinct_airframes[0].name!r} and {airframe.name!r}, of which one lacks a field. Add its values, "
+                f"inherit them with the key 'base', or use another controller."
             )
     airframe_indices = [distinct_airframes.index(airframe) for airframe in airframes]
 

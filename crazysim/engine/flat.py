@@ -23,7 +23,7 @@ class PackCache:
     """
 
     def __init__(self) -> None:
-        self._cached: tuple[Sequence[Any], Array | None] = (), None  # one attribute: other threads may replace it
+        self._cached: tuple[Sequence[Any], Array | None] = (), None  # one tuple: threads replace both at once
 
     def __call__(self, arrays: list[Any]) -> Array:
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
@@ -69,7 +69,7 @@ class ZerosCache:
     """
 
     def __init__(self) -> None:
-        self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one attribute: other threads may replace it
+        self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one tuple: threads replace both at once
         self._indices_by_structure: dict[Any, list[int]] = {}
 
     def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:

@@ -146,7 +146,7 @@ class Step:
         self._home_sharding: Any = None
         """Last sharding that was found to be at ``location``."""
         self._last_false_flag: Any = None
-        """Last flag of ``_make_false_flag``."""
+        """Last value of ``core.mjx_synced`` that ``_make_false_flag`` made."""
 
     def without_stages(self, names: Collection[str]) -> Step:
         """Return a step without the stages of some names."""
@@ -169,7 +169,7 @@ class Step:
             data: The simulation.
             n_steps: Number of steps, at least 0: an integer, or an array of integer type. ()
             zeros: Result of the method ``zeros`` for this data from before it was traced. Without it, the values of
-                parameters are unknown under a trace, and no terms are left out.
+                parameters are unknown under a trace, and terms that are multiplied by zero are not left out.
         """
         _check_steps(n_steps)
         require_data(data)
@@ -189,7 +189,7 @@ class Step:
         Args:
             data: The simulation.
             zeros: As in ``__call__``.
-            n_steps: Any number of steps of the type that will be passed to ``advance``; None for an array.
+            n_steps: Number of steps of the type that will be passed to ``advance``, of any value; None means an array.
             separate: Leaves that stay separate arrays. If one kernel runs the whole step, the other leaves that it
                 writes, except random keys, are stored as rows of a few arrays, one for each scope and type. This makes
                 loops over calls faster. None to store no leaf as rows.
@@ -213,7 +213,7 @@ class Step:
         plan = flat.plan
         step, inputs = plan.static_count_step if isinstance(n_steps, int) else plan.traced_count_step, flat.inputs()
         if plan.numpy_step is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
-            step = plan.numpy_step
+            step = plan.numpy_step  # the step of engine 'interpret', written in NumPy
         call_key = id(plan), n_steps if isinstance(n_steps, int) else None
         with keep_programs(enabled=call_key not in self._called):
             outputs = step(inputs, n_steps)
@@ -259,7 +259,7 @@ class Step:
         return sorted({plan.engine for plan in self._plans.values()})
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function, for the tests of law 6: no retrace."""
+        """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
         count = jaxcompat.n_compilations
         called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans.values()]
         steps = [step for plan in self._plans.values() for step in (plan.traced_count_step, plan.static_count_step)]
@@ -299,7 +299,7 @@ class Step:
         if plan is None:
             check_axes(data, data.core.n_worlds, data.core.n_drones)
             for stage in self.stages:
-                Axes(data).writable_scopes(stage)
+                Axes(data).writable_scopes(stage)  # raises ConfigError for a population that does not exist
             location = self.location if other_location is None else other_location
             planner = Planner(self.stages, self.engine, self.strict, location, self._reported)
 

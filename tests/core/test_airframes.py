@@ -256,7 +256,7 @@ def test_airframes_that_lack_gains_are_named():
         Sim(drone=FLEET, control="state", controller="mellinger")
     records = {"cf21B_500": first_principles.Params.create(load_airframe("cf21B_500"))}
     records["bumblebee"] = records["cf21B_500"].replace(L=None)
-    with pytest.raises(ConfigError, match="the same numbers for Params, got 'cf21B_500' and 'bumblebee'"):
+    with pytest.raises(ConfigError, match="the same fields of Params, got 'cf21B_500' and 'bumblebee'"):
         create_per_drone([load_airframe(name) for name in records], lambda airframe: records[airframe.name], 1)
 
 

@@ -9,7 +9,8 @@ from crazysim.core.stage import vmap_worlds
 from crazysim.envs import make
 
 CONTACT_HEIGHT = 0.066
-"""Height of the centre of mass over a level roof that the drone touches, m: radius 0.086 less 0.02."""
+"""Height of the centre of mass over a level roof that the drone touches, m. The collision sphere has the
+radius 0.086, and its centre is 0.02 above the centre of mass."""
 CASES = {
     # Position relative to the roof's middle, m, and velocity relative to it, m/s.
     "soft": ((0.0, 0.0, CONTACT_HEIGHT + 0.003), (0, 0, -0.3)),
@@ -49,7 +50,7 @@ def roof_motion(env):
 
 
 @pytest.fixture(scope="module")
-def recorded_flight(start_state, step, roof_motion):
+def state_after_step(start_state, step, roof_motion):
     """Return the state after a step from all cases, over cars at their full speed."""
     data = start_state.data
     car = data.plugins["cars"]
@@ -72,17 +73,17 @@ def names(mask):
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 
-def test_a_soft_touch_of_the_roof_from_above_is_a_landing(recorded_flight):
-    assert names(recorded_flight.info["landed"]) == LANDED
+def test_a_soft_touch_of_the_roof_from_above_is_a_landing(state_after_step):
+    assert names(state_after_step.info["landed"]) == LANDED
 
 
-def test_every_other_touch_and_flying_away_is_a_crash(recorded_flight):
-    assert names(recorded_flight.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
-    np.testing.assert_array_equal(recorded_flight.terminated, [name not in IN_FLIGHT for name in CASES])
+def test_every_other_touch_and_flying_away_is_a_crash(state_after_step):
+    assert names(state_after_step.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
+    np.testing.assert_array_equal(state_after_step.terminated, [name not in IN_FLIGHT for name in CASES])
 
 
-def test_the_reward_is_for_landing(recorded_flight):
-    rewards = dict(zip(CASES, np.asarray(recorded_flight.reward)[:, 0], strict=True))
+def test_the_reward_is_for_landing(state_after_step):
+    rewards = dict(zip(CASES, np.asarray(state_after_step.reward)[:, 0], strict=True))
     assert min(rewards[name] for name in LANDED) > 9 > 0 > -3 > max(rewards[name] for name in ("fast", "hood", "far"))
 
 

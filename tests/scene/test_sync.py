@@ -51,7 +51,7 @@ DERIVED = (
 
 @pytest.fixture(scope="module", params=["", '<joint type="hinge"/>'], ids=["fixed", "joint"])
 def sim(request):
-    """Return three worlds of two drones at random poses, a tower with children, moved through mjx_data, and a shelf."""
+    """Return three worlds with two drones and a tower, all at random poses, and a shelf; mjx_data moves the tower."""
     sim = Sim(n_worlds=3, n_drones=2)
     shelf = mujoco.MjSpec.from_string(SHELF.format(joint=request.param))
     sim.spec.worldbody.add_frame().attach_body(shelf.body("shelf"), "", "")

@@ -66,8 +66,8 @@ def test_an_update_computes_the_outputs_of_the_rollout(rng):
     learner, config = init_learner(env, memory=5)
     memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
     collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
-    key, rates = jax.random.key(1)[None], stack_swept_values((config,))
-    _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, rates, key)
+    key, swept_values = jax.random.key(1)[None], stack_swept_values((config,))
+    _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, swept_values, key)
     agent, samples = take_seed(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
     assert samples.done.sum() == 2 * 4
 
@@ -130,7 +130,7 @@ def test_a_policy_with_memory_learns_a_task_that_needs_it():
         for _ in range(config.iterations):
             learner, metrics = ppo.iterate(learner, env, (config,))
         assert metrics["finite"]
-        rewards[memory] = float(metrics["reward"][0]) + float(metrics["std"][0]) ** 2  # without exploration
+        rewards[memory] = float(metrics["reward"][0]) + float(metrics["std"][0]) ** 2  # without the cost of exploration
     assert rewards[8] > -0.06
     assert rewards[0] < -0.15
 
@@ -157,7 +157,8 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     policy, loaded, meta = load_policy(tmp_path / "whole")
     assert loaded.config["memory"] == 4
     assert evaluate(whole.env, policy)["reward"] == evaluate(whole.env, whole.policy)["reward"]
-    assert film(loaded.make_env(1), policy, tmp_path / "film.gif", worlds=1) == 3
+    n_frames = film(loaded.make_env(1), policy, tmp_path / "film.gif", worlds=1)
+    assert n_frames == 3
     assert "void policy_reset(policy_state *state)" in to_c(policy, tmp_path / "policy.h", meta).read_text()
     with pytest.raises(ConfigError, match="expected a policy without memory, got one with a memory"):
         to_out_of_tree(policy, tmp_path, meta, whole.env.sim.airframes[0], 50)
@@ -172,16 +173,18 @@ def test_a_run_with_memory_resumes_is_evaluated_filmed_and_exported(tmp_path):
     obs = whole.env.reset(jax.random.key(0)).obs
     with pytest.raises(ConfigError, match=r"expected a memory besides .*policy\.act\(obs, memory\)"):
         policy(obs)
-    link = TrainedPolicy(policy, meta, goal=(0, 0, 1))
+    flight_policy = TrainedPolicy(policy, meta, goal=(0, 0, 1))
     memory = policy.initial_memory(8, 1)
     for _ in range(2):
         action, memory = policy.act(obs, memory)
         drone_obs = {name: np.asarray(x[0, 0]) for name, x in obs.items()}
-        link._compute_observations = lambda _, drone_obs=drone_obs: drone_obs
-        np.testing.assert_allclose(link(None), link._centre + link._scale * action[0, 0], atol=1e-6)
-    np.testing.assert_allclose(link._memory, memory[0, 0], atol=1e-6)
-    link.reset()
-    assert not np.any(link._memory)
+        flight_policy._compute_observations = lambda _, drone_obs=drone_obs: drone_obs
+        np.testing.assert_allclose(
+            flight_policy(None), flight_policy._centre + flight_policy._scale * action[0, 0], atol=1e-6
+        )
+    np.testing.assert_allclose(flight_policy._memory, memory[0, 0], atol=1e-6)
+    flight_policy.reset()
+    assert not np.any(flight_policy._memory)
 
 
 def test_policies_of_several_seeds_have_separate_memories(rng):
@@ -268,7 +271,7 @@ def test_a_critic_may_see_all_drones_and_their_true_states():
 
 @pytest.mark.long("compiles a training")
 @pytest.mark.parametrize(
-    "task", ["swarm", pytest.param("multi_race", marks=pytest.mark.slow("swarm has several drones too"))]
+    "task", ["swarm", pytest.param("multi_race", marks=pytest.mark.slow("the case swarm also has several drones"))]
 )
 def test_tasks_of_several_drones_train_with_a_critic_of_all(task):
     env = AutoReset(make(task, 4, seconds=0.1))
@@ -315,7 +318,7 @@ def equinox_network():
 @pytest.mark.parametrize(
     "make_network",
     [
-        pytest.param(plain_network, marks=pytest.mark.slow("the network of Flax has no memory either")),
+        pytest.param(plain_network, marks=pytest.mark.slow("the case flax_network also has no memory")),
         flax_network,
         equinox_network,
     ],

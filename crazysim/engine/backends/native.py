@@ -36,8 +36,8 @@ from crazysim.startup import __version__
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler; the options of the variable CXXFLAGS follow them. Products and sums may be contracted, and
-no option assumes that there is no NaN. Integers wrap around, as in XLA. NVRTC has no such option, so the source
-converts integers to unsigned integers before it adds them."""
+no option assumes that there is no NaN. Integers wrap around (``-fwrapv``), as in XLA. NVRTC has no option for
+that, so the source converts integers to unsigned integers before it adds them."""
 
 ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
 """Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
@@ -52,12 +52,14 @@ COMPILE_TIMEOUT = 300.0
 LINES_IN_ONE_SECOND = 10_000
 """Lines of a kernel that takes at least 1 s to compile; the time grows with the square of the number of lines.
 
-Measured with g++ 12 on one core: 20,000 lines of matrix products take 5 s, of maxima 38 s, 40,000 of conditions 94 s.
+Measured with g++ 12 on one core: 20,000 lines take 5 s if they are matrix products, and 38 s if they are maxima. 40,000
+lines of conditions take 94 s.
 """
 SELECTING_LINE = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.*$", re.MULTILINE)
 """Lines of a kernel that select between numbers."""
 SELECTING_LINE_WEIGHT = 2.4
-"""Weight of a selecting line, in lines: in the same measurements 10,000 lines of conditions take 5.9 s."""
+"""Weight of a selecting line, in lines. By the measurements above 10,000 lines of conditions would take 94 s / 4^2 =
+5.9 s, as long as 24,000 lines with the square law of ``LINES_IN_ONE_SECOND``."""
 
 TEMPORARY_FOLDER_VARIABLES = ("TMPDIR", "ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 """Variables that name the folder of a compiler's temporary files."""
@@ -78,8 +80,9 @@ VECTOR_BYTES = 64
 """Size of the widest vector, bytes."""
 
 Launch = Callable[[int, Any, Sequence[Array], Sequence[Any]], list[Array]]
-"""Function from the number of lanes, the number of steps (1,), the inputs, and the shapes and types of the outputs to
-the outputs. For a kernel with backward pass the number of steps must be a NumPy array."""
+"""Function that returns the outputs of a kernel. Its arguments are the number of lanes, the number of steps (1,), the
+inputs, and the shapes and types of the outputs. For a kernel with backward pass the number of
+steps must be a NumPy array."""
 
 
 class HostLaunch:
@@ -99,8 +102,8 @@ class HostLaunch:
     def memory_function(self) -> Callable[[int, int, Any, int], int]:
         """Return the kernel as a function on memory, which does not use XLA and returns when the kernel is done.
 
-        It takes the numbers of lanes and of steps, the addresses of inputs and outputs as pointers in ``bytes``, and
-        the number of inputs. It returns 0 if it could not allocate memory.
+        It takes the numbers of lanes and of steps, a ``bytes`` object with the addresses of inputs and outputs, one
+        pointer after the other, and the number of inputs. It returns 0 if it could not allocate memory.
         """
         call = _LIBRARIES[self._name].crazysim_call
         call.restype = ctypes.c_int
@@ -294,7 +297,8 @@ def _check_settings(work_folder: Path) -> None:
 def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     """Provide threads that compile. If the ``with`` block is interrupted, their compilers are killed.
 
-    A kernel whose compiler was killed raises ``RuntimeError``, so that no other engine compiles in its place.
+    If a compiler was killed, the compilation raises ``RuntimeError``. A ``KernelError`` would make another engine
+    compile in its place.
 
     Args:
         n: Number of threads; None for the default of ``ThreadPoolExecutor``.
@@ -314,7 +318,7 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
 
 
 _INTERRUPTED = threading.Event()
-"""Set while threads that compile end because they were interrupted."""
+"""Set after an interrupt, until the threads of ``compiling_threads`` have ended."""
 _COMPILER_PIPES: set[IO[str]] = set()
 """Pipes of the running compilers; closing a pipe kills its compiler."""
 

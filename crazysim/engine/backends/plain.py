@@ -124,5 +124,5 @@ class Reset:
         return self._compiled.lower(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function, for the tests of law 6: no retrace."""
+        """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
         return jaxcompat.n_compilations(self._compiled)

@@ -33,6 +33,7 @@ def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device]
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
     fitted_kernel = cuda.fit_registers(kernel, device)
+    # A kernel with much code has more threads a block if there are more drones than a GPU runs at once.
     widened_kernel, resources = cuda.widen_blocks(fitted_kernel, device), cuda.resources(fitted_kernel, device)
     is_widened = widened_kernel is not fitted_kernel
     widened_text = f", {widened_kernel.threads} from {cuda.RESIDENT_LANES:,} drones on" if is_widened else ""

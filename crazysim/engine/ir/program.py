@@ -23,7 +23,8 @@ Slot = tuple[int, int]
 """Place of a number: the index of its leaf, and the index of the element among the elements of one drone (or world)."""
 
 TABLE_INDEX = -1
-"""Element index in the slot of a whole leaf that is read as a table. Only shared leaves are tables."""
+"""Element index of a slot that stands for a whole leaf. Such a leaf is a table: operations read it at computed indices.
+Only shared leaves are tables."""
 
 PACKED_LEAF_NAME = "packed"
 """Name of the leaf that holds the packed shared leaves."""
@@ -45,8 +46,8 @@ class Leaf:
     dtype: Any
     """Type."""
     row_leaves: tuple[int, ...] = ()
-    """Indices of the leaves whose numbers are the rows of this leaf, in order. The shape of a leaf with rows is
-    (n_rows, n_lanes). Empty for a leaf without rows."""
+    """Indices of the leaves that are stored as rows of this leaf, in order: each number of a drone (or world) is a row.
+    The shape of a leaf with rows is (n_rows, n_lanes). Empty for a leaf without rows."""
 
     @functools.cached_property
     def size(self) -> int:
@@ -148,7 +149,7 @@ class Program:
     segments: tuple[Segment | UnfusedStage, ...]
     """Segments in order, phase by phase."""
     check_segment: Segment | None = None
-    """Segment that runs after the last step and flags drones with an input that is not finite."""
+    """Segment that runs after the last step and flags drones for which one of its ``reads`` is not finite."""
     scratch: frozenset[int] = frozenset()
     """Leaves that only pass numbers from one stage to another; their values are lost after a call."""
     packed: tuple[int, ...] = ()
@@ -185,7 +186,10 @@ class Program:
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Rank of each leaf among the used leaves. Kernels name leaves by rank, so equal steps have equal source."""
+        """Rank of each leaf among the used leaves.
+
+        Kernels name leaves by rank, so steps that only differ in unused leaves have the same source.
+        """
         checked = [leaf for leaf, _ in self.check_segment.reads] if self.check_segment is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read_leaves, *s.written_leaves))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}

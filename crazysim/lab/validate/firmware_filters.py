@@ -21,7 +21,8 @@ from crazysim.plugins.estimators import complementary, error_state, updates
 FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
 """Folder with the recorded outputs of filters."""
 MEASUREMENT_KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
-"""Kinds of measurements of the Kalman filter, one for each recording."""
+"""Kinds of measurements of the Kalman filter, one for each recording. ``difference`` is between the distances to two
+anchors; ``ground`` is the position, of a drone on the ground."""
 ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
 """Positions of the anchors, m."""
 DIODE_OFFSET = np.array([0.015, 0.0075, 0.0], np.float32)
@@ -35,7 +36,7 @@ def update_with_measurements(
 ) -> Any:
     """Return the estimate after the measurements of one loop of the Kalman filter.
 
-    The loops in which measurements are used, and their deviations, are as in
+    The measurements are used in the same loops and with the same standard deviations as in
     tests/plugins/estimators/record_filter.py.
 
     Args:
@@ -91,7 +92,7 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
         Position, m, velocity, body frame, m/s, attitude error, rad, quaternion, wxyz, and the upper triangle of the
         covariance, row by row. (40, 58) each
     """
-    level = jnp.array([0.0, 0.0, 0.0, 1.0])
+    level_quat = jnp.array([0.0, 0.0, 0.0, 1.0])
     with np.load(FILTER_RECORDINGS / "firmware_filter.npz") as file:
         inertial = jnp.asarray(file[f"inertial/{'ground' if kind == 'ground' else 'air'}"])[1:]
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
@@ -100,7 +101,7 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
     def loop(carry: Any, x: Any) -> tuple[Any, Array]:
         (estimate, rot), (loop_index, inertial_row, measurement) = carry, x
         accel, gyro = inertial_row[:3], inertial_row[3:]
-        predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
+        predicted = error_state.predict(estimate, accel, gyro, 0.01, level_quat if kind == "ground" else None)
         estimate = error_state.add_noise(
             error_state.select_estimate(loop_index % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
         )
@@ -111,7 +112,7 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
         return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
 
     start = error_state.initial_estimate(
-        jnp.array([0.05, -0.05, 1.25]), jnp.zeros(3), level, (100, 100, 1, *[0.01] * 6)
+        jnp.array([0.05, -0.05, 1.25]), jnp.zeros(3), level_quat, (100, 100, 1, *[0.01] * 6)
     )
     loops = jnp.arange(1, len(inputs) + 1), inertial, inputs
     run = jax.jit(lambda start, x: jax.lax.scan(loop, (start, jnp.eye(3)), x)[1])
@@ -131,12 +132,17 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
 
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
-        (quat, integral, climb, height, climb_rate, over_surface), (k, row) = carry, x
+        (quat, integral, inertial_climb, height, climb_rate, over_surface), (k, row) = carry, x
         gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
         attitude_update = complementary.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
-        attitude_update = *attitude_update, complementary.inertial_climb(climb, attitude_update[0], accel, 0.004)
-        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(attitude_update, carry[:3], strict=True))
-        shift = 0.01 * climb
+        attitude_update = (
+            *attitude_update,
+            complementary.inertial_climb(inertial_climb, attitude_update[0], accel, 0.004),
+        )
+        quat, integral, inertial_climb = (
+            jnp.where(k % 4 == 0, *pair) for pair in zip(attitude_update, carry[:3], strict=True)
+        )
+        shift = 0.01 * inertial_climb
         pressure_height = complementary.filtered_height(height, row[6:7], shift)
         is_useful = row[8:] <= 1000 * complementary.MAX_RANGE_AGE
         new_height, new_over_surface = complementary.height_over_surface(
@@ -148,7 +154,9 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
             jnp.where(is_height_tick, new_over_surface, over_surface),
         )
         height = jnp.where(is_height_tick, new_height, height)
-        return (quat, integral, climb, height, climb_rate, over_surface), jnp.concatenate([quat, height, climb_rate])
+        return (quat, integral, inertial_climb, height, climb_rate, over_surface), jnp.concatenate(
+            [quat, height, climb_rate]
+        )
 
     zero = jnp.zeros(1)
     start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero

@@ -124,6 +124,7 @@ class Complementary(Estimator):
 
         return [
             ("attitude", Stage(update_attitude, "drone", is_due_every(period))),
+            # The last stage has the name of the estimator.
             ("", Stage(update_height, "drone", is_due_every(height_period))),
         ]
 

@@ -14,7 +14,7 @@ from crazysim.sim import Sim
 
 
 def test_sticks_move_in_the_axes_of_the_drone():
-    """At a yaw of 90 degrees, forwards is y and left is -x; the third stick moves down, and the fourth turns."""
+    """At a yaw of 90 degrees, forwards is y and left is -x; the third stick moves up, and the fourth turns."""
     start = [1.0, 2.0, 3.0, np.pi / 2]
     np.testing.assert_allclose(move_setpoint(start, [1, 0, 0, 0], 1.0, 2.0, 0.5), [1, 4, 3, np.pi / 2], atol=1e-12)
     np.testing.assert_allclose(move_setpoint(start, [0, 1, 0, 0], 1.0, 2.0, 0.5), [-1, 2, 3, np.pi / 2], atol=1e-12)
