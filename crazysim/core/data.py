@@ -118,7 +118,7 @@ class SimCore(PyTree):
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
     rng_key: Array = leaf("parameter", 0)
-    """Random key; resets do not change it. (), or (n_worlds, n_drones) for one key per drone"""
+    """Random key; resets do not change it. (n_worlds, n_drones) for one key per drone, else ()"""
     mjx_synced: Array = leaf("shared", 0)
     """True if the scene matches this data. ()"""
 

@@ -32,9 +32,9 @@ class Params(PyTree):
     mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     L: Array = leaf("parameter", 1)
-    """Arm that scales the first two rows of the mixing matrix, m. (1,), or (n_rotors,) if rotors differ"""
+    """Arm that scales the first two rows of the mixing matrix, m. (n_rotors,) if rotors differ, else (1,)"""
     prop_inertia: Array = leaf("parameter", 1)
-    """Inertia of a propeller and motor about its axis, kg m^2. (1,), or (n_rotors,) if rotors differ"""
+    """Inertia of a propeller and motor about its axis, kg m^2. (n_rotors,) if rotors differ, else (1,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration, world frame, m/s^2. (3,)"""
     J: Array = leaf("parameter", 2)
@@ -42,20 +42,20 @@ class Params(PyTree):
     J_inv: Array = leaf("parameter", 2)
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve, N, N/rpm, N/rpm^2. (1, 3), or (n_rotors, 3) if rotors differ"""
+    """Thrust curve, N, N/rpm, N/rpm^2. (n_rotors, 3) if rotors differ, else (1, 3)"""
     rpm2torque: Array = leaf("parameter", 2)
-    """Drag torque curve, N m, N m/rpm, N m/rpm^2. (1, 3), or (n_rotors, 3) if rotors differ"""
+    """Drag torque curve, N m, N m/rpm, N m/rpm^2. (n_rotors, 3) if rotors differ, else (1, 3)"""
     mixing_matrix: Array = leaf("parameter", 2)
     """Mixing matrix, rotor thrusts to torque: positions over L, and signs of the drag torque. (3, n_rotors)"""
     drag_matrix: Array = leaf("parameter", 2)
     """Linear drag coefficients, body frame, N s/m. (3, 3)"""
     rotor_dyn_coef: Array = leaf("parameter", 2)
-    """Coefficients of ``rotor_acceleration`` on spin-up, then on spin-down, 1/s, 1/(s rpm). (1, 4), or (n_rotors, 4) if
-    rotors differ"""
+    """Coefficients of ``rotor_acceleration`` on spin-up, then on spin-down, 1/s, 1/(s rpm). (n_rotors, 4) if
+    rotors differ, else (1, 4)"""
     rotor_vel_min: Array = leaf("parameter", 1)
-    """Minimum speed of a rotor that is on, rpm. (1,), or (n_rotors,) if rotors differ"""
+    """Minimum speed of a rotor that is on, rpm. (n_rotors,) if rotors differ, else (1,)"""
     rotor_vel_max: Array = leaf("parameter", 1)
-    """Maximum rotor speed, rpm. (1,), or (n_rotors,) if rotors differ"""
+    """Maximum rotor speed, rpm. (n_rotors,) if rotors differ, else (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> Params:

@@ -221,7 +221,7 @@ def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
         (WorldObservations(env), r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"),
         (
             WithInfo(env, has_wrong_entry=True),
-            r"expected info\['three'\] as one number of a world, .* 2 drones in front",
+            r"expected info\['three'\] as one number of a world, .* one row for each of 2 drones",
         ),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -166,7 +166,9 @@ def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(
 def test_the_header_describes_inputs_and_outputs(tmp_path, policy, meta):
     text = to_c(policy, tmp_path / "policy.h", meta).read_text()
     assert "[0..2] ang_vel: angular velocity, body frame, rad/s" in text
-    assert "[3..5] difference_to_goal: goal minus position, world frame, m" in text
+    assert (
+        "[3..5] difference_to_goal: goal minus position (of the load in transport and deliver), world frame, m" in text
+    )
     assert "[9..17] rot" in text
     assert "[18..20] vel" in text
     assert "level attitude" in text

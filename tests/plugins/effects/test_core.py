@@ -152,8 +152,8 @@ def at_world(scope, x, world):
 def test_law_01_a_stage_computes_the_same_for_one_and_for_all(sim_with_effects, flight_data, name):
     """On the data of one drone or world a stage gives what it gives on all data at that index."""
     stage = sim_with_effects.step_pipeline[name]
-    all_at_once, apply_to_one = on_host(jax.jit(stage)(flight_data)), jax.jit(stage.apply_unbatched)
-    apply_to_world = jax.jit(vmap_drones(stage.apply_unbatched))
+    all_at_once, apply_to_one = on_host(jax.jit(stage)(flight_data)), jax.jit(stage.apply_unmapped)
+    apply_to_world = jax.jit(vmap_drones(stage.apply_unmapped))
     for index in [(0, 0), (1, 1), (2, 0)]:
 
         def select(scope, x, index=index):
