@@ -151,8 +151,9 @@ class Swarm(Closeable):
         live.lights[0] = self.colors
 
     def compile(self, live: Live) -> None:
-        """Compile a control step."""
-        self.compile_step()
+        """Compile the reading of the states; the loop compiles its step."""
+        with self.lock:
+            self._read_states()
 
     def run_in(self, live: Live) -> None:
         """Make ``advance`` and ``sleep`` run a live loop, at its speed and with its viewers."""
