@@ -21,6 +21,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
+from crazysim.train.optimizer import build_optimizer
 from crazysim.train.seeds import SweptValues, are_seeds_divided, for_each_seed, split_blocks, stack_swept_values
 
 T = TypeVar("T")
@@ -92,7 +93,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
 
     def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
         policy = init_mlp(k_policy, (obs.shape[-1], *config.hidden, env.actions.size), 0.01)
-        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(policy)
+        optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations).init(policy)
         return Agent(policy, optimizer, RunningStats.create(obs.shape[-1]).update(obs), key)
 
     obs = split_blocks(flatten(state.obs), len(configs))
@@ -142,7 +143,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         agent: Agent, loss: Array, grads: Layers, raw_obs: Array, swept_values: SweptValues
     ) -> tuple[Agent, dict[str, Array]]:
         grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
-        transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
+        transform = build_optimizer(swept_values["learning_rate"], swept_values["max_grad_norm"], config.iterations)
         updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
         updated_state = (optax.apply_updates(agent.policy, updates), optimizer)
         policy, optimizer = jax.tree.map(
@@ -181,8 +182,3 @@ def _copy_per_device(tree: T, n_copies: int, env: Env) -> T:
     return jax.lax.with_sharding_constraint(
         jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), device_sharding
     )
-
-
-def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
-    schedule = optax.linear_schedule(learning_rate, 0.0, config.iterations)
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))

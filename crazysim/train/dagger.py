@@ -35,6 +35,7 @@ from crazysim.train.convolution import find_images
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
+from crazysim.train.optimizer import build_optimizer
 from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values, take_seed
 
 TEACHER_PREFIX = "teacher "
@@ -72,6 +73,11 @@ class Config:
         check_hyperparameters(self)
         if self.teacher:  # so that the run can be resumed from any folder
             object.__setattr__(self, "teacher", str(Path(self.teacher).resolve()))
+
+    @property
+    def n_updates(self) -> int:
+        """Number of updates of the whole training."""
+        return self.iterations * self.epochs * self.minibatches
 
 
 class Agent(PyTree):
@@ -184,7 +190,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
 
     def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
         student: Any = init_weights(network, k_student, obs.shape[-1], (*config.hidden, env.actions.size), 0.01)
-        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(student)
+        optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(student)
         stats = RunningStats.create(obs.shape[-1], network.pixels).update(obs)
         return Agent(student, optimizer, stats, key, network)
 
@@ -331,7 +337,7 @@ def _update_agent(
         key: Random key.
         config: Hyperparameters of the first seed; values in ``swept_values`` take precedence.
     """
-    transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
+    transform = build_optimizer(swept_values["learning_rate"], swept_values["max_grad_norm"], config.n_updates)
     samples = agent.stats.normalize(raw_obs), labels
 
     def loss(student: Weights, batch: tuple[Array, Array]) -> Array:
@@ -353,9 +359,3 @@ def _update_agent(
     stats = agent.stats.update(raw_obs)
     finite = all_finite((student, optimizer, stats, losses))
     return agent.replace(student=student, optimizer=optimizer, stats=stats), finite
-
-
-def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
-    n_updates = config.iterations * config.epochs * config.minibatches
-    schedule = optax.linear_schedule(learning_rate, 0.0, n_updates)
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))

@@ -34,6 +34,7 @@ from crazysim.train.networks import (
     mlp,
     unroll,
 )
+from crazysim.train.optimizer import build_optimizer
 from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values
 
 PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
@@ -87,6 +88,11 @@ class Config:
     def __post_init__(self) -> None:
         """Check the values."""
         check_hyperparameters(self)
+
+    @property
+    def n_updates(self) -> int:
+        """Number of updates of the whole training."""
+        return self.iterations * self.epochs * self.minibatches
 
 
 class Agent(PyTree):
@@ -186,7 +192,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         value = init_weights(network, k_value, _critic_input(obs, config).shape[-1], (*hidden_sizes, 1), 1.0)
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
-        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(parameters)
+        optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(parameters)
         stats = RunningStats.create(obs.shape[-1], network.pixels).update(obs)
         returns = RunningStats.create(1)
         return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, network, apply_layers)
@@ -355,7 +361,7 @@ def _run_epochs(
     """
     n_worlds, network, n_obs, apply_layers = data[1].shape[1], agent.network, agent.n_obs, agent.apply_layers
     n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
-    transform = _optimizer(config, swept_values["learning_rate"], swept_values["max_grad_norm"])
+    transform = build_optimizer(swept_values["learning_rate"], swept_values["max_grad_norm"], config.n_updates)
 
     def select_minibatch(worlds: Array) -> Any:
         """Return the samples of the worlds of a minibatch, and their memories before the rollout.
@@ -401,12 +407,6 @@ def _run_epochs(
 
     carry, losses = jax.lax.scan(run_epoch, (parameters, agent.optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
-
-
-def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
-    n_updates = config.iterations * config.epochs * config.minibatches
-    schedule = optax.linear_schedule(learning_rate, 0.0, n_updates)
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))
 
 
 def _find_images(env: Env, policy_obs: Obs, config: Config) -> tuple[Image, ...]:

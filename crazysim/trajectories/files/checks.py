@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -69,13 +70,14 @@ def require_version_one(value: dict[str, Any], location: str) -> None:
         raise_error("version 1", short_repr(version), location)
 
 
-def require_number(value: object, location: str, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a value that must be a number from ``low`` to ``high``, as a float."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
+def require_number(
+    value: object, location: str, low: float = -sys.float_info.max, high: float = sys.float_info.max
+) -> float:
+    """Return a value that must be a finite number from ``low`` to ``high``, as a float."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        is_bounded = max(-low, high) < sys.float_info.max
         raise_error(
-            "a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}",
-            short_repr(value),
-            location,
+            f"a number from {low:g} to {high:g}" if is_bounded else "a finite number", short_repr(value), location
         )
     return float(value)
 

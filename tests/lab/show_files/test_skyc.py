@@ -171,6 +171,10 @@ WRONG_VALUES = {
     "negative time": (TRAJECTORY, ["takeoffTime"], -1.0, "number from 0"),
     "lights that are no base64": ("drones/drone_0/lights.json", ["data"], "?", "base64"),
     "lights of another version": ("drones/drone_0/lights.json", ["version"], 7, "version 1"),
+    "infinite parameter": (
+        "show.json", ["swarm", "drones", 0, "settings", "parameters"], [[0.5, "health.motorPWM", float("inf")]],
+        "a finite number",
+    ),
     "cue without time": ("cues.json", ["items", 0, "time"], None, "number"),
     "environment": ("show.json", ["environment", "type"], "space", "indoor"),
 }  # fmt: skip
