@@ -404,7 +404,8 @@ def devices(lines: list[Line]) -> str:
     """Return rates by number of devices, and their ratios to the rate of one device.
 
     Exchanged bytes, memory and compile time are for the largest number of devices of one process. Rates of several
-    processes, such as one on each host, are in the last columns of rates.
+    processes, such as one on each host, are in the last columns of rates. Cases are measured in any order, and listed
+    by name.
     """
     cases: dict[str, dict[tuple[int, int], Line]] = {}
     for line in lines:
@@ -413,7 +414,7 @@ def devices(lines: list[Line]) -> str:
     columns = sorted({column for case in cases.values() for column in case})
     names = [f"{n} device{'s' * (n > 1)}" + f" of {n_hosts} processes" * (n_hosts > 1) for n_hosts, n in columns]
     rows = []
-    for name, case in cases.items():
+    for name, case in sorted(cases.items(), key=lambda item: item[0].casefold()):
         last = case[max(column for column in case if column[0] == 1)]
         rates = [si_text(case[column]["rate"]) if column in case else "" for column in columns]
         sizes = sum(last["exchanged"].values()), last["memory_bytes"]
