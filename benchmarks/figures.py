@@ -545,7 +545,7 @@ FIGURES: dict[str, Figure] = {
         table=tables.fleets,
     ),
     "controllers": Figure(
-        PAGE,
+        "docs/concepts/control-results.md",
         ("crazysim/control", "crazysim/dynamics", "crazysim/drones"),
         cpu="controllers.py --worlds 0",
         table=tables.control,
