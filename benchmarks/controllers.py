@@ -3,7 +3,8 @@
     python benchmarks/controllers.py [--controllers auto indi ...] [--drones cf21B_500 my_drone.toml ...] [--speed 2]
 
 - hover: distance from the setpoint, at a height of 1 m, 5 s after the take-off from the floor, m
-- tracking: RMS distance over 9 s along a figure eight of 2 m, from a start on it, with ``--speed`` in its middle, m
+- tracking: RMS distance from the setpoint on a figure eight 2 m wide, over 9 s from a start on it, m; its largest speed
+  is ``--speed``
 - pushed, pushed_largest: distance 5 s after a sideways force of a tenth of the weight sets in, and largest distance, m
 - heavier: distance after 5 s of hovering with 20% more mass, m
 - home: fraction of the flights from random attitudes at 5 rad/s that end within 0.1 m of the setpoint, after 15 s
@@ -12,9 +13,9 @@
 - error_attitude, error_body_rate: largest error 2 s after these steps and later, fraction of a step
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; omitted with --worlds 0
 
-Without --drones, the airframes are all built-in airframes with rotors, and three generic airframes
-(``generic_airframes``). A controller is left out for an airframe that lacks its constants. ``tracking_lqr`` only flies
-the figure eight.
+Without --drones, the airframes are all built-in airframes with rotors, and with the dynamics ``first_principles`` three
+generic airframes (``generic_airframes``). A controller is left out for an airframe that lacks its constants.
+``tracking_lqr`` only flies the figure eight.
 """
 
 from __future__ import annotations
@@ -235,6 +236,7 @@ def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> 
     (n_steps, n_worlds, n_drones, 3) and (n_steps, 3)
     """
     step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
+    # Elements of parameters that are zero: a traced step leaves their terms out.
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 
@@ -254,21 +256,19 @@ def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> 
 
 def flight_metrics(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str, float]:
     """Return the metrics of one airframe from its positions. (n_steps, n_worlds, 3)"""
-    steps_per_s, setpoint_pos = len(pos) // 15, np.array([0, 0, 1.0])
+    freq, setpoint_pos = len(pos) // 15, np.array([0, 0, 1.0])
     distance = np.linalg.norm(pos - setpoint_pos, axis=-1)
     results = {
-        "tracking": float(
-            np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - path_pos)[: 9 * steps_per_s] ** 2, axis=-1)))
-        )
+        "tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - path_pos)[: 9 * freq] ** 2, axis=-1))))
     }
     if name == "tracking_lqr":
         return results
     return {
-        "hover": float(distance[5 * steps_per_s, TAKE_OFF_WORLD]),
+        "hover": float(distance[5 * freq, TAKE_OFF_WORLD]),
         **results,
-        "pushed": float(distance[7 * steps_per_s, PUSHED_WORLD]),
+        "pushed": float(distance[7 * freq, PUSHED_WORLD]),
         "pushed_largest": float(distance[:, PUSHED_WORLD].max()),
-        "heavier": float(distance[5 * steps_per_s, HEAVY_WORLD]),
+        "heavier": float(distance[5 * freq, HEAVY_WORLD]),
         "home": float(np.mean(np.linalg.norm(pos[-1, FIRST_TUMBLING_WORLD:] - [0, 0, START_HEIGHT], axis=-1) < 0.1)),
         "lost_178": float(START_HEIGHT - pos[:, INVERTED_WORLD, 2].min()),
     }
@@ -277,7 +277,7 @@ def flight_metrics(pos: np.ndarray, path_pos: np.ndarray, name: str) -> dict[str
 def report_cost(args: argparse.Namespace) -> None:
     """Print the step rates of many hovering worlds, measured alternately."""
 
-    def compile_steps(sim: Sim) -> Any:
+    def compile_and_build_timer(sim: Sim) -> Any:
         def steps() -> Any:
             sim.step(100)
             return sim.data.states.pos
@@ -291,7 +291,9 @@ def report_cost(args: argparse.Namespace) -> None:
     for name in args.controllers:
         sims[name] = Sim(args.worlds, control="state", controller=make_controller(name), device=args.device)
         sims[name].state_control(command)
-    for name, duration in medians({name: compile_steps(sim) for name, sim in sims.items()}, args.repeats).items():
+    for name, duration in medians(
+        {name: compile_and_build_timer(sim) for name, sim in sims.items()}, args.repeats
+    ).items():
         rate, engine = args.worlds * 100 / duration, engine_name(sims[name])
         line = {"n_worlds": args.worlds, "engine": engine, "steps_per_s": round_digits(rate)}
         report(args.device, benchmark="controllers", controller=name, **line)

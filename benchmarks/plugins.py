@@ -2,11 +2,12 @@
 
     python benchmarks/plugins.py [--device gpu] [--worlds 262144] [--drones 2] [--cases imu kalman everything ...]
 
-Drones hover on a constant state command, in calls of 100 steps; all cases alternate. Sensors have their default rates.
-``kalman``, ``eskf`` and ``complementary`` are estimators with their sensors; the controllers do not use the estimate of
-``complementary``. ``all_aids`` is a Kalman filter with all kinds of sensors that it takes. ``outdoors`` is an
-error-state filter with satellite navigation, barometer and magnetometer. ``everything`` is all sensors, the Kalman
-filter, wind with gusts, downwash, ground effect, battery and latency.
+Drones hover on a constant state command, in calls of 100 steps; all cases alternate. Sensors have their default rates;
+the distances of ``multi_ranger`` are computed at 10 Hz. ``kalman``, ``eskf`` and ``complementary`` are estimators with
+their sensors; the controllers do not use the estimate of ``complementary``. ``all_aids`` is a Kalman filter with all
+kinds of sensors that it takes. ``outdoors`` is an error-state filter with satellite navigation, barometer and
+magnetometer. ``everything`` is all sensors, the Kalman filter, wind with gusts, downwash, ground effect, battery and
+latency.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ def _all_plugins() -> list[Plugin]:
 OUTDOOR_SENSORS = ("imu", "gps", "barometer", "magnetometer")
 """Cases of the sensors of ``outdoors``."""
 NOT_IN_EVERYTHING = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
-"""Cases that ``everything`` leaves out, or adds in another way: sensors with the filter, battery with its voltage."""
+"""Cases whose plugins ``everything`` does not take from ``CASES``. It adds ``imu`` and ``motion_capture`` together with
+the filter, and ``battery`` with ``battery_voltage``; it leaves out the other two."""
 CASES: dict[str, MakePlugins] = {
     "none": lambda: [],
     **SENSORS,

@@ -3,9 +3,9 @@
     python benchmarks/step.py [--engine auto plain lanes fused] [--controllers auto crazyflow] [--device gpu]
         [--worlds 1024 16384] [--steps 10 100]
 
-Engines and controllers alternate. ``compile_s`` of ``fused`` includes the kernel only the first time that a process
-needs it; ``scaling.py`` runs each size in its own process. Other scripts: ``compile.py``, ``scaling.py``,
-``limits.py``, ``flight_stack.py``, ``versus_crazyflow.py``.
+Engines and controllers alternate. ``compile_s`` of ``fused`` includes the compilation of the kernel only in the first
+case of a process that needs this kernel; ``scaling.py`` runs each size in its own process. Other scripts:
+``compile.py``, ``scaling.py``, ``limits.py``, ``flight_stack.py``, ``versus_crazyflow.py``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
-    """Print one line for each engine and number of steps; all numbers of steps share one compilation."""
+    """Print one line for each engine, controller and value of ``--steps``; all these values share one compilation."""
     cases = list(itertools.product(args.engine, args.controllers))
     sims = {case: build_sim(args, *case, control, integrator, n_worlds, n_drones) for case in cases}
     compile_s: dict[tuple[str, str], float] = {}

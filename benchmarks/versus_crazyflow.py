@@ -1,8 +1,10 @@
 """Comparison of crazysim with Crazyflow 0.4.0, which runs in a virtual environment that this script creates.
 
 Each program runs in its own process with the same JAX. Batches of calls of the two programs alternate, so that the
-noise of a shared machine affects both. Medians and the ratios of medians are printed. Steps, loops, calls and gradients
-are measured with each controller of ``--controllers``; ``crazyflow`` is the controller of Crazyflow. The cases:
+noise of a shared machine affects both. Medians are printed. A ``ratio`` of times is Crazyflow's over ours; the ratio of
+``memory`` is ours over Crazyflow's, and that of ``swarm`` is the time of the single drones over that of the swarm.
+Steps, loops, calls and gradients are measured with each controller of ``--controllers``; ``crazyflow`` is the
+controller of Crazyflow. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds
@@ -66,7 +68,7 @@ def main() -> None:
     args = parser.parse_args()
     pythons = {"crazysim": sys.executable}
     if set(args.only) != {"swarm"}:
-        pythons["crazyflow"] = str(args.peer_python or peer_environment(args.device))
+        pythons["crazyflow"] = str(args.peer_python or peer_interpreter(args.device))
     if "first_step" in args.only:
         compare_first_steps(pythons, args.device)
     workers = {name: Worker(python, name) for name, python in pythons.items()}
@@ -132,7 +134,7 @@ class Comparison:
             print(json.dumps(line | self.machine), flush=True)
 
     def compare_query(self, task: str, **case: Any) -> None:
-        """Print the time of a query in both programs."""
+        """Print the time of a task in both programs: a scene query, the build of a swarm, or environment steps."""
         durations = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
         line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{task}", **case}
         for name, (seconds, compile_s) in durations.items():
@@ -185,7 +187,7 @@ class Comparison:
 
 
 def compare_first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
-    """Print the time from Sim(n_worlds=1) to its first step in fresh processes, alternating."""
+    """Print the times of imports and from Sim(n_worlds=1) to its first step, in alternating fresh processes."""
     times: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     for _ in range(repeats):
         for name, python in pythons.items():
@@ -230,7 +232,7 @@ class Worker:
         self._out.close()
 
 
-def peer_environment(device: str) -> Path:
+def peer_interpreter(device: str) -> Path:
     """Return the interpreter of an environment with Crazyflow 0.4.0 and the version of JAX that is installed here.
 
     The environment is created at the first use.

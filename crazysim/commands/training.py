@@ -1,4 +1,7 @@
-"""``crazysim train``, ``evaluate``, ``export`` and ``render``: policies."""
+"""``crazysim train``, ``evaluate``, ``export`` and ``render``: policies.
+
+A recipe is the settings that are known to solve a task (``crazysim.train.config``).
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,10 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add = parser.add_argument
     task_help = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
     add("task", help=task_help)
-    add("--algorithm", help="ppo, apg or dagger; by default the recipe's, or dagger with a teacher")
+    add("--algorithm", help="ppo, apg or dagger; by default that of the task's recipe, or dagger with --teacher")
     teacher_help = (
-        "folder of a run whose policy teaches this one, which sees what the task observes (DAgger); by default the "
-        "recipe's teacher, if it has one, which is trained first"
+        "folder of a run whose policy is the teacher (DAgger); the new policy gets the observations of the task. By "
+        "default the recipe's teacher, if it has one, which is trained first"
     )
     add("--teacher", metavar="FOLDER", help=teacher_help)
     add("--seed", type=int, help="random seed; by default 0")
@@ -37,7 +40,9 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep_help)
     worlds_help = "number of parallel worlds of a training, but not of a recipe's teacher; by default the recipe's"
     add("--worlds", type=int, help=worlds_help)
-    iterations_help = "number of rollouts, each with its updates, as --worlds; by default the recipe's"
+    iterations_help = (
+        "number of rollouts, each with its updates, but not of a recipe's teacher; by default the recipe's"
+    )
     add("--iterations", type=int, help=iterations_help)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume_help = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
@@ -49,7 +54,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--devices", metavar="all|N|I,J", help=devices_help)
     hosts.add_options(add)
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
-    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm, as --worlds")
+    config_help = "hyperparameters of the algorithm, but not of a recipe's teacher"
+    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help=config_help)
     add("--no-film", action="store_true", help="write no film")
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)

@@ -22,7 +22,7 @@ MIN_EXTENT, MAX_EXTENT = 0.01, 10_000.0
 MAX_COORDINATE = 1e6
 """Largest coordinate of a map, m."""
 MAX_VOXELS = 20_000_000
-"""Largest number of voxels that are tested or merged; more would need several GB of memory."""
+"""Largest number of points of a cloud, or of voxels near triangles; more would need several GB of memory."""
 MAX_BOXES = 10_000
 """Largest number of boxes of a map."""
 MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
@@ -128,6 +128,6 @@ def _read_source(source: MapSource) -> MapFile:
 def _check_count(label: str, n: int, resolution: float) -> None:
     if n > MAX_VOXELS:
         raise ConfigError(
-            f"expected a map of at most {MAX_VOXELS} {label}, got {n} with voxels of {resolution:g} m. Use a larger "
-            f"resolution=, or a part of the map."
+            f"expected a map of at most {MAX_VOXELS} {label}, got {n} with voxels of {resolution:g} m. Use a part of "
+            f"the map, or for triangles a larger resolution=."
         )

@@ -115,7 +115,10 @@ class Handle:
 def _replace_rows(
     old: Array, value: Array | NDArray, mask: Array | None, row_indices: tuple[int, ...], is_quat: bool
 ) -> Array:
-    """Return positions, attitudes (normalised) or velocities of all objects with the selected rows replaced."""
+    """Return positions, attitudes (normalised) or velocities of all objects with the selected rows replaced.
+
+    Arrays are (n_worlds, 1, n_objects, k) for all worlds, or (n_objects, k) for one world.
+    """
     n, size = len(row_indices), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:
@@ -134,7 +137,12 @@ def _replace_rows(
 
 @jit_eager_calls("row_indices")
 def _select_rows(poses: Array, row_indices: tuple[int, ...]) -> Array:
-    """Return positions or attitudes of the selected objects. (n, k), or (n_worlds, n, k) for all worlds"""
+    """Return positions or attitudes of the selected objects. (n, k), or (n_worlds, n, k) for all worlds
+
+    Args:
+        poses: Positions or attitudes of all objects. (n_objects, k), or (n_worlds, 1, n_objects, k) for all worlds
+        row_indices: Rows of the selected objects.
+    """
     return (poses if poses.ndim == 2 else poses[:, 0])[..., np.array(row_indices), :]
 
 
@@ -183,7 +191,7 @@ class SceneObjects:
     def add(
         self,
         spec: mujoco.MjSpec,
-        source: Source,
+        source: Source | list[Source],
         name: str | None,
         count: int,
         pos: ArrayLike,
@@ -264,7 +272,13 @@ def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
 
 
 def add_bodies(
-    spec: mujoco.MjSpec, source: Source, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
+    spec: mujoco.MjSpec,
+    source: Source | list[Source],
+    names: list[str],
+    pos: np.ndarray,
+    quat: np.ndarray,
+    mocap: bool,
+    options: dict,
 ) -> None:
     """Add bodies to a spec.
 
@@ -322,7 +336,7 @@ def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
     return spec
 
 
-def _default_name(source: Source) -> str:
+def _default_name(source: Source | list[Source]) -> str:
     """Return the name of objects that are added without a name."""
     if isinstance(source, mujoco.MjsBody):
         return source.name or "object"

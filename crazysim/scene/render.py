@@ -17,7 +17,7 @@ from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
 
 MAX_SIZES = 4
-"""Largest number of image sizes for which contexts are kept."""
+"""Largest number of image sizes for which OpenGL contexts are kept."""
 
 FREE_CAMERA_SHAPES = {"lookat": (3,), "distance": (), "azimuth": (), "elevation": ()}
 """Shapes of the settings of the free camera, which ``cam_config`` may contain."""

@@ -54,10 +54,11 @@ def run(
     ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the plots or the film are left out, and a line
     is logged. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` from a signal handler.
 
-    Some recipes have a teacher, such as the recipe of ``race_by_camera``. The teacher is trained first, in the folder
-    ``teacher`` of the run, unless the settings name another teacher or another algorithm. ``options`` apply to teacher
-    and student; ``n_worlds``, ``config`` and ``on_iteration`` apply only to the student. If the teacher is interrupted,
-    call ``run`` again with the same settings and ``resume=True``.
+    The recipe of a task is the settings that are known to solve it (``crazysim.train.config``). Some recipes have a
+    teacher, such as the recipe of ``race_by_camera``. The teacher is trained first, in the folder ``teacher`` of the
+    run, unless the settings name another teacher or another algorithm. ``options`` apply to teacher and student;
+    ``n_worlds``, ``config`` and ``on_iteration`` apply only to the student. If the teacher is interrupted, call ``run``
+    again with the same settings and ``resume=True``.
 
     Args:
         task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task`` such as

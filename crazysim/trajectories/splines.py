@@ -92,7 +92,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
     durations = np.diff(end_times, prepend=0.0)
     if not np.all(np.isfinite(end_times)) or not np.all(durations > 0):
         raise ConfigError(
-            f"expected finite, positive, ascending ends, got {end_times.tolist()}. Remove curves without length."
+            f"expected finite, positive, ascending ends, got {end_times.tolist()}. Remove curves without duration."
         )
     degree = max(len(curve) for curve in curves) - 1
     pieces = [

@@ -46,7 +46,10 @@ def add_wrappers(env):
     [
         ("hover", add_wrappers, {"randomize": "crazyflie"}),
         pytest.param(
-            "swarm", lambda env: env, {}, marks=pytest.mark.slow("hover has wrappers too, race is flown below")
+            "swarm",
+            lambda env: env,
+            {},
+            marks=pytest.mark.slow("the case hover also has wrappers; Race is tested below"),
         ),
     ],
     ids=["hover", "swarm"],
@@ -64,7 +67,7 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mes
             else:
                 state = step(state, argument) if kind == "step" else restart(state, argument)
             yield state
-        assert jax.eval_shape(env.flatten, state).plan.rows  # a rollout updates them in place
+        assert jax.eval_shape(env.flatten, state).plan.rows  # arrays that a rollout updates in place
 
     n_ended = 0
     for unsharded, sharded in zip(fly_on_mesh(None), fly_on_mesh(mesh), strict=True):

@@ -68,7 +68,7 @@ def place_drones(state, drone, load, vel, goal=GOAL):
 
 
 @pytest.fixture(scope="module")
-def recorded_flight():
+def case_worlds_and_state():
     """Return the world of each case, and the state after a step."""
     env = make_env(len(CASES))
     place, load_offset, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
@@ -76,18 +76,19 @@ def recorded_flight():
     return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
 
 
-def test_touching_and_missing_the_gate_or_leaving_the_corridor_is_a_crash(recorded_flight):
-    world, after = recorded_flight
+def test_touching_and_missing_the_gate_or_leaving_the_corridor_is_a_crash(case_worlds_and_state):
+    world, after = case_worlds_and_state
     crashed = np.asarray(after.info["crashed"])[:, 0]
     assert {name for name, k in world.items() if crashed[k]} == set(CASES) - SAFE
     np.testing.assert_array_equal(after.terminated, crashed)
     np.testing.assert_array_equal(np.asarray(after.reward)[:, 0] < -5, crashed)
 
 
-def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(recorded_flight):
-    world, after = recorded_flight
+def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(case_worlds_and_state):
+    world, after = case_worlds_and_state
     passed = np.asarray(after.info["passed"])[:, 0]
-    assert {name for name, k in world.items() if passed[k]} - {"load just inside"} == {"through", "behind"}
+    in_plane = {"load just inside"}  # its load is in the gate's plane, so rounding decides
+    assert {name for name, k in world.items() if passed[k]} - in_plane == {"through", "behind"}
 
 
 def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_the_gate():
@@ -159,7 +160,7 @@ def test_starts_are_clear_of_the_gates_and_links_are_taut():
 
 
 class Pilot(PyTree):
-    """Fly along the gate's axis at up to 0.8 m/s, where it is centred, and then bring the load to its goal."""
+    """Policy that flies through the gate along its axis, faster the nearer to the axis, and then to the goal."""
 
     gain: jax.Array
     """Factor of all actions. ()"""
@@ -194,7 +195,7 @@ def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_t
     [
         (
             {"opening": 0.5},
-            "expected opening from 0.55 m, 0.25 m more than the length of rod or cable, to 1.6 m, got 0.5",
+            r"expected opening from 0.55 m \(length of rod or cable \+ 0.25 m\) to 1.6 m, got 0.5",
         ),
         ({"length": 1.0}, "expected opening from 1.25 m"),
         ({"swing": -0.1}, "swing of Transport to be from 0 to 1, got -0.1"),

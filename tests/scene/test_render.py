@@ -76,7 +76,7 @@ def test_the_empty_image_is_plain_floor(empty_image):
     assert np.ptp(empty_image.reshape(-1, 3), axis=0).max() < 20
 
 
-def test_a_drone_that_moved_is_drawn_at_its_new_set_positions(sim, empty_image):
+def test_a_drone_that_moved_is_drawn_at_its_new_position(sim, empty_image):
     """The next image shows every change of the state."""
     set_positions(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
     rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
@@ -87,15 +87,16 @@ def test_a_drone_that_moved_is_drawn_at_its_new_set_positions(sim, empty_image):
 def test_a_drone_that_rolled_shows_its_side(sim, empty_image):
     """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, but not shorter."""
 
-    def widths(quat_xyzw):
+    def turn_and_measure(quat_xyzw):
+        """Turn the drones, and return height and width of the drone in the image, pixels."""
         states = sim.data.states
         sim.data = sim.data.replace(states=states.replace(quat=np.tile(np.float32(quat_xyzw), (2, 1, 1))))
         rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))
         return np.ptp(rows), np.ptp(columns)
 
     s = np.sqrt(0.5)
-    level, rolled, pitched = widths([0, 0, 0, 1.0]), widths([s, 0, 0, s]), widths([0, s, 0, s])
-    widths([0, 0, 0, 1.0])
+    level, rolled, pitched = (turn_and_measure(quat) for quat in ([0, 0, 0, 1.0], [s, 0, 0, s], [0, s, 0, s]))
+    turn_and_measure([0, 0, 0, 1.0])  # level again for the next tests
     assert rolled[0] < 0.6 * level[0]
     assert rolled[1] > 0.8 * level[1]
     assert pitched[1] < 0.6 * level[1]
@@ -154,7 +155,7 @@ def test_the_free_camera_follows_cam_config(sim, empty_image):
 
 
 def test_the_onboard_camera_turns_with_the_drone(sim):
-    """Looking ahead it sees the horizon in the middle, pitched down by 90 degrees only floor."""
+    """A level camera sees the horizon in the middle. Pitched down by 90 degrees, it sees only floor."""
     shot = SHOT | {"mode": "depth_array", "camera": "fpv_cam:0"}
     ahead = sim.render(**shot)
     assert ahead[-1].max() < 1.0, "the floor is near below the horizon"
@@ -186,7 +187,7 @@ def test_every_call_uses_its_own_arguments(sim, empty_image):
 
 
 def test_images_of_many_sizes_are_drawn_in_turn(sim):
-    """There are more sizes than kept contexts, and some are larger than any before."""
+    """There are more sizes than OpenGL contexts are kept for, and some are larger than all before them."""
     sizes = [(48, 32), (2000, 40), (64, 64), (33, 17), (40, 1100), (160, 120), (48, 32)]
     for width, height in sizes:
         assert sim.render(**SHOT | {"width": width, "height": height}).shape == (height, width, 3)
@@ -212,7 +213,7 @@ def test_a_second_simulation_draws_beside_the_first(sim):
 
 
 def test_depth_is_the_distance_along_the_axis_in_metres(sim):
-    """Straight down the floor is everywhere as far as the camera is high, whatever the angle; the drone is nearer."""
+    """From a camera that looks straight down, all floor has a depth of the camera's height; the drone is nearer."""
     depth = sim.render(**SHOT | {"mode": "depth_array"})
     assert depth.shape == (HEIGHT, WIDTH)
     assert depth.dtype == np.float32
@@ -353,7 +354,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
             for corner in (shown[-40:, -150:], shown[:40, :100]):
                 assert ((corner.max(-1) < 150).sum() > 500) == has_text, "letters stand on a dark ground"
         assert blue.sum() > 100
-        assert not red.any(), "marks are for one picture only"
+        assert not red.any(), "overlays are for one picture only"
         assert np.nonzero(blue)[1].mean() < lit[1].mean() - 20
         assert program.stdout.readline().strip() == "done"
         assert program.wait(60) == 0

@@ -45,13 +45,15 @@ def derivative_rows(t, size):
     return np.array([[f * t ** max(j - k, 0) for j, f in enumerate(row)] for k, row in enumerate(factors)])
 
 
-def snap_by_lagrange(waypoints, durations, order, velocity):
-    """Return the minimum over monomials with every waypoint and all continuity as a constraint, by its KKT system.
+def coefficients_by_kkt(waypoints, durations, order, velocity):
+    """Return the coefficients of the optimal polynomials. (n_pieces, 3, 2 order)
+
+    Waypoints and continuity are equality constraints, and the KKT system is solved.
 
     Args:
-        waypoints: (n, 3)
-        durations: (n - 1,)
-        order: Derivative whose square is minimised.
+        waypoints: (n_pieces + 1, 3)
+        durations: (n_pieces,)
+        order: Order of the derivative whose squared integral is minimised.
         velocity: Velocity at the second waypoint; NaN where free. (3,)
     """
     size, n = 2 * order, len(durations)
@@ -65,22 +67,23 @@ def snap_by_lagrange(waypoints, durations, order, velocity):
     for axis in range(3):
         rows, right = [], []
 
-        def equal(terms, value, rows=rows, right=right):
+        def add_constraint(terms, value, rows=rows, right=right):
+            """Require that the rows in ``terms`` times the coefficients of their pieces sum to a value."""
             row = np.zeros(n * size)
             for p, part in terms:
                 row[p * size : (p + 1) * size] += part
             rows.append(row), right.append(value)
 
         for k in range(1, order):
-            equal([(0, derivative_rows(0.0, size)[k])], 0.0)
-            equal([(n - 1, derivative_rows(durations[-1], size)[k])], 0.0)
+            add_constraint([(0, derivative_rows(0.0, size)[k])], 0.0)
+            add_constraint([(n - 1, derivative_rows(durations[-1], size)[k])], 0.0)
         for p, h in enumerate(durations):
-            equal([(p, derivative_rows(0.0, size)[0])], waypoints[p, axis])
-            equal([(p, derivative_rows(h, size)[0])], waypoints[p + 1, axis])
+            add_constraint([(p, derivative_rows(0.0, size)[0])], waypoints[p, axis])
+            add_constraint([(p, derivative_rows(h, size)[0])], waypoints[p + 1, axis])
             for k in range(1, order if p + 1 < n else 0):
-                equal([(p, derivative_rows(h, size)[k]), (p + 1, -derivative_rows(0.0, size)[k])], 0.0)
+                add_constraint([(p, derivative_rows(h, size)[k]), (p + 1, -derivative_rows(0.0, size)[k])], 0.0)
         if np.isfinite(velocity[axis]):
-            equal([(1, derivative_rows(0.0, size)[1])], velocity[axis])
+            add_constraint([(1, derivative_rows(0.0, size)[1])], velocity[axis])
         a = np.array(rows)
         system = np.block([[cost, a.T], [a, np.zeros((len(a), len(a)))]])
         found = np.linalg.lstsq(system, np.concatenate([np.zeros(len(cost)), right]), rcond=None)[0]
@@ -94,7 +97,7 @@ def test_the_plan_is_the_solution_of_the_kkt_system(method, velocity, x64):
     velocities = np.full_like(WAYPOINTS, np.nan)
     velocities[[0, -1]], velocities[1] = 0.0, velocity
     trajectory = method(WAYPOINTS, DURATIONS, velocities=velocities)
-    expected = snap_by_lagrange(WAYPOINTS, DURATIONS, METHODS[method], velocity)
+    expected = coefficients_by_kkt(WAYPOINTS, DURATIONS, METHODS[method], velocity)
     np.testing.assert_allclose(pieces(trajectory), expected, atol=1e-7 * np.abs(expected).max())
 
 
@@ -227,7 +230,7 @@ def test_a_wide_corridor_changes_nothing_and_a_single_piece_may_be_bounded():
 
 
 def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
-    """Two pieces in a plane; SciPy minimises the same cost under the same bound at 60 times of each piece."""
+    """Two pieces in a plane; SciPy minimises the same cost, with a bound on the distances at 61 times of each piece."""
     waypoints, durations, radius = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1.0]]), np.array([1.0, 1.0]), 0.05
     found = pieces(minimum_snap(waypoints, durations, corridors=radius))
 
@@ -250,7 +253,10 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     parts = np.array([coefficients(e) - base for e in np.eye(6)])
 
     def clearance(x):
-        """Return the squared radius, which is reduced by 0.75%, less the squared distances to the segments."""
+        """Return the square of the radius, less 0.75%, minus the squared distances to the segments.
+
+        The planner leaves 0.5% to 1% of the radius unused (``RADIUS_MARGIN``).
+        """
         pos = np.einsum("uk,pak->pua", powers, base + np.tensordot(x, parts, 1))
         begin, along = waypoints[:2, None, :2], np.diff(waypoints, axis=0)[:, None, :2]
         nearest = begin + np.clip(np.sum((pos - begin) * along, axis=-1), 0, 1)[..., None] * along
@@ -340,6 +346,9 @@ def test_durations_times_the_factor_of_the_error_meet_the_limits():
     factor = float(str(caught.value).split("durations by ")[1].split(",")[0])
     report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
     assert max(report.peaks[name].value[0] / LIMITS.as_dict()[name] for name in ("speed", "acceleration")) > 0.99
+
+
+def test_separation_is_no_quantity_of_one_trajectory():
     assert "separation" not in QUANTITIES
 
 

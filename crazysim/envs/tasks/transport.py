@@ -85,8 +85,8 @@ class Transport(BringLoad):
         super().__post_init__()
         if not self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6:
             raise ConfigError(
-                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m, {MIN_OPENING_MARGIN} m more than the "
-                f"length of rod or cable, to 1.6 m, got {self.opening!r}"
+                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m (length of rod or cable + "
+                f"{MIN_OPENING_MARGIN} m) to 1.6 m, got {self.opening!r}"
             )
 
     def install(self, sim: Sim) -> None:

@@ -88,7 +88,8 @@ class ESKF(ErrorStateFilter):
     max_vel: float = setting(default=100.0, positive=True)
     """Magnitude of the velocity along an axis beyond which the estimate has diverged, m/s."""
     reset_before: ClassVar[str | None] = "integration"
-    """Name of the stage before which an episode is reset, so that the reset uses the state before the first step."""
+    """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
+    state before that step."""
     name: str = "eskf"
 
     @property
@@ -119,6 +120,7 @@ class ESKF(ErrorStateFilter):
                 if sensor.is_late
             ),
             *self.fusion_stages(),
+            # The last stage has the name of the estimator.
             ("", self.restart_stage()),
         ]
 

@@ -35,7 +35,8 @@ class Estimator(Plugin):
     control: bool = True
     """True if the controllers of the simulation use the estimate."""
     reset_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage before which an episode is reset, so that the reset uses the state after the first step."""
+    """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
+    state after that step."""
     _: dataclasses.KW_ONLY
     name: str = "estimator"
 
@@ -61,7 +62,9 @@ class Estimator(Plugin):
         raise NotImplementedError
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the names and stages of the filter, in their order; the name of the last stage is empty.
+        """Return the names and stages of the filter, in their order.
+
+        The last name is empty: that stage has the name of the plugin.
 
         Args:
             freq: Steps of the simulation per second, Hz.

@@ -122,6 +122,7 @@ class Kalman(ErrorStateFilter):
             *self.fusion_stages(),
             ("finalize", Stage(self._finalize, "drone", self._is_updated)),
             ("restart", self.restart_stage()),
+            # The last stage has the name of the estimator.
             ("", Stage(self._store_attitude, "drone")),
         ]
 

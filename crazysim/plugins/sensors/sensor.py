@@ -63,7 +63,8 @@ class Sensor(Plugin):
     kind: ClassVar[type[PyTree]]
     """Class of the record."""
     reset_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage before which an episode is reset, so that the reset uses the state of the first measurement."""
+    """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
+    state of the first measurement."""
 
     _: dataclasses.KW_ONLY
     freq: int | None = None

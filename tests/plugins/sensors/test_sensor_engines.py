@@ -42,7 +42,8 @@ def build(n_worlds, names, **settings):
         if name in REQUIRED_BY:
             sim.add(REQUIRED_BY[name]())
         sim.add(SENSORS[name]())
-    sim.rotor_vel_control(np.broadcast_to(1.05 * speed, (n_worlds, 2, 4)))  # the lag has a kink at the command
+    # The slope of the rotor lag jumps where the speed equals the command.
+    sim.rotor_vel_control(np.broadcast_to(1.05 * speed, (n_worlds, 2, 4)))
     return sim
 
 
@@ -64,8 +65,8 @@ def test_every_sensor_is_fused(sim):
 
 
 def test_every_sensor_measures_something(sim):
-    ideal, found = (measurements(sim, data) for data in (sim.data, sim.step_fn(sim.data, jnp.int32(20))))
-    for name, x in found.items():
+    ideal, measured = (measurements(sim, data) for data in (sim.data, sim.step_fn(sim.data, jnp.int32(20))))
+    for name, x in measured.items():
         assert np.isfinite(x).all()
         changed = np.abs(x - ideal[name]).max(axis=-1) > 1e-7 * np.abs(x).max()
         assert changed.all() or name == "lighthouse.visible", name
@@ -116,7 +117,8 @@ def test_law_08_gradients_are_central_differences(x64):
         SENSORS, slopes, reverse_slopes, differences, sizes, strict=True
     ):
         assert abs(difference) > 1e-6 * size, name
-        np.testing.assert_allclose([slope, reverse_slope], difference, rtol=1e-5, err_msg=name)  # h^2 of the difference
+        # The error of the difference is of order h^2.
+        np.testing.assert_allclose([slope, reverse_slope], difference, rtol=1e-5, err_msg=name)
 
 
 def test_gradients_pass_through_rounding(x64):
