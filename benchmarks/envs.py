@@ -3,11 +3,13 @@
     python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize] [--depth 16 12]
                               [--actions random policy bfloat16 training]
 
-An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training. ``ended`` is
-the fraction of worlds whose episode ends per step; lines of ``training`` lack it. With ``--randomize`` the same
-rollouts with ``Randomize.crazyflie()`` are timed alternately. With ``--depth`` the policies also receive a depth image
-of each drone's camera at every environment step. ``training`` times the iterations of ``crazysim train`` by PPO. This
-includes rollout and updates, but no compilation or evaluation. Batches of training grow with the number of worlds.
+An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training. With several
+drones in a world, the steps of each drone count. ``ended`` is the fraction of worlds whose episode ends per step; lines
+of ``training`` lack it. With ``--randomize`` the same rollouts with ``Randomize.crazyflie()`` are timed alternately.
+``drones`` is ``as the airframe`` or ``randomized``, which describes their parameters. With ``--depth`` the policies
+also receive a depth image of each drone's camera at every environment step. ``training`` times the iterations of
+``crazysim train`` by PPO. This includes rollout and updates, but no compilation or evaluation. Batches of training grow
+with the number of worlds.
 """
 
 from __future__ import annotations
@@ -120,14 +122,14 @@ def report_rates(
         "policy": act_with_noise(policy),
         "bfloat16": act_with_noise(policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))),
     }
-    recipe = TrainConfig.create(task, "ppo", n_worlds=n_worlds).algorithm_config()
+    config = TrainConfig.create(task, "ppo", n_worlds=n_worlds).algorithm_config()
     for name in actions:
         measures: dict[str, Any] = {}
         compile_s, last_results = {}, {}
         for drones, env in env_by_drones.items():
             if name == "training":
-                carry = ppo.init(env, (recipe,), key[None])
-                lowered = ppo.iterate.lower(carry, env, (recipe,))
+                carry = ppo.init(env, (config,), key[None])
+                lowered = ppo.iterate.lower(carry, env, (config,))
             else:
                 carry = (start_states[drones], jax.device_put(jax.random.key(2), env_device))
                 lowered = jit_rollout(env, act_functions[name]).lower(carry)
@@ -145,7 +147,7 @@ def report_rates(
                 return time.perf_counter() - start_time
 
             measures[drones], last_results[drones] = measure, results
-        steps = recipe.n_steps if name == "training" else n_steps
+        steps = config.n_steps if name == "training" else n_steps
         for drones, seconds in medians(measures, repeats).items():
             ended_entry = (
                 {} if name == "training" else {"ended": round_digits(float(jnp.mean(last_results[drones][1][1])))}

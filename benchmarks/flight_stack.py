@@ -5,8 +5,9 @@
 Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time of the case divided by the time of its
 reference. The reference is ``state`` for trajectories and controllers, and ``rotor`` for loads.
 
-- state: the default controller, a constant command; follow: a figure eight for all; starts: with a start per world
-- slots: 16 trajectories of 60 pieces, index and start per world
+- state: the default controller, a constant command
+- follow: a figure eight for all; starts: the same, with another start time in each world
+- slots: the same with 16 trajectories of 60 pieces, one for each world in turn
 - geometric: geometric control at 100 Hz along a figure eight
 - pid, mellinger: the firmware's controllers, a constant command
 - rotor: rotor commands without a load; rod, cable: a load attached to the centre of mass; offset: a rod attached below
@@ -70,12 +71,12 @@ def follow_trajectory(sim: Sim) -> None:
 
 
 def follow_from_own_starts(sim: Sim) -> None:
-    """Make all drones follow one trajectory, from a different time on in each world."""
+    """Make all drones follow one trajectory, with another start time in each world."""
     sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), start=start_times(sim), visible=False))
 
 
 def follow_slots(sim: Sim) -> None:
-    """Make the drones follow 16 trajectories of 60 pieces, from a different time on in each world."""
+    """Make the drones follow 16 trajectories of 60 pieces, with another start time in each world."""
     coefficients = np.random.default_rng(0).normal(0.0, 0.01, (N_PIECES, 4, 8))
     coefficients[:, 2, 0] = 1.0
     pieces = Trajectory.of_pieces(np.full(N_PIECES, 0.1), coefficients)
@@ -84,7 +85,7 @@ def follow_slots(sim: Sim) -> None:
 
 
 def start_times(sim: Sim) -> np.ndarray:
-    """Return times at which the drones start, s. (n_worlds, 1)"""
+    """Return times at which the drones start their trajectories, s. (n_worlds, 1)"""
     return np.linspace(-1.0, 0.0, sim.n_worlds)[:, None]
 
 

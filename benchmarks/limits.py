@@ -1,7 +1,7 @@
 """Lower bound of the time of each case on this machine, and the measured time relative to it.
 
 The lower bound is the larger of two times. One is the time of the operations at the rate of multiply-adds that the same
-engine reaches on this machine. The other is the time to move each number that a call reads or writes once, at the
+engine reaches on this machine. The other is the time to move each number once that a call reads or writes, at the
 bandwidth of a copy on this machine. Both rates are the best of all repeats; the measured time is a median. The copy is
 larger than the caches. Data that fits into a cache may move faster.
 
@@ -150,13 +150,13 @@ def _count_contracted(block: Block) -> int:
             if isinstance(x, Value):
                 users.setdefault(x, []).append(op)
     outputs = {x for inner in block.blocks() for x in inner.outputs}
-    products: set[Value] = set()
+    contracted_sums: set[Value] = set()
     contracted = 0
     for op in block.operations:
         sums = {user.results[0]: user for x in op.results for user in users.get(x, []) if user.results}
-        is_summed = all(user.name in ("add", "sub") and x not in products for x, user in sums.items())
+        is_summed = all(user.name in ("add", "sub") and x not in contracted_sums for x, user in sums.items())
         if op.name == "mul" and op.dtype.kind == "f" and sums and is_summed and op.results[0] not in outputs:
-            products |= sums.keys()
+            contracted_sums |= sums.keys()
             contracted += 1
     return contracted
 

@@ -44,8 +44,8 @@ def report_rate(samples: int, args: argparse.Namespace) -> None:
     start_hovering(sim, args.control)
     settings = {"substeps": args.substeps, "knots": args.knots, "freq": args.freq}
     mppi = MPPI(sim, args.horizon, samples, **settings)
-    zero, no_feedforward = jnp.zeros(3), jnp.zeros(1)
-    setpoint = jax.device_put(Setpoint(jnp.array([0.5, 0, 1.0]), *[zero] * 4, *[no_feedforward] * 3), sim.device)
+    zero_vector, zero_angle = jnp.zeros(3), jnp.zeros(1)
+    setpoint = jax.device_put(Setpoint(jnp.array([0.5, 0, 1.0]), *[zero_vector] * 4, *[zero_angle] * 3), sim.device)
     compile_s = seconds(lambda: mppi.command(sim.data, setpoint))
     mppi.command(sim.data, setpoint)
     command_s = medians({"command": lambda: seconds(lambda: mppi.command(sim.data, setpoint))}, args.repeats)["command"]

@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--together", type=int, default=20, help="largest number of seeds of a process")
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
     parser.add_argument("--only-plot", action="store_true", help="plot, summarise and write finished runs; train none")
-    parser.add_argument("--keep", action="store_true", help="use finished runs of other sources of the package too")
+    parser.add_argument("--keep", action="store_true", help="use finished runs of other versions of the package too")
     parser.add_argument(
         "--commit", default=source_commit(), help="name of the sources in the table; by default %(default)s"
     )
@@ -86,17 +86,17 @@ def main() -> None:
     tasks = args.tasks or (list(TASKS) if args.all or args.check else ["hover", "recover", "track", "race"])
     seeds = args.seeds or ([0] if args.check else [0, 1, 2, 3, 4])
 
-    results_file, source = args.out / "results.jsonl", source_hash()
+    results_file, digest = args.out / "results.jsonl", source_hash()
     keys = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
     results = {
-        key: x for key, x in read_results(results_file).items() if key in keys and (args.keep or x["sources"] == source)
+        key: x for key, x in read_results(results_file).items() if key in keys and (args.keep or x["sources"] == digest)
     }
     failures = []
     if not args.only_plot:
         missing_keys = [key for key in keys if key not in results]
         print(json.dumps({"finished": len(results), "to_train": len(missing_keys)}), flush=True)
         groups = group_runs(missing_keys, args.together)
-        run_info = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
+        run_info = {"sources": digest, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
         if missing_keys:
             # In a separate process, because this process would keep memory of the device.
             run_info |= run_in_process(describe_machine, args.device)
@@ -209,7 +209,8 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
     Args:
         group: Task, seed, device and further arguments of ``crazysim train`` for each run; only the seeds differ.
         out: Folder of the runs.
-        run_info: Hash of the sources, and the number of processes that run at the same time.
+        run_info: Entries of all results, among them the hash of the sources (``sources``) and the number of processes
+            that run at the same time (``parallel``).
 
     Raises:
         RuntimeError: If the training fails, with the end of its output.
@@ -249,9 +250,10 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
 
 
 def read_result(folder: Path, diverged: int | None) -> dict[str, Any]:
-    """Return the results of one seed from its learning curve. Seconds are the time of its process for all seeds.
+    """Return the results of one seed from its learning curve.
 
-    Steps and seconds include the steps and seconds of a teacher that was trained first.
+    Seconds are those of the process, which trains all of its seeds together. Steps and seconds include those of a
+    teacher that was trained first. ``kept_iteration`` is the iteration of the policy that was kept.
 
     Args:
         folder: Folder of the seed.

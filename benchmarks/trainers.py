@@ -274,12 +274,12 @@ def measure_trainer(
 ) -> dict[str, Any]:
     """Return the line of one trainer and number of worlds."""
     env, eval_env = (make(task, n, device=device) for n in (n_worlds, n_starts))
-    n_steps = config.iterations * config.n_steps * n_worlds
+    env_steps = config.iterations * config.n_steps * n_worlds
     rates, success = [], []
     for seed in range(n_seeds):
         start_time = time.perf_counter()
         seconds, policy = TRAINERS[name](env, config, seed)
-        rates.append(n_steps * (1 - (config.iterations // QUARTERS) / config.iterations) / seconds)
+        rates.append(env_steps * (1 - (config.iterations // QUARTERS) / config.iterations) / seconds)
         total_s = time.perf_counter() - start_time
         success.append(round(evaluate(eval_env, policy)["success"], 4))
         print(f"{name}, seed {seed}: {total_s:.1f} s, success {success[-1]:.1%}", file=sys.stderr, flush=True)
@@ -291,8 +291,8 @@ def measure_trainer(
     }
     if name == "rsl_rl":
         line["torch"] = importlib.metadata.version("torch")
-    line |= {"task": task, "n_worlds": n_worlds, "iterations": config.iterations, "env_steps": n_steps}
-    line |= {"env_steps_per_s": round_digits(rate), "seconds": round_digits(n_steps / rate), "success": success}
+    line |= {"task": task, "n_worlds": n_worlds, "iterations": config.iterations, "env_steps": env_steps}
+    line |= {"env_steps_per_s": round_digits(rate), "seconds": round_digits(env_steps / rate), "success": success}
     return line | describe_machine(device)
 
 

@@ -66,6 +66,7 @@ def measure(case: str, args: argparse.Namespace) -> None:
     sim = Sim(n_worlds, control="rotor_vel", device=args.device, engine=args.engine)
     cars = sim.add(Cars(args.cars, in_scene=False, **CASES[case]))
     if cars.path is None:
+        # Speed, m/s, or at the other level the motor reference, 1; and the steering angle, rad.
         command: Any = [1.5 if cars.level == "speed" else 0.08, 0.2]
         sim.data = cars.with_command(sim.data, np.tile(np.asarray(command, np.float32), (n_worlds, args.cars, 1)))
     if case != "beside_drone":

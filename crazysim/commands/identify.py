@@ -58,7 +58,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         default="first_principles",
         help="model to fit",
     )
-    add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
+    add("--network", type=int, metavar="N", help="train a residual wrench with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of the training of --network")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
     add(
@@ -115,6 +115,7 @@ def run(options: argparse.Namespace) -> None:
     result = identify(logs, options.airframe, mass=options.mass)
     print("\n".join(result.describe()))
     logs = [aligned(log, result.delays[log.name]) for log in logs]
+    # Each log has its own delay of the state behind the rotor speeds, which fast rotations show.
     held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
     models = {
         options.airframe: Model.create(airframe, options.mass),
@@ -169,7 +170,7 @@ def _read_columns(texts: Sequence[str]) -> Columns:
                 f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
                 f"Fields are {', '.join(column_fields)}."
             )
-        if "_per_" not in name:
+        if "_per_" not in name:  # column names; the other fields are factors, such as rpm_per_unit
             fields[name] = names if name == "time" else tuple(filter(None, names.split(",")))
             continue
         try:

@@ -1,4 +1,8 @@
-"""Controllers: pure functions for one drone, with any leading axes, and the protocol of ``Sim(controller=...)``."""
+"""Controllers as pure functions, and as objects for ``Sim(controller=...)``.
+
+The functions are written for one drone, and accept arrays with any leading axes. ``load_params`` and ``load_fn_params``
+return the parameters of Crazyflow's controllers, and have the names of Crazyflow.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Dynamics models: pure functions for one drone, with any leading axes."""
+"""Dynamics models: pure functions, written for one drone, which accept arrays with any leading axes."""
 
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.first_principles import hover_rotor_vel

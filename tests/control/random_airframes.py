@@ -14,13 +14,13 @@ from crazysim.errors import ConfigError
 
 GRAVITY = 9.81
 MIN_AUTHORITY = np.array([4.0, 4.0, 0.2])
-"""Angular acceleration in hover below which an airframe is not drawn, rad/s^2; ``airframe check`` warns below 0.2."""
+"""Least ``max_ang_acc`` of drawn airframes about x, y, z, rad/s^2; ``airframe check`` warns of smaller ones. (3,)"""
 
 MAX_TIME_CONSTANT = 0.2
 """Maximum time constant of drawn rotors, s; ``airframe check`` warns of longer ones."""
 
 MAX_BODY_RATE = 2.0
-"""Body rate, rad/s, at which the net momentum of the rotors needs at most half of the control authority."""
+"""Body rate, rad/s, at which the gyroscopic torque of rotors is at most half of the largest roll or pitch torque."""
 
 
 def log_uniform(rng, low, high):
@@ -30,8 +30,9 @@ def log_uniform(rng, low, high):
 def draw_airframe(rng, n, name):
     """Return an airframe of n rotors: 20 g to 20 kg, thrust over weight 1.3 to 10, rotors of 2 to 200 ms.
 
-    Half of the bodies are asymmetric: rotors off their angles and radii, and a centre of mass beside their middle.
-    Rotors have a third to three times the usual inertia and spin down up to twice as slowly, or as quickly, as up.
+    Half of the bodies are asymmetric: the angles and radii of the rotors vary, and the centre of mass is not in their
+    middle. Rotors have a third to three times the usual inertia. Their rate of slowing down is half to twice the rate
+    of speeding up.
     """
     while True:
         mass, ratio, tau = log_uniform(rng, 0.02, 20), log_uniform(rng, 1.3, 10), log_uniform(rng, 0.002, 0.2)
@@ -41,22 +42,23 @@ def draw_airframe(rng, n, name):
         x, y = aspect * radii * np.cos(angles), radii * np.sin(angles) / aspect
         x, y = (p - np.mean(p) + asymmetry * rng.uniform(-0.08, 0.08) * arm for p in (x, y))
         signs = np.array([1, -1] * (n // 2) + [1] * (n % 2))
-        size = rng.uniform(0.3, 1.0) * mass
-        inertia = size * np.array([np.mean(y**2), np.mean(x**2), 0]) * rng.uniform(0.8, 1.25, 3)
+        effective_mass = rng.uniform(0.3, 1.0) * mass  # the mass that would have this inertia at the rotors
+        inertia = effective_mass * np.array([np.mean(y**2), np.mean(x**2), 0]) * rng.uniform(0.8, 1.25, 3)
         inertia[2] = (inertia[0] + inertia[1]) * rng.uniform(0.65, 0.98)
         # Propellers: thrust coefficient, and inertia of a rod of 15 g at 0.279 m, see airframe_estimate.
         diameter = 2 * arm * np.sin(np.pi / n) * rng.uniform(0.6, 1.0)
         curve = rng.uniform(0.09, 0.15) * 1.225 * diameter**4 / 3600
         rod = 0.015 * (diameter / 0.279) ** 2 * diameter**2 / 12
-        lift = np.linalg.pinv(np.stack([np.ones(n), y, -x, signs]))[:, 0]
-        max_thrust = ratio * mass * GRAVITY * np.max(lift)
+        lift_shares = np.linalg.pinv(np.stack([np.ones(n), y, -x, signs]))[:, 0]
+        max_thrust = ratio * mass * GRAVITY * np.max(lift_shares)
         hover = np.sqrt(mass * GRAVITY / n / curve)
         rise_rate, fall_rate = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
-        quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])
+        quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])  # share of the quadratic lag in the rate in hover
+        # Linear and quadratic coefficient of spinning up, then of spinning down.
         lag = [rate * part for rate in (rise_rate, fall_rate) for part in (1 - quadratic, quadratic / 2 / hover)]
         if min(rise_rate, fall_rate) < 1 / MAX_TIME_CONSTANT:
             continue
-        if max(rise_rate, fall_rate) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
+        if max(rise_rate, fall_rate) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift_shares))) > 600:
             continue  # too quick for steps of 2 ms
         try:
             airframe = load_airframe(

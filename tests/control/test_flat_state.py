@@ -1,4 +1,7 @@
-"""State and wrench of a flat trajectory: they obey Newton's and Euler's laws, by finite differences in float64."""
+"""State and wrench of a flat trajectory: they obey Newton's and Euler's laws, by finite differences in float64.
+
+Laws with numbers are those of CONTRIBUTING.md.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +80,7 @@ def test_hover_takes_the_weight_and_no_torque():
 
 
 def test_law_01_and_07_a_batch_equals_single_states_and_gradients_are_finite():
-    """In free fall, nose down and upside down, values and gradients are finite, and equal for one state and a batch."""
+    """Values and gradients are finite, also in free fall and upside down, and values equal those of single states."""
     accelerations = np.array([[0, 0, 0], [0, 0, -9.81], [9.81, 0, -9.81], [0, 0, -30.0], [1.0, 2.0, 3.0]])
     ones = np.ones((5, 1))
     setpoints = Setpoint(*[np.ones((5, 3))] * 2, accelerations, *[np.ones((5, 3))] * 2, 0 * ones, ones, ones)

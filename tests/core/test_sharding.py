@@ -1,4 +1,7 @@
-"""Worlds distributed over two devices: the sharding of each leaf, and the same results as on one device."""
+"""Worlds distributed over two devices: the sharding of each leaf, and the same results as on one device.
+
+Laws are those of CONTRIBUTING.md.
+"""
 
 import jax
 import jax.numpy as jnp

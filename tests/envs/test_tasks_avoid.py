@@ -23,7 +23,7 @@ def start_state():
 
 
 def place_drones(state, pos, **changes):
-    """Return the state with drones at other positions, at rest and level."""
+    """Return the state with drones at other positions, at rest and level, and changes in the record of the task."""
     data, s = state.data, state.data.states
     pos = np.broadcast_to(np.asarray(pos, np.float32), s.pos.shape)
     level = np.broadcast_to(np.float32([0, 0, 0, 1]), s.quat.shape)
@@ -54,11 +54,11 @@ def test_obstacles_have_other_positions_in_every_world_and_leave_gaps(start_stat
     assert np.all(np.ptp(pos[..., :2], axis=0) > 2.5)
     quat = np.asarray(state.data.objects.quat)
     np.testing.assert_allclose(1 - 2 * np.sum(quat[..., :2] ** 2, axis=-1), 1, atol=1e-5)  # upright
-    poles, boxes = pos[:, :8, 2], pos[:, 8:, 2]
-    np.testing.assert_array_equal(poles, 0)
-    assert boxes.min() > 0.15
-    assert boxes.max() < HEIGHT - 0.15
-    assert np.ptp(boxes) > 1
+    pole_heights, box_heights = pos[:, :8, 2], pos[:, 8:, 2]
+    np.testing.assert_array_equal(pole_heights, 0)
+    assert box_heights.min() > 0.15
+    assert box_heights.max() < HEIGHT - 0.15
+    assert np.ptp(box_heights) > 1
 
 
 def test_observations_are_the_nearest_points_of_the_nearest_obstacles(start_state):
@@ -68,18 +68,20 @@ def test_observations_are_the_nearest_points_of_the_nearest_obstacles(start_stat
     env.sim.data = inside
     gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
     obs = jax.jit(vmap_worlds(env.task.observe))(inside)
-    to_surface, to_middle = (np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle"))
-    # A report measures from the ball around the drone, whose middle is 2 cm above the start of the vectors.
+    to_surface, surface_to_middle = (
+        np.asarray(obs[f"obstacles_{x}"]).reshape(N_WORLDS, 2, 4, 3) for x in ("near", "middle")
+    )
+    # Contacts are measured from a ball of radius 8.6 cm, whose middle is 2 cm above the position of the drone.
     expected_gaps = np.linalg.norm(to_surface, axis=-1) - 0.086
     outside = gaps > 0.05
     assert outside.mean() > 0.5
     assert np.abs(expected_gaps - gaps)[outside].max() < 0.021
-    is_box = np.any(to_middle != 0, axis=-1)
+    is_box = np.any(surface_to_middle != 0, axis=-1)  # zero for poles
     assert 0.2 < is_box.mean() < 0.5, "a third of the obstacles"
-    middle = np.asarray(inside.states.pos)[:, :, None] + to_surface + to_middle
-    boxes = np.asarray(inside.objects.pos)[:, 0, None, None, 8:] - middle[..., None, :]
+    middle = np.asarray(inside.states.pos)[:, :, None] + to_surface + surface_to_middle
+    middle_to_boxes = np.asarray(inside.objects.pos)[:, 0, None, None, 8:] - middle[..., None, :]
     outside_box = is_box & (np.linalg.norm(to_surface, axis=-1) > 0.01)
-    np.testing.assert_allclose(np.linalg.norm(boxes, axis=-1).min(axis=-1)[outside_box], 0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(middle_to_boxes, axis=-1).min(axis=-1)[outside_box], 0, atol=1e-5)
     # A short step along such a vector reduces the distance by its length.
     length = np.maximum(np.linalg.norm(to_surface[:, :, 0], axis=-1, keepdims=True), 0.01)
     ahead = inside.states.pos + 0.1 * to_surface[:, :, 0] / length

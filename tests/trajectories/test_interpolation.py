@@ -28,8 +28,8 @@ def test_each_basis_polynomial_has_one_derivative(order):
     basis = interpolation.hermite_basis(order)
     for column in range(2 * order):
         p = Polynomial(basis[:, column])
-        found = [p.deriv(k)(u) if k else p(u) for u in (0.0, 1.0) for k in range(order)]
-        np.testing.assert_allclose(found, np.eye(2 * order)[column], atol=1e-9)
+        end_derivatives = [p.deriv(k)(u) if k else p(u) for u in (0.0, 1.0) for k in range(order)]
+        np.testing.assert_allclose(end_derivatives, np.eye(2 * order)[column], atol=1e-9)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -51,9 +51,11 @@ def test_other_derivatives_cost_more(order, seed):
     filled = interpolation.fill_derivatives(nodes, durations)
     min_cost = interpolation.derivative_cost(filled, durations)
     change = np.where(np.isnan(nodes), np.random.default_rng(seed).normal(size=nodes.shape), 0.0)
-    steps = [interpolation.derivative_cost(filled + step * change, durations) - min_cost for step in (-1e-3, 1e-3)]
-    assert min(steps) > 0
-    np.testing.assert_allclose(steps[0], steps[1], rtol=1e-4)  # a minimum has no slope
+    differences = [
+        interpolation.derivative_cost(filled + step * change, durations) - min_cost for step in (-1e-3, 1e-3)
+    ]
+    assert min(differences) > 0
+    np.testing.assert_allclose(differences[0], differences[1], rtol=1e-4)  # a minimum has no slope
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -71,7 +73,7 @@ def test_the_gradient_with_respect_to_durations_equals_differences(order):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_derivatives_are_continuous_over_many_uneven_pieces(order):
-    """Derivative 2k - 2 is the highest continuous one; the durations of 60 pieces vary by a factor of 50."""
+    """Derivatives up to 2 ``order`` - 2 are continuous; the durations of 60 pieces vary by a factor of 50."""
     nodes, durations = random_problem(order, 60, 4, 2.0)
     c = interpolation.unit_coefficients(interpolation.fill_derivatives(nodes, durations), durations)
     for derivative in range(2 * order - 1):

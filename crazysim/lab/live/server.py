@@ -1,4 +1,4 @@
-"""Servers and listeners: threads that turn messages from the network into commands in a queue.
+"""A server and a client, whose threads turn messages from the network into commands in a queue.
 
 They share only a queue with the simulation, which removes commands from it between two steps.
 """
@@ -20,7 +20,8 @@ from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Requ
 from crazysim.storage import Closeable
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
-"""Ports of AIMotionLab's test server, for commands to single drones and for the stream to all drones."""
+"""Ports for commands to single drones and for the stream to all drones, as in AIMotionLab's test server,
+a stand-in for its Skybrush server."""
 MAX_QUEUE = 10_000
 """Largest number of commands that wait for the simulation."""
 MAX_PEERS = 64
@@ -130,6 +131,7 @@ class CommandServer(CommandQueue):
             for message in _read_messages(peer, self._stop_event, self.timeout):
                 if drone is None:
                     if not isinstance(message, Request) or not self._claim_drone(message.drone):
+                        # The drone is None if the message is not a request.
                         log.warning("%s refused: drone %s is not free", peer_name, getattr(message, "drone", None))
                         peer.sendall(b"ACK_00")
                         return

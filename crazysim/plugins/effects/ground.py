@@ -45,14 +45,14 @@ class TerrainData(PyTree):
         return (height + self.middle[2])[..., None], normal
 
     def gap_at(self, point: Array) -> tuple[Array, Array]:
-        """Return the distance of a point to the plane of the triangle below it, and the plane's normal.
+        """Return the distance of a point above the plane of the triangle below it, and the plane's normal.
 
         Args:
             point: Position, world frame, m. (..., 3)
 
         Returns:
-            Distance, m, ``OUTSIDE_DISTANCE`` beyond the border of a terrain that a flat floor surrounds (...), and unit
-            normal (..., 3).
+            Signed distance, m (...), and unit normal (..., 3). Beyond the border of a terrain that a flat floor
+            surrounds, the distance is ``OUTSIDE_DISTANCE``.
         """
         height, normal, is_inside = surface_at(self.heights, self.half_size, point - self.middle)
         gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]

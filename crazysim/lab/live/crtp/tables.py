@@ -74,7 +74,10 @@ class Table:
 
 
 def pack_number(struct_format: str, value: float) -> bytes:
-    """Return a number as bytes, clipped to the range of its format; integer formats round it, and take 0 for NaN."""
+    """Return a number as bytes, clipped to the range of its format.
+
+    Integer formats round it, and store 0 for NaN and infinite numbers.
+    """
     if struct_format in ("<f", "<e"):
         largest = 3.4e38 if struct_format == "<f" else 65504.0
         return struct.pack(struct_format, value if math.isnan(value) else min(max(value, -largest), largest))
