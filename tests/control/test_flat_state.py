@@ -1,7 +1,4 @@
-"""State and wrench of a flat trajectory: they obey Newton's and Euler's laws, by finite differences in float64.
-
-Laws with numbers are those of CONTRIBUTING.md.
-"""
+"""State and wrench of a flat trajectory: they obey Newton's and Euler's laws, by finite differences in float64."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The functional API stages commands for their own level, and reports ticks. Laws: see CONTRIBUTING.md."""
+"""The functional API stages commands for their own level, and reports ticks."""
 
 import re
 from pathlib import Path

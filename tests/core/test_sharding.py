@@ -1,7 +1,4 @@
-"""Worlds distributed over two devices: the sharding of each leaf, and the same results as on one device.
-
-Laws are those of CONTRIBUTING.md.
-"""
+"""Worlds distributed over two devices: the sharding of each leaf, and the same results as on one device."""
 
 import jax
 import jax.numpy as jnp
