@@ -44,8 +44,8 @@ def compare(name, engines):
     for engine in engines:
         step = Step(sim.step_pipeline, engine)
         assert step.plan(sim.data).engine == engine
-        found = step(sim.data, jnp.int32(N_STEPS))
-        sweep.assert_agree(found, expected, sweep.TOLERANCES.get(name, sweep.ROUNDING), engine)
+        result = step(sim.data, jnp.int32(N_STEPS))
+        sweep.assert_agree(result, expected, sweep.TOLERANCES.get(name, sweep.ROUNDING), engine)
 
 
 def test_every_plugin_and_controller_is_in_the_sweep():

@@ -27,32 +27,32 @@ def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
     assert load_airframe(path).name == "mine"
     assert load_airframe(path).value("battery.cells") == 6
     assert main(["airframe", "check", str(path), "--picture", str(picture)]) == 0
-    found = rows(capsys.readouterr().out)
-    assert found["wheelbase"] == "240 mm, the largest distance of two rotors"  # twice the arm
-    assert [found[f"rotor {k}"].split("; turns ")[1].split()[0] for k in range(1, 5)] == [
+    result = rows(capsys.readouterr().out)
+    assert result["wheelbase"] == "240 mm, the largest distance of two rotors"  # twice the arm
+    assert [result[f"rotor {k}"].split("; turns ")[1].split()[0] for k in range(1, 5)] == [
         "counter-clockwise",
         "clockwise",
     ] * 2
-    assert {found[f"rotor {k}"].split(";")[0] for k in range(1, 5)} == {  # 120 mm over the root of two
+    assert {result[f"rotor {k}"].split(";")[0] for k in range(1, 5)} == {  # 120 mm over the root of two
         f"85 mm {a}, 85 mm {b}" for a in ("forward", "back") for b in ("left", "right")
     }
-    assert found["thrust over weight"] == "4.00"
-    assert found["hover"] == "25% of the largest thrust"
-    assert found["tilt at full thrust"] == "holds height up to 76 degrees"  # arccos(1 / 4) = 75.5 degrees
-    assert "50% of" in found["rotor speed"]  # thrust is quadratic in the speed
-    assert found["rotor time constant"] == "0.05 s in hover"
-    assert found["auto"] == "state, attitude, body_rate"
+    assert result["thrust over weight"] == "4.00"
+    assert result["hover"] == "25% of the largest thrust"
+    assert result["tilt at full thrust"] == "holds height up to 76 degrees"  # arccos(1 / 4) = 75.5 degrees
+    assert "50% of" in result["rotor speed"]  # thrust is quadratic in the speed
+    assert result["rotor time constant"] == "0.05 s in hover"
+    assert result["auto"] == "state, attitude, body_rate"
     loops = ("position", "velocity", "attitude", "rate")
     gains = "; ".join(f"[pid.{loop}] kp, ki, kd" for loop in loops)
     lacking = f"{gains}; [pid] tilt_max, thrust_base, thrust_min; [controller] pwm_max"
-    assert found["pid"] == f"none; not state, attitude, body_rate: lacks {lacking}"
-    assert found["mellinger"].startswith(
+    assert result["pid"] == f"none; not state, attitude, body_rate: lacks {lacking}"
+    assert result["mellinger"].startswith(
         "none; not state, attitude: lacks [mellinger] mass, mass_thrust, kp, kd, ki, integral_max, kR, "
     )
-    assert found["mellinger"].endswith("; [controller] pwm_max")
-    assert found["crazyflow"].startswith("force_torque; not state: lacks [controller.state] kp, kd, ki, int_err_max;")
-    assert "; not attitude, body_rate: lacks [controller.attitude] kR, kw, ki_m" in found["crazyflow"]
-    assert "warning" not in found
+    assert result["mellinger"].endswith("; [controller] pwm_max")
+    assert result["crazyflow"].startswith("force_torque; not state: lacks [controller.state] kp, kd, ki, int_err_max;")
+    assert "; not attitude, body_rate: lacks [controller.attitude] kR, kw, ki_m" in result["crazyflow"]
+    assert "warning" not in result
     from matplotlib.image import imread
 
     image = np.asarray(imread(picture))[..., :3]

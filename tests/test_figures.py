@@ -106,8 +106,8 @@ def test_a_record_is_stale_once_the_code_that_it_measures_has_changed(repository
     source.write_text(MEASURED.replace("return 2.0 * squared", "return 2.0 * speed"))
     assert "thrust.py changed after" in repository.stale_records()[0]
     source.write_text(MEASURED.replace("2.0", "3.0"))
-    (found,) = repository.stale_records()
-    assert found == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
+    (result,) = repository.stale_records()
+    assert result == f"speed, 2 cores of EPYC (AVX2): thrust.py changed after {commit}"
     repository.store_records([record(repository, commit_all(repository))])
     assert repository.stale_records() == []
     (repository.ROOT / "benchmarks" / "speed.py").write_text("print(2)\n")
@@ -141,7 +141,7 @@ def test_local_variables_are_renamed_one_to_one(repository, renamings, is_same):
     source = repository.ROOT / "thrust.py"
     source.write_text(VARIABLES)
     repository.store_records([record(repository, commit_all(repository))])
-    text = re.sub("|".join(map(re.escape, renamings)), lambda found: renamings[found[0]], VARIABLES)
+    text = re.sub("|".join(map(re.escape, renamings)), lambda match: renamings[match[0]], VARIABLES)
     assert text != VARIABLES
     source.write_text(text)
     assert (repository.stale_records() == []) == is_same

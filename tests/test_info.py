@@ -22,19 +22,19 @@ def lines(text):
 
 def test_it_prints_versions_devices_compiler_and_caches(capsys):
     assert main(["info"]) == 0
-    found = lines(capsys.readouterr().out)
-    assert found["crazysim"].startswith(crazysim.__version__)
-    assert found["Python"].startswith(".".join(map(str, sys.version_info[:3])))
-    assert "CPU cores" in found["system"]
+    result = lines(capsys.readouterr().out)
+    assert result["crazysim"].startswith(crazysim.__version__)
+    assert result["Python"].startswith(".".join(map(str, sys.version_info[:3])))
+    assert "CPU cores" in result["system"]
     for name in REQUIRED_PACKAGES:
-        assert found[name] == importlib.metadata.version(name)
-    assert found["devices"].count("cpu") >= len(jax.devices("cpu"))
+        assert result[name] == importlib.metadata.version(name)
+    assert result["devices"].count("cpu") >= len(jax.devices("cpu"))
     if shutil.which("g++"):
-        assert "g++" in found["C++ compiler"]
-        assert "-O2" in found["C++ compiler"]
-    assert jax.config.jax_compilation_cache_dir in found["cache"].replace("~", os.path.expanduser("~"))
-    assert " MB in " in found["cache"]
-    assert found["rendering"].startswith(os.environ["MUJOCO_GL"])
+        assert "g++" in result["C++ compiler"]
+        assert "-O2" in result["C++ compiler"]
+    assert jax.config.jax_compilation_cache_dir in result["cache"].replace("~", os.path.expanduser("~"))
+    assert " MB in " in result["cache"]
+    assert result["rendering"].startswith(os.environ["MUJOCO_GL"])
 
 
 def test_missing_parts_are_lines_with_the_reason(tmp_path):
@@ -45,11 +45,11 @@ def test_missing_parts_are_lines_with_the_reason(tmp_path):
     }  # fmt: skip
     program = "import sys; sys.modules['ziglang'] = None; from crazysim.__main__ import main; sys.exit(main(['info']))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
-    found = lines(done.stdout)
-    assert found["C++ compiler"].startswith("none")
-    assert found["cache"] == f"~/.cache/crazysim/jax/{default_folder().name}: not there yet"
-    assert found["rendering"].startswith("disable, fails: ")
-    assert "JAX_PLATFORMS=cpu" in found["variables"]
+    result = lines(done.stdout)
+    assert result["C++ compiler"].startswith("none")
+    assert result["cache"] == f"~/.cache/crazysim/jax/{default_folder().name}: not there yet"
+    assert result["rendering"].startswith("disable, fails: ")
+    assert "JAX_PLATFORMS=cpu" in result["variables"]
 
 
 @pytest.mark.parametrize("missing", [OPTIONAL_PACKAGES, (*OPTIONAL_PACKAGES, "mujoco-mjx")])
@@ -61,9 +61,9 @@ def test_missing_packages_are_named(monkeypatch, capsys, missing):
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     assert main(["info"]) == 0
-    found = lines(capsys.readouterr().out)
-    assert found["extras"] == "none"
-    assert (found["mujoco-mjx"] == "not installed") == ("mujoco-mjx" in missing)
+    result = lines(capsys.readouterr().out)
+    assert result["extras"] == "none"
+    assert (result["mujoco-mjx"] == "not installed") == ("mujoco-mjx" in missing)
 
 
 def test_broken_settings_are_lines_with_the_reason(monkeypatch, capsys):
@@ -101,6 +101,6 @@ def test_a_backend_that_cannot_be_used_is_a_line():
     )
     assert done.returncode == 0
     assert "expected a MUJOCO_GL that MuJoCo can use, got 'nope'" in done.stderr
-    found = lines(done.stdout)
-    assert found["rendering"].startswith("nope, fails: RuntimeError: invalid value")
-    assert "MUJOCO_GL=nope" in found["variables"]
+    result = lines(done.stdout)
+    assert result["rendering"].startswith("nope, fails: RuntimeError: invalid value")
+    assert "MUJOCO_GL=nope" in result["variables"]

@@ -115,17 +115,17 @@ def test_a_call_keeps_its_own_derivative():
 
 def test_primitives_written_in_terms_of_others_are_expanded():
     """JAX has ``call_hi_primitive`` from 0.12 on. Its expansion computes the same."""
-    found = []
+    result = []
     for fn in (jax.nn.relu, jax.nn.silu, jax.nn.softplus, jnp.linalg.det, jax.scipy.special.logsumexp):
         x = jnp.eye(3) + 0.1
         for eqn in jax.make_jaxpr(fn)(x).jaxpr.eqns:
             if eqn.primitive.name == "call_hi_primitive":
-                found.append(eqn)
+                result.append(eqn)
                 args = [jnp.ones(v.aval.shape, v.aval.dtype) for v in eqn.invars]
                 expected = jax.tree.leaves(eqn.primitive.bind(*args, **eqn.params))
                 for a, b in zip(jaxcompat.expand_primitive(eqn)(*args), expected, strict=True):
                     np.testing.assert_allclose(a, b, rtol=1e-6)
-    assert not found or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
+    assert not result or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
 
 
 def test_a_primitive_is_replaced_under_vmap_and_an_error_elsewhere():
@@ -138,8 +138,8 @@ def test_a_primitive_is_replaced_under_vmap_and_an_error_elsewhere():
 
     p = jaxcompat.batched_primitive("scaled", lambda x, factor: [x], batched, outside)
     scale = lambda x: p.bind(x, factor=2.0)[0]  # noqa: E731
-    found = jax.jit(jax.vmap(scale, axis_name="some"))(jnp.arange(3.0))
-    np.testing.assert_array_equal(found, [0.0, 2.0, 4.0])
+    result = jax.jit(jax.vmap(scale, axis_name="some"))(jnp.arange(3.0))
+    np.testing.assert_array_equal(result, [0.0, 2.0, 4.0])
     for fn in (scale, jax.jit(scale)):
         with pytest.raises(TypeError, match="outside"):
             fn(jnp.float32(1))
@@ -186,8 +186,8 @@ def test_a_jaxpr_takes_what_it_closes_over():
     assert len(closed.consts) == 1
     opened = jaxcompat.constants_to_inputs(closed)
     assert not opened.consts
-    (found,) = jaxcompat.jaxpr_as_fun(opened)(table, 1.0)
-    np.testing.assert_array_equal(found, [1.0, 2.0, 3.0])
+    (result,) = jaxcompat.jaxpr_as_fun(opened)(table, 1.0)
+    np.testing.assert_array_equal(result, [1.0, 2.0, 3.0])
 
 
 # Arrays --------------------------------------------------------------------------------------------------------------
@@ -338,14 +338,14 @@ def test_only_one_module_goes_beyond_the_public_interface():
     private = ("jax.extend", "jax._src", "jax.interpreters", "jax.experimental", "jax.custom_batching", "SymbolicZero",
                "get_bind_params", "pycapsule", "_cache_size", ".primitive.bind", "jax.core.Jaxpr")  # fmt: skip
     root = Path(crazysim.__file__).parent
-    found = {
+    result = {
         f"{path.relative_to(root)}: {word}"
         for path in root.rglob("*.py")
         for word in private
         if path.name != "jaxcompat.py" and word in path.read_text()
     }
     # Methods of ours by that name, for the tests of law 6 of CONTRIBUTING.md, no silent retrace.
-    assert found == {"engine/step.py: _cache_size", "engine/backends/plain.py: _cache_size"}
+    assert result == {"engine/step.py: _cache_size", "engine/backends/plain.py: _cache_size"}
 
 
 @pytest.mark.long("runs tests in another process")

@@ -68,30 +68,30 @@ def literal(node):
 def violations(source):
     """Return every violation of a source as (line, complaint)."""
     tree = ast.parse(source)
-    found = []
+    result = []
     for line, kind, text in docstrings(tree):
         if text.split()[0] in QUESTION_WORDS:
-            found.append((line, f"a {kind} docstring begins with {text.split()[0]!r}"))
+            result.append((line, f"a {kind} docstring begins with {text.split()[0]!r}"))
         if kind == "flag" and not text.startswith("True "):
-            found.append((line, f"the docstring of a flag begins with {text.split()[0]!r}, not with 'True where'"))
-        found += [
+            result.append((line, f"the docstring of a flag begins with {text.split()[0]!r}, not with 'True where'"))
+        result += [
             (line, f"a description begins with {word!r}") for word in descriptions(text) if word in QUESTION_WORDS
         ]
     for node in ast.walk(tree):
         if isinstance(node, ast.Assert):
-            found.append((node.lineno, "assert: raise an error that names the remedy"))
+            result.append((node.lineno, "assert: raise an error that names the remedy"))
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
             name = node.exc.func.id if isinstance(node.exc.func, ast.Name) else ""
             message = literal(node.exc.args[0])
             if name in USER_ERRORS and message is not None and not REMEDY.search(message):
-                found.append((node.lineno, f"message without a remedy: {message!r}"))
-    return sorted(found)
+                result.append((node.lineno, f"message without a remedy: {message!r}"))
+    return sorted(result)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_prose_of_the_package(path):
-    found = violations(path.read_text())
-    assert not found, "\n".join(f"{path.relative_to(ROOT)}:{line}: {complaint}" for line, complaint in found)
+    result = violations(path.read_text())
+    assert not result, "\n".join(f"{path.relative_to(ROOT)}:{line}: {complaint}" for line, complaint in result)
 
 
 BAD = '''

@@ -197,8 +197,8 @@ def test_law_07_jacobians_are_finite_at_and_next_to_90_degrees_of_pitch(tiny, dt
     half = np.sqrt(0.5)
     quats = np.array([[0, half, 0, half], [0, -half, 0, half], [half, 0, half, 0], [0.5] * 4, [1, 0, 0, 0]], dtype)
     everywhere = quats[:, None] + np.eye(4, dtype=dtype) * np.asarray(tiny, dtype)
-    for name, found in values_and_jacobians(everywhere.reshape(-1, 4)).items():
-        for x in found:
+    for name, result in values_and_jacobians(everywhere.reshape(-1, 4)).items():
+        for x in result:
             assert x.dtype == dtype
             assert len(x) == 20
             assert np.all(np.isfinite(x)), name

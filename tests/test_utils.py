@@ -49,8 +49,8 @@ def test_enable_cache_takes_the_settings_of_crazyflow(tmp_path, cache_settings, 
         enable_xla_caches=enable_xla_caches,
     )
     assert returned == tmp_path
-    found = [getattr(jax.config, name) for name in cache_settings]
-    assert found == [str(tmp_path), 1000, 2, "all" if enable_xla_caches else "none"]
+    result = [getattr(jax.config, name) for name in cache_settings]
+    assert result == [str(tmp_path), 1000, 2, "all" if enable_xla_caches else "none"]
 
 
 def test_world_mask_names_the_leaves_of_worlds_and_pytree_replace_writes_them():

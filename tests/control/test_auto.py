@@ -48,9 +48,9 @@ def airframes():
 
 def test_every_airframe_flies_as_accurately_as_documented():
     """The figures of the page on controllers for all built-in airframes and three generic ones."""
-    found = benchmark().fly_airframes("auto", airframes(), 2.0, 100)
-    assert len(found) == 11
-    for name, row in found.items():
+    result = benchmark().fly_airframes("auto", airframes(), 2.0, 100)
+    assert len(result) == 11
+    for name, row in result.items():
         assert row["hover"] < 2e-3, (name, row)
         assert row["tracking"] < 0.03, (name, row)
         assert row["pushed"] < 0.01, (name, row)
@@ -187,11 +187,11 @@ def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
     axis = axis / max(np.linalg.norm(axis), 1e-12)
     turn = (Rotation.from_rotvec(tilt * axis).inv() * relative).as_rotvec()[2]
     expected = 2 * np.array([*(np.sin(tilt / 2) * axis[:2]), np.sin(turn / 2)])
-    found = np.asarray(jitted_quat_error(relative.as_quat().astype(np.float32)))
-    np.testing.assert_allclose(found[:2], expected[:2], atol=5e-3)
-    np.testing.assert_allclose(np.abs(found[2]), np.abs(expected[2]), atol=5e-3)
+    result = np.asarray(jitted_quat_error(relative.as_quat().astype(np.float32)))
+    np.testing.assert_allclose(result[:2], expected[:2], atol=5e-3)
+    np.testing.assert_allclose(np.abs(result[2]), np.abs(expected[2]), atol=5e-3)
     if abs(turn) < 3.0:
-        np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
+        np.testing.assert_allclose(result[2], expected[2], atol=5e-3)
 
 
 jitted_quat_error = jax.jit(quat_error)
@@ -302,13 +302,13 @@ def test_any_state_and_command_give_finite_rotor_speeds(quat, pos, vel, ang_vel,
 @functools.cache
 def steps_of_levels():
     """Return data and a compiled step with a command, for every level that the controller follows."""
-    found = {}
+    result = {}
     for level in ("state", "attitude", "body_rate"):
         sim = Sim(control=level, controller="auto", engine="plain")
         command = getattr(F, f"{level}_control")
         step = sim.build_step_fn()
-        found[level] = (sim.data, jax.jit(lambda data, cmd, f=command, step=step: step(f(data, cmd), 2)))
-    return found
+        result[level] = (sim.data, jax.jit(lambda data, cmd, f=command, step=step: step(f(data, cmd), 2)))
+    return result
 
 
 @pytest.mark.usefixtures("x64")

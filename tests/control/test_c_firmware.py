@@ -145,11 +145,11 @@ def fly_to_heights(controller, n_steps=1000):
 
 
 def test_a_law_in_c_flies_like_the_same_law_in_jax(library):
-    found = fly_to_heights(CFirmware(library("hover", HOVER)))
+    result = fly_to_heights(CFirmware(library("hover", HOVER)))
     expected = fly_to_heights(Height())
     assert np.ptp(expected.data.states.pos[..., 2]) > 1.0
     # Both laws round differently, by 1e-7 in each of 1,000 steps.
-    np.testing.assert_allclose(found.data.states.pos, expected.data.states.pos, atol=1e-5)
+    np.testing.assert_allclose(result.data.states.pos, expected.data.states.pos, atol=1e-5)
 
 
 def test_the_memory_of_each_drone_lasts_until_its_world_is_reset(library):

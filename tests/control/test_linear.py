@@ -117,8 +117,8 @@ def test_a_load_without_mass_does_not_change_the_drone():
 
 @given(angles=vectors(2, 1.4), rates=vectors(2, 5.0))
 def test_rod_angles_are_the_inverse_of_the_direction(angles, rates):
-    found, found_rates = angles_of_rod(*rod(angles, rates))
-    np.testing.assert_allclose(found, angles, atol=1e-9)
+    result, found_rates = angles_of_rod(*rod(angles, rates))
+    np.testing.assert_allclose(result, angles, atol=1e-9)
     np.testing.assert_allclose(found_rates, rates, atol=1e-9 * (1 + np.abs(rates).max()))
 
 

@@ -168,8 +168,8 @@ def test_error_dynamics_agree_with_flights(knots):
     later = advance(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
     moved = reference._replace(pos=later[3], vel=later[2], matrix=later[0], ang_vel=later[1])
     quat = Rotation.from_matrix(np.array(after[0])).as_quat()
-    found = jax.jit(state_error)(after[3], quat, after[2], after[1], moved)
-    np.testing.assert_allclose((found - error) / h / size, slope / size, atol=2e-2)
+    result = jax.jit(state_error)(after[3], quat, after[2], after[1], moved)
+    np.testing.assert_allclose((result - error) / h / size, slope / size, atol=2e-2)
 
 
 @pytest.mark.usefixtures("x64")

@@ -80,8 +80,8 @@ def test_attitudes_and_body_rates_are_followed_with_little_overshoot(level, n, s
     for _ in range(400):
         sim.step(10)
         now = angles(sim) if level == "attitude" else np.asarray(sim.data.states.ang_vel)
-        found = np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)])
-        highest = np.maximum(highest, found)
+        result = np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)])
+        highest = np.maximum(highest, result)
     sim.step(14000)
     assert highest.max() < 1.1, airframes[int(highest.max(0).argmax())].name
     if level == "attitude":

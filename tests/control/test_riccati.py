@@ -41,9 +41,9 @@ def test_solutions_in_float32_are_accurate_to_half_a_percent(kind, n, m):
     solve, reference = SOLVERS[kind]
     for seed in range(5):
         matrices = [x.astype(np.float32) for x in random_problem(n, m, seed)]
-        expected, found = reference(*random_problem(n, m, seed)), solve(*matrices)
-        assert found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
+        expected, result = reference(*random_problem(n, m, seed)), solve(*matrices)
+        assert result.dtype == np.float32
+        np.testing.assert_allclose(result, expected, atol=5e-3 * np.abs(expected).max())
 
 
 @pytest.mark.usefixtures("x64")

@@ -67,11 +67,11 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
         single_sim.step(25)
         n, single_states = single_sim.airframe.n_rotors, jax.device_get(single_sim.data.states)
         for name in STATES:
-            expected, found = getattr(single_states, name)[0, 0], getattr(flown, name)[0, k]
-            np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
-        expected, found = single_states.rotor_vel[0, 0], flown.rotor_vel[0, k]
-        np.testing.assert_allclose(found[:n], expected, rtol=1e-3)
-        np.testing.assert_array_equal(found[n:], 0)
+            expected, result = getattr(single_states, name)[0, 0], getattr(flown, name)[0, k]
+            np.testing.assert_allclose(result, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
+        expected, result = single_states.rotor_vel[0, 0], flown.rotor_vel[0, k]
+        np.testing.assert_allclose(result[:n], expected, rtol=1e-3)
+        np.testing.assert_array_equal(result[n:], 0)
 
 
 @pytest.mark.parametrize("name", ["bumblebee", "hexarotor"])
@@ -88,8 +88,8 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
     for k, airframe in enumerate(fleet.values()):
         single_sim = set_flying(Sim(drone=airframe, control="body_rate", engine="interpret"), pos[:, k : k + 1])
         single_sim.step(25)
-        found, expected = mixed.data.states.ang_vel[0, k], single_sim.data.states.ang_vel[0, 0]
-        np.testing.assert_allclose(found, expected, rtol=3e-5, atol=3e-5)
+        result, expected = mixed.data.states.ang_vel[0, k], single_sim.data.states.ang_vel[0, 0]
+        np.testing.assert_allclose(result, expected, rtol=3e-5, atol=3e-5)
 
 
 @pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])
@@ -101,8 +101,8 @@ def test_fitted_models_may_be_mixed(dynamics):
     for k, airframe in enumerate(fleet):
         single_sim = set_flying(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
         single_sim.step(50)
-        expected, found = np.asarray(single_sim.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+        expected, result = np.asarray(single_sim.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
+        np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
 def test_equal_airframes_share_their_parameters():
@@ -130,8 +130,8 @@ def test_worlds_and_drones_may_be_equally_many(n_worlds):
     sim = Sim(n_worlds, drone=FLEET[:n_worlds] if n_worlds > 1 else FLEET[:2], engine="plain")
     check_axes(sim.data, n_worlds, sim.n_drones)
     mass = [airframe.value("rigid_body.mass") for airframe in sim.airframes]
-    found = np.asarray(sim.data.params.mass)[..., 0]
-    np.testing.assert_allclose(found, np.broadcast_to(mass, (n_worlds, sim.n_drones)), rtol=1e-6)
+    result = np.asarray(sim.data.params.mass)[..., 0]
+    np.testing.assert_allclose(result, np.broadcast_to(mass, (n_worlds, sim.n_drones)), rtol=1e-6)
 
 
 def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
@@ -180,10 +180,10 @@ def test_effects_take_the_numbers_of_each_airframe():
             for name in ("full_speed_voltage", "propeller_radius", "rotor_pos", "diameter"):
                 if hasattr(record, name):
                     expected = np.asarray(getattr(record, name))
-                    found = np.asarray(getattr(mixed, name))
-                    found = found[0, k] if found.ndim > expected.ndim else found
-                    found = found[: len(expected)]  # rows of rotors that it lacks follow
-                    np.testing.assert_allclose(found, expected, rtol=1e-6, err_msg=name)
+                    result = np.asarray(getattr(mixed, name))
+                    result = result[0, k] if result.ndim > expected.ndim else result
+                    result = result[: len(expected)]  # rows of rotors that it lacks follow
+                    np.testing.assert_allclose(result, expected, rtol=1e-6, err_msg=name)
     sim.step(2)
     assert np.all(np.isfinite(sim.data.states.pos))
 

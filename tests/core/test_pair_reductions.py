@@ -82,8 +82,8 @@ def test_all_pairs_are_computed(n_drones):
     expected = np.stack([crowd_forces(pos) for pos in np.asarray(sim.data.states.pos, np.float64)])
     assert np.abs(expected).max() > 1e-4 or n_drones == 1
     step = Step(sim.step_pipeline, strict=True)
-    found = step(sim.data, jnp.int32(1))
-    np.testing.assert_allclose(found.states.force, expected, rtol=2e-5, atol=1e-9)
+    result = step(sim.data, jnp.int32(1))
+    np.testing.assert_allclose(result.states.force, expected, rtol=2e-5, atol=1e-9)
     assert not step.plan(sim.data).program.unfused_stages
 
 
@@ -167,13 +167,15 @@ def test_an_inner_vmap_and_an_influence_may_reduce():
             sim.data, pos=random_positions(2, n_drones), vel=random_positions(2, n_drones, 1) - [0, 0, 2]
         )
         sim.add(Push())
-        found = Step(sim.step_pipeline)(sim.data, jnp.int32(3)).states
+        result = Step(sim.step_pipeline)(sim.data, jnp.int32(3)).states
         pos = np.asarray(sim.data.states.pos, np.float64)
         still = Sim(n_worlds=2, n_drones=n_drones, control="rotor_vel", integrator="rk4")
         still.data = sim.data.replace(plugins={})
         free = Step(still.step_pipeline)(still.data, jnp.int32(3)).states
         pull = 3e-3 * (n_drones * pos - pos.sum(1, keepdims=True)) / 0.0434
-        np.testing.assert_allclose(np.asarray(found.vel) - np.asarray(free.vel), 3 * 0.002 * pull, rtol=0.02, atol=2e-5)
+        np.testing.assert_allclose(
+            np.asarray(result.vel) - np.asarray(free.vel), 3 * 0.002 * pull, rtol=0.02, atol=2e-5
+        )
 
 
 def test_law_09_wrong_uses_are_errors():

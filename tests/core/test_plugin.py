@@ -109,8 +109,8 @@ def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, 
     system = np.array([[0, 1, 0, 0], [0, 0, -0.8 / float(p.mass[0]), 1], [0, 1, -6.0, 0], [0, 0, 0, 0]])
     for axis, (start, g) in enumerate(zip([0, 0, 10.0], [0, 0, -9.81], strict=True)):
         exact = expm(DURATION * system) @ [start, v0[axis], 0.0, g]
-        for found, expected in ((states.pos, exact[0]), (states.vel, exact[1]), (wake_vel, exact[2])):
-            errors = np.abs(np.asarray(found)[0, :, axis] - expected)
+        for result, expected in ((states.pos, exact[0]), (states.vel, exact[1]), (wake_vel, exact[2])):
+            errors = np.abs(np.asarray(result)[0, :, axis] - expected)
             assert np.all(errors > 1e-14), "rounding hides the order"
             slope = np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
             assert abs(slope - Integrator(integrator).order) < 0.3, (axis, errors)
@@ -287,11 +287,11 @@ def test_observations_are_those_of_each_drone():
     sim.add(Wake())
     sim.add(Battery(0.25, 0.1))
     fly_on(sim)
-    found = sim.plugins.observations(sim.data)
-    assert set(found) == {"wake.vel", "wake.height", "battery.voltage", "battery.charge"}
-    np.testing.assert_array_equal(found["wake.vel"], sim.data.plugins["wake"].vel)
-    np.testing.assert_array_equal(found["wake.height"], np.asarray(sim.data.states.pos)[..., 2:])
-    np.testing.assert_array_equal(found["battery.voltage"], sim.data.plugins["battery"].voltage)
+    result = sim.plugins.observations(sim.data)
+    assert set(result) == {"wake.vel", "wake.height", "battery.voltage", "battery.charge"}
+    np.testing.assert_array_equal(result["wake.vel"], sim.data.plugins["wake"].vel)
+    np.testing.assert_array_equal(result["wake.height"], np.asarray(sim.data.states.pos)[..., 2:])
+    np.testing.assert_array_equal(result["battery.voltage"], sim.data.plugins["battery"].voltage)
 
 
 def test_plugins_draw_into_images():

@@ -33,10 +33,10 @@ def keep_mass_stages(sim):
 
 def states_by_name(data):
     """Return the states of drones and masses."""
-    found = {"drones": data.states.pos, "speeds": data.states.vel}
+    result = {"drones": data.states.pos, "speeds": data.states.vel}
     for name, record in data.plugins.items():
-        found |= {f"masses of {name}": record.pos, f"ticks of {name}": record.ticks}
-    return {name: np.asarray(value) for name, value in found.items()}
+        result |= {f"masses of {name}": record.pos, f"ticks of {name}": record.ticks}
+    return {name: np.asarray(value) for name, value in result.items()}
 
 
 @pytest.mark.parametrize(("n_worlds", "n_drones", "n_members"), COUNTS)

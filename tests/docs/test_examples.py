@@ -15,8 +15,8 @@ EXAMPLES = sorted(
 def check_fit(result):
     """Check that a fit, started 4 % off or more, finds every number to 0.2 % with a matching standard deviation."""
     assert len(result) == 7
-    for name, (found, true, sigma) in result.items():
-        assert abs(found - true) < min(4 * sigma, 2e-3 * true), name
+    for name, (estimate, true, sigma) in result.items():
+        assert abs(estimate - true) < min(4 * sigma, 2e-3 * true), name
         assert sigma < 1e-3 * true, name
 
 

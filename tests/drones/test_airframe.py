@@ -53,16 +53,16 @@ def test_every_number_has_a_unit_and_a_source(path):
     sources = tables.pop("sources")
     assert tables.pop("base", None) in (None, *airframe_names())
     assert tables.pop("name", path.stem) == path.stem
-    found = list(iterate_numbers(tables))
+    result = list(iterate_numbers(tables))
     assert len(list(iterate_numbers(load_airframe(path.stem).tables))) > 30
-    for key, entry in found:
+    for key, entry in result:
         assert isinstance(entry, dict), f"{key} is a bare number"
         assert set(entry) == {"value", "unit", "source"}, key
         assert isinstance(entry["unit"], str), key
         assert entry["unit"], key
         assert entry["source"] in sources, f"{key}: no [sources] entry {entry['source']!r}"
     assert all(len(text) > 10 for text in sources.values())
-    unused = set(sources) - {entry["source"] for _, entry in found}
+    unused = set(sources) - {entry["source"] for _, entry in result}
     assert not unused
 
 
@@ -528,14 +528,14 @@ def test_the_page_lists_all_tables_and_keys_and_no_others():
     rows = [
         [cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if re.match(r"\| (?!-)", line)
     ]
-    found, table = set(), ""
+    result, table = set(), ""
     for row in (row for row in rows[1:] if len(row) != 2):  # the table with two columns explains names of models
         is_shape = len(row) == 3
         if not is_shape and row[0]:
             table = row[0].strip("`")
         keys = re.findall(r"`(\w+)`", row[0] if is_shape else row[1])
-        found |= {f"shape.{key}" if is_shape else f"{table}.{key}".removeprefix(".") for key in keys}
-    assert found == {*LAYOUT.keys, *LAYOUT.top_level}
+        result |= {f"shape.{key}" if is_shape else f"{table}.{key}".removeprefix(".") for key in keys}
+    assert result == {*LAYOUT.keys, *LAYOUT.top_level}
 
 
 def test_models_of_the_keys_are_those_of_the_dynamics():

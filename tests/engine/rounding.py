@@ -202,10 +202,10 @@ def _disturbed_results(fn, values: list[np.ndarray], n_lanes: int):
         return jnp.where(jnp.isfinite(disturbed) & ~denormal, disturbed, undisturbed)
 
     def any_alternative(eqn, args: list, out):
-        found = find_alternatives(eqn, args, out) if is_sampled(out) else None
-        if found is None:
+        result = find_alternatives(eqn, args, out) if is_sampled(out) else None
+        if result is None:
             return out
-        where, numbers = found
+        where, numbers = result
         choices = rng.integers(len(numbers) + 1, size=out.shape)
         choices[0] = len(numbers)  # the first is not disturbed
         for k, number in enumerate(numbers):

@@ -26,7 +26,7 @@ def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
 
     The losses are a function of commands and velocities, (n_worlds,).
     """
-    found = []
+    result = []
     for engine in ("fused", "plain"):
         sim = Sim(n_worlds, n_drones, engine=engine, **options)
         for stage_fn in stages:
@@ -42,14 +42,14 @@ def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
             s = step(F.attitude_control(data, cmd), n_steps).states
             return jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3], (1, 2))
 
-        found.append((losses, step, sim.data))
+        result.append((losses, step, sim.data))
     rng = np.random.default_rng(0)
     point = np.tile(COMMAND, (n_worlds, n_drones, 1)), rng.normal(size=(n_worlds, n_drones, 3))
-    return found, jax.tree.map(jnp.asarray, point)
+    return result, jax.tree.map(jnp.asarray, point)
 
 
-def assert_close(found, expected):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+def assert_close(computed, expected):
+    for a, b in zip(jax.tree.leaves(computed), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * max(np.max(np.abs(b)), 1e-3))
 
 
@@ -81,8 +81,8 @@ def test_tangents_of_a_block_equal_those_of_jax(fn, x64):
     for indices, direction in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
         extended_block = add_block_tangents(block, [block.inputs[k] for k in indices])
         verify_block(extended_block)
-        found = xla.run_block(extended_block, [x, y, *(direction[k] for k in indices)], (16,))
-        for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), direction), strict=True):
+        result = xla.run_block(extended_block, [x, y, *(direction[k] for k in indices)], (16,))
+        for a, b in zip(result, jax.jvp(jax.vmap(fn), (x, y), direction), strict=True):
             np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
@@ -92,8 +92,8 @@ def test_a_transposed_block_equals_the_vjp_of_jax(name, x64):
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
     _, vjp_fn = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
-    found = xla.run_block(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
-    for a, b in zip(found, vjp_fn(jnp.asarray(ct)), strict=True):
+    result = xla.run_block(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
+    for a, b in zip(result, vjp_fn(jnp.asarray(ct)), strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
@@ -103,10 +103,10 @@ def test_a_kernel_computes_the_gradient(x64, monkeypatch):
     """Gradients are repeatable to the bit, also in intervals, and for batches of worlds."""
     ((fast, step, data), (plain, *_)), point = make_losses(n_steps=3, n_drones=2)
     kernel_gradient = jit_gradient(fast)
-    found = kernel_gradient(point)
+    result = kernel_gradient(point)
     assert "gradient: one kernel" in explain(step, data)
-    assert_close(found, jit_gradient(plain)(point))
-    for a, b in zip(found, kernel_gradient(point), strict=True):
+    assert_close(result, jit_gradient(plain)(point))
+    for a, b in zip(result, kernel_gradient(point), strict=True):
         np.testing.assert_array_equal(a, b)
 
     monkeypatch.setattr(native, "GRADIENT_MEMORY_BYTES", 0)
@@ -179,8 +179,8 @@ def long_loop(data):
 def test_programs_without_a_kernel_are_differentiated_on_lanes(x64):
     ((fast, step, data), (plain, *_)), point = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
-        found = jit_gradient(fast)(point)
-    assert_close(found, jit_gradient(plain)(point))
+        result = jit_gradient(fast)(point)
+    assert_close(result, jit_gradient(plain)(point))
     assert "a loop of 3000 iterations is too long to be reversed" in explain(step, data)
 
 

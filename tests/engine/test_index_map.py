@@ -50,18 +50,18 @@ def compute_by_hand(numbers, places):
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_lanes_stop_and_skip_on_their_own(tables, platform):
-    found = jax.jit(lambda *tables: map_indices(sum_positive_rows, N, tables, platform))(*tables)
-    for x, y in zip(found, compute_by_hand(*map(np.asarray, tables)), strict=True):
+    result = jax.jit(lambda *tables: map_indices(sum_positive_rows, N, tables, platform))(*tables)
+    for x, y in zip(result, compute_by_hand(*map(np.asarray, tables)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
     numbers = jnp.stack([tables[0], 2 * tables[0]])
-    found = jax.jit(jax.vmap(lambda x: map_indices(sum_positive_rows, N, [x, tables[1]], platform)))(numbers)
+    result = jax.jit(jax.vmap(lambda x: map_indices(sum_positive_rows, N, [x, tables[1]], platform)))(numbers)
     for k in range(2):
         expected = compute_by_hand(np.asarray(numbers[k]), np.asarray(tables[1]))
-        np.testing.assert_allclose(found[0][k], expected[0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(result[0][k], expected[0], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)

@@ -57,9 +57,9 @@ def test_updates_at_indices_equal_those_of_plain(sim):
 
     expected = np.float32([row for _, row in WRITES])
     data = sim.data.replace(plugins={"written": Results(np.full((2, 2, *expected.shape), -1, np.float32))})
-    found = np.asarray(Step({"write": write}, strict=True)(data).plugins["written"].rows)
+    result = np.asarray(Step({"write": write}, strict=True)(data).plugins["written"].rows)
     for k, row in enumerate(expected):
-        np.testing.assert_array_equal(found[:, :, k], np.broadcast_to(row, (2, 2, 3)), err_msg=f"function {k}")
+        np.testing.assert_array_equal(result[:, :, k], np.broadcast_to(row, (2, 2, 3)), err_msg=f"function {k}")
 
 
 WINDOW = "lax.ScatterDimensionNumbers((1,), (), (0,))"

@@ -163,12 +163,12 @@ def test_the_first_difference_has_stage_field_element_and_operation(moving_data,
 
     wrong = dataclasses.replace(ops.TABLE["sin"], xla=lambda x: jax.lax.sin(x) + 0.01)
     monkeypatch.setitem(ops.TABLE, "sin", wrong)
-    found = compare.first_difference({"mine": undeclared_stage, "sway": sway}, moving_data, engines=("plain", "lanes"))
-    assert found is not None
-    assert (found.stage, found.leaf, found.index[2:]) == ("sway", "states.force", (0,))
-    assert abs(found.values[1] - found.values[0]) > 1e-4
-    assert "%2: float32 = sin(%0) of stage 'sway'" in found.operation
-    assert str(found).startswith("stage 'sway': states.force")
+    result = compare.first_difference({"mine": undeclared_stage, "sway": sway}, moving_data, engines=("plain", "lanes"))
+    assert result is not None
+    assert (result.stage, result.leaf, result.index[2:]) == ("sway", "states.force", (0,))
+    assert abs(result.values[1] - result.values[0]) > 1e-4
+    assert "%2: float32 = sin(%0) of stage 'sway'" in result.operation
+    assert str(result).startswith("stage 'sway': states.force")
 
 
 def test_nan_is_equal_to_nan(moving_data):

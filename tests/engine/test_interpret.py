@@ -64,13 +64,13 @@ def test_outside_of_a_trace_nothing_is_compiled():
     """Results equal those of a traced call, and are on the device of the data."""
     sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret", device="cpu:1")
     sim.rotor_vel_control(np.full((2, 1, 4), 1.7e4))
-    found = sim.step_fn(sim.data, jnp.int32(3))
+    result = sim.step_fn(sim.data, jnp.int32(3))
     assert sim.step_fn._cache_size() == 0
-    assert found.states.pos.devices() == sim.data.states.pos.devices() == {jax.devices("cpu")[1]}
+    assert result.states.pos.devices() == sim.data.states.pos.devices() == {jax.devices("cpu")[1]}
     inside = jax.jit(lambda data: sim.step_fn(data, jnp.int32(3)))(sim.data)
-    for x, y in zip(jax.tree.leaves(found.states), jax.tree.leaves(inside.states), strict=True):
+    for x, y in zip(jax.tree.leaves(result.states), jax.tree.leaves(inside.states), strict=True):
         np.testing.assert_array_equal(x, y)
-    assert not np.array_equal(found.states.rotor_vel, sim.data.states.rotor_vel)
+    assert not np.array_equal(result.states.rotor_vel, sim.data.states.rotor_vel)
 
 
 # Leaves --------------------------------------------------------------------------------------------------------------
@@ -108,7 +108,7 @@ def test_a_stage_may_write_random_keys(run_steps):
     assert isinstance(program.segments[0], Segment)
     written, _ = run_steps(program, jax.tree.leaves(data), 2)
     expected = draw(draw(data)).plugins["own"]
-    found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written_leaves), written, strict=True))
-    assert found["key"].dtype == expected.key.dtype
-    np.testing.assert_array_equal(found["drawn"], expected.drawn)
-    np.testing.assert_array_equal(jax.random.key_data(found["key"]), jax.random.key_data(expected.key))
+    result = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written_leaves), written, strict=True))
+    assert result["key"].dtype == expected.key.dtype
+    np.testing.assert_array_equal(result["drawn"], expected.drawn)
+    np.testing.assert_array_equal(jax.random.key_data(result["key"]), jax.random.key_data(expected.key))

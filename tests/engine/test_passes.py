@@ -70,9 +70,9 @@ def test_fusing_changes_no_number(pipeline):
     assert fused.segments[0].stages == tuple(s.stages[0] for s in program.segments)
     assert fused.segments[0].n_operations <= sum(s.n_operations for s in program.segments)
     assert {op.stage for op in fused.segments[0].block.walk()} <= {*fused.segments[0].stages}
-    expected, found = run_program(program, numbers, 3), run_program(fused, numbers, 3)
+    expected, result = run_program(program, numbers, 3), run_program(fused, numbers, 3)
     for slot, x in expected.items():
-        np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
+        np.testing.assert_array_equal(result[slot], x, err_msg=str(slot))
 
 
 def test_hoisting_takes_work_out_of_the_loop(pipeline):
@@ -85,9 +85,9 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
     assert after.n_operations < before.n_operations
     assert {"cos", "sin", "div"} & {op.name for op in after.hoisted.operations}
     assert hoisted.changing_slots().isdisjoint(after.hoisted_reads)
-    expected, found = run_program(fused, numbers, 3), run_program(hoisted, numbers, 3)
+    expected, result = run_program(fused, numbers, 3), run_program(hoisted, numbers, 3)
     for slot, x in expected.items():
-        np.testing.assert_allclose(found[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))
+        np.testing.assert_allclose(result[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))
 
 
 def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
@@ -101,9 +101,9 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
     assert [name for name in names if name != "barrier"] == [
         op.name for op in before.block.operations if op.name != "barrier"
     ]
-    expected, found = run_program(fused, numbers, 3), run_program(separated, numbers, 3)
+    expected, result = run_program(fused, numbers, 3), run_program(separated, numbers, 3)
     for slot, x in expected.items():
-        np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
+        np.testing.assert_array_equal(result[slot], x, err_msg=str(slot))
 
 
 # Programs of a few numbers ------------------------------------------------------------------------------------------
@@ -147,9 +147,9 @@ def test_stages_of_the_same_ticks_are_joined(result):
     assert [op.name for op in joined.segments[0].block.operations].count("when") == 1
     x = np.array([-1, 1, 0, 2, -3], np.float32)
     numbers = {X: x, Y: x + 10, Z: x + 20, SHARED: np.float32(3)}
-    expected, found = run_program(fused, numbers, 2), run_program(joined, numbers, 2)
-    assert all((found[slot] == expected[slot]).all() for slot in (X, Y, Z))
-    assert (found[result] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[result])).all()
+    expected, with_joined = run_program(fused, numbers, 2), run_program(joined, numbers, 2)
+    assert all((with_joined[slot] == expected[slot]).all() for slot in (X, Y, Z))
+    assert (with_joined[result] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[result])).all()
 
 
 def test_stages_of_other_ticks_are_not_joined():
@@ -183,8 +183,8 @@ def test_the_inverse_of_a_number_is_computed_once():
     assert [x.name for x in after.hoisted.operations] == ["div"]
     assert [x.name for x in after.block.operations] == ["mul"] * 4
     numbers = {X: np.full(N_WORLDS, 3.0, np.float32), SHARED: np.float32(2.0)}
-    found = run_program(schedule.hoist(program), numbers, 1)
-    assert [found[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
+    result = run_program(schedule.hoist(program), numbers, 1)
+    assert [result[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
 
 
 # Verification -------------------------------------------------------------------------------------------------------

@@ -46,10 +46,10 @@ def make_pipeline(sim, *stages):
 def assert_steps_like_plain(sim, step, stages):
     """Assert that a step that fell back to a slower engine computes the same as ``plain``."""
     data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 1.0))
-    found, expected = step(data, jnp.int32(3)), Step(make_pipeline(sim, *stages), "plain")(data, jnp.int32(3))
+    result, expected = step(data, jnp.int32(3)), Step(make_pipeline(sim, *stages), "plain")(data, jnp.int32(3))
     for name in ("pos", "vel", "force", "torque"):
-        np.testing.assert_allclose(getattr(found.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-7)
-    assert float(jnp.abs(found.states.force).max()) > 1e-4
+        np.testing.assert_allclose(getattr(result.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-7)
+    assert float(jnp.abs(result.states.force).max()) > 1e-4
 
 
 def test_a_stage_without_a_rule_is_named_in_one_warning(sim, monkeypatch):

@@ -10,15 +10,15 @@ NAN = np.nan
 DENORMAL = 2.0**-130
 
 
-def is_within_rounding(fn, values, found, dtype=np.float32):
-    """Return True if ``found`` is the result of a function for the values of one lane, within rounding."""
+def is_within_rounding(fn, values, computed, dtype=np.float32):
+    """Return True if ``computed`` is the result of a function for the values of one lane, within rounding."""
     arrays = [np.asarray([x], None if isinstance(x, int) else np.float32) for x in values]
     arrays = [x.astype(np.int32) if x.dtype.kind == "i" else x for x in arrays]
-    return bool(are_within_rounding(fn, arrays, np.asarray([found], dtype), signed=False)[0])
+    return bool(are_within_rounding(fn, arrays, np.asarray([computed], dtype), signed=False)[0])
 
 
 @pytest.mark.parametrize(
-    ("fn", "values", "found", "wrong"),
+    ("fn", "values", "computed", "wrong"),
     [
         pytest.param(lax.lgamma, [1.4891759], -0.12112227, -0.1212, id="lgamma between its zeros"),
         pytest.param(lax.digamma, [1.5], 0.036489975, 0.0366, id="digamma near its zero"),
@@ -37,20 +37,20 @@ def is_within_rounding(fn, values, found, dtype=np.float32):
         pytest.param(lax.div, [0.0, DENORMAL], 0.0, None, id="division by a denormal number"),
     ],
 )
-def test_rounding_is_distinguished_from_wrong_results(fn, values, found, wrong):
+def test_rounding_is_distinguished_from_wrong_results(fn, values, computed, wrong):
     """Rounding must not explain ``wrong``, which is None where any number is possible."""
-    assert is_within_rounding(fn, values, found)
+    assert is_within_rounding(fn, values, computed)
     assert wrong is None or not is_within_rounding(fn, values, wrong)
 
 
 def test_the_sign_of_zero_is_kept_where_it_is_defined():
-    values, found = [np.float32([-0.0])], np.float32([0.0])
-    assert are_within_rounding(jnp.rint, values, -found, signed=True)[0]
-    assert not are_within_rounding(jnp.rint, values, found, signed=True)[0]
+    values, result = [np.float32([-0.0])], np.float32([0.0])
+    assert are_within_rounding(jnp.rint, values, -result, signed=True)[0]
+    assert not are_within_rounding(jnp.rint, values, result, signed=True)[0]
 
 
 def test_zero_by_zero_is_any_integer_that_compilers_make_of_it():
-    for found in (-1, 1):
-        assert is_within_rounding(lax.div, [0, 0], found, np.int32)
+    for result in (-1, 1):
+        assert is_within_rounding(lax.div, [0, 0], result, np.int32)
     assert not is_within_rounding(lax.div, [0, 0], 7, np.int32)
     assert not is_within_rounding(lax.div, [5, 0], 1, np.int32)

@@ -43,8 +43,8 @@ def test_a_case_gives_the_results_of_jax(name):
     block = lower_function(case_function(name), drone_shapes(g))
     verify_block(block)
     assert block.outputs
-    found = interpret.run_block(block, lane_numbers(g), (N_LANES,))
-    assert_agree(np.stack(found, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
+    result = interpret.run_block(block, lane_numbers(g), (N_LANES,))
+    assert_agree(np.stack(result, axis=-1), jax.jit(map_over_drones(name)).lower(g).compile()(g), name)
 
 
 @pytest.mark.parametrize("engine", COMPILED_ENGINES)
@@ -118,8 +118,8 @@ def test_a_refused_stage_runs_without_fusion(data):
     stages = {"mine": stage("drone")(REFUSED_STAGES["eigh"][0])}
     expected = stages["mine"](stages["mine"](data)).states.pos
     with pytest.warns(EngineWarning, match="stage 'mine' is not fused: primitive 'eigh' has no rule"):
-        found = Step(stages)(data, jnp.int32(2)).states.pos
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+        result = Step(stages)(data, jnp.int32(2)).states.pos
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
 def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsupported(monkeypatch):
@@ -141,8 +141,8 @@ def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsup
 def test_constants_do_not_hide_numbers_that_are_not_finite(fn):
     """A product with zero is NaN where the other number is infinite, even if the zero is a constant."""
     x = np.float32([np.nan, np.inf, -np.inf, 0.0, -2.5])
-    (found,) = interpret.run_block(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
-    np.testing.assert_array_equal(found, np.asarray(jax.jit(jax.vmap(fn))(x)))
+    (result,) = interpret.run_block(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
+    np.testing.assert_array_equal(result, np.asarray(jax.jit(jax.vmap(fn))(x)))
 
 
 def test_powers_and_angles_of_special_numbers():
@@ -156,11 +156,11 @@ def test_powers_and_angles_of_special_numbers():
     scalar = jax.ShapeDtypeStruct((), np.float32)
     block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], scalar, scalar, scalar)
     program, leaves = make_program(block, [y, x, z], len(y))
-    found, _ = jax.jit(lambda leaves: build(program, Location("cpu"))(leaves, 1))(leaves)
+    result, _ = jax.jit(lambda leaves: build(program, Location("cpu"))(leaves, 1))(leaves)
     with np.errstate(all="ignore"):
         expected = [f.astype(np.float32) for f in (np.arctan2(*map(np.float64, (y, x))), np.exp(np.float64(z)),
                                                    np.arctan2(np.float64(z), 2.0))]  # fmt: skip
-    for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), found, expected, strict=True):
+    for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), result, expected, strict=True):
         a = np.asarray(a)[:, 0]
         # XLA flushes subnormal numbers to zero.
         np.testing.assert_allclose(a, b, rtol=4 * ULP, atol=np.finfo(np.float32).tiny, err_msg=name)

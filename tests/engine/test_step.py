@@ -84,9 +84,9 @@ def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
     # ``lanes`` runs every integrator once; XLA takes long to compile the pipeline that has rk4 and a controller.
     for engine in COMPILED_ENGINES[-1:] if (integrator, control) == ("rk4", "attitude") else COMPILED_ENGINES:
-        found = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
+        result = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
         for name in ("pos", "quat", "vel"):
-            a, b = getattr(found.states, name), getattr(expected.states, name)
+            a, b = getattr(result.states, name), getattr(expected.states, name)
             assert a.dtype == np.float64
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=f"{engine} {name}")
 
@@ -153,10 +153,10 @@ def test_a_nan_in_one_drone_stays_in_that_drone():
     expected_data, after = step(data, jnp.int32(5)), step(data_with_nan, jnp.int32(5))
     np.testing.assert_array_equal(np.asarray(after.core.nonfinite)[:, 0], [False, True, False])
     for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
-        found, expected = np.asarray(getattr(after.states, name)), np.asarray(getattr(expected_data.states, name))
+        result, expected = np.asarray(getattr(after.states, name)), np.asarray(getattr(expected_data.states, name))
         is_other = np.ones((3, 2), bool)
         is_other[1, 0] = False
-        np.testing.assert_array_equal(found[is_other], expected[is_other])
+        np.testing.assert_array_equal(result[is_other], expected[is_other])
 
 
 # Stages of the user -------------------------------------------------------------------------------------------------
@@ -239,9 +239,9 @@ def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
     _, data = make_sim_with_stages(n_drones, separation)
     step = Step({"separation": separation})
     assert step.plan(data).program.fused
-    found = step(data, jnp.int32(1)).states.force
-    assert n_drones == 1 or np.abs(found).max() > 1e-4
-    np.testing.assert_allclose(found, separation(data).states.force, rtol=2e-5, atol=2e-6)
+    result = step(data, jnp.int32(1)).states.force
+    assert n_drones == 1 or np.abs(result).max() > 1e-4
+    np.testing.assert_allclose(result, separation(data).states.force, rtol=2e-5, atol=2e-6)
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
@@ -286,9 +286,9 @@ def loss(step, command, data, n):
     return jnp.sum(after.states.pos**2) + jnp.sum(after.states.vel * after.states.force)
 
 
-def assert_gradients_equal(found, expected):
+def assert_gradients_equal(computed, expected):
     """Assert equality to 1e-9 of the largest component of each gradient."""
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(expected), strict=True):
         scale = float(np.abs(y).max())
         assert scale > 1e-3
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * scale)
@@ -300,14 +300,14 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     data = scatter_drones(sim, dtype=np.float64)
     command = data.controls.attitude.staged_cmd
-    found, expected = (
+    result, expected = (
         jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
         for step, derivative in (
             (Step(sim.step_pipeline, COMPILED_ENGINES[-1]), jax.grad),
             (build_stagewise_step(sim), jax.jacfwd),
         )
     )
-    assert_gradients_equal(found, expected)
+    assert_gradients_equal(result, expected)
 
 
 @pytest.mark.long("compiles gradients in both directions")
@@ -455,10 +455,10 @@ def test_a_rollout_stages_commands_like_the_setter(control):
         expected = sim.step_fn(send(expected, command), jnp.int32(n))
     sim.data = before
     sim.rollout(lambda command, _: command, command, 2)
-    found, sim.data = sim.data, sim.default_data
-    for x, y in zip(jax.tree.leaves(found.controls), jax.tree.leaves(expected.controls), strict=True):
+    result, sim.data = sim.data, sim.default_data
+    for x, y in zip(jax.tree.leaves(result.controls), jax.tree.leaves(expected.controls), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(found.states.pos, expected.states.pos, rtol=1e-5)
+    np.testing.assert_allclose(result.states.pos, expected.states.pos, rtol=1e-5)
 
 
 def test_a_rollout_has_a_gradient():
@@ -509,10 +509,10 @@ def test_auto_takes_the_kernel_and_says_so():
 def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
     monkeypatch.setattr("crazysim.engine.backends.native.compiler", lambda: None)
     sim = Sim(control="rotor_vel")
-    assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
+    assert sim.explain().startswith("engine: lanes (no C++ compiler was computed")
     sim.step(2)
     with pytest.raises(
-        ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was found.*engine='lanes'"
+        ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was computed.*engine='lanes'"
     ):
         Sim(engine="fused")
 

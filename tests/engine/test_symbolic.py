@@ -85,8 +85,8 @@ def test_conversions_truncate_saturate_and_wrap_as_in_jax():
         return jnp.concatenate([(1e3 * x).astype(jnp.int32), i.astype(bool), words, (1e10 * x).astype(jnp.uint32)])
 
     x, i = np.array([-2.5, -0.0017, 0.0, 0.0017, 1.0, 3.1]), np.array([5, -1, 0, 7])
-    found = call(casadi_function(convert, vector(6), vector(4, np.int32)), x, i)
-    np.testing.assert_array_equal(found, np.asarray(jax.jit(convert)(x, np.int32(i)), float))
+    result = call(casadi_function(convert, vector(6), vector(4, np.int32)), x, i)
+    np.testing.assert_array_equal(result, np.asarray(jax.jit(convert)(x, np.int32(i)), float))
 
 
 def test_a_long_loop_is_refused():

@@ -115,8 +115,8 @@ def case_stage(name, scope="drone"):
     """Return a stage that reads the elements of a case in every other step."""
 
     def read_case(tables, places):
-        found = jnp.ravel(CASES[name](tables, *places))[:8]
-        return jnp.pad(found.astype(jnp.float32), (0, 8 - len(found)))
+        result = jnp.ravel(CASES[name](tables, *places))[:8]
+        return jnp.pad(result.astype(jnp.float32), (0, 8 - len(result)))
 
     @stage(scope, when=lambda data: data.core.steps % 2 == 0)
     def read(data):
@@ -170,8 +170,8 @@ def test_a_lowered_stage_reads_the_same_elements_as_the_stage(scope, names):
 def test_a_kernel_reads_the_same_elements_as_the_stage(scope, names):
     """One stage sums up all cases."""
     total = sum_stage(names, scope)
-    found = Step({"total": total})(make_data(), jnp.int32(1)).plugins["tables"].out
-    np.testing.assert_allclose(found, jax.jit(total)(make_data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
+    result = Step({"total": total})(make_data(), jnp.int32(1)).plugins["tables"].out
+    np.testing.assert_allclose(result, jax.jit(total)(make_data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
 
 
 def pack_leaves(program, leaves):
@@ -216,9 +216,9 @@ def test_gradients_by_states_and_entries_are_those_of_the_stage():
 
     numbers, vel = make_data().plugins["tables"].numbers, make_data().states.vel + jnp.asarray([1.0, 2.0, 3.0])
     with pytest.warns(EngineWarning, match="read as a table"):
-        found = jax.grad(functools.partial(loss, Step({"read": read})), argnums=(0, 1))(numbers, vel)
+        result = jax.grad(functools.partial(loss, Step({"read": read})), argnums=(0, 1))(numbers, vel)
     expected = jax.grad(functools.partial(loss, lambda data, _: read(read(data))), argnums=(0, 1))(numbers, vel)
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(result, expected, strict=True):
         assert float(jnp.abs(b).max()) > 0.1
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 

@@ -95,9 +95,9 @@ def expected(all_operations):
     return interpret.run_block(segment.block, inputs, (N_LANES,))
 
 
-def assert_agree(found, expected, engine):
+def assert_agree(computed, expected, engine):
     wrong = []
-    for case, x, y in zip(cases(), found, expected, strict=True):
+    for case, x, y in zip(cases(), computed, expected, strict=True):
         name, x, y = case[0], np.asarray(x).reshape(-1), np.asarray(y)
         assert x.dtype == y.dtype, case
         if y.dtype.kind != "f":
@@ -173,8 +173,8 @@ def test_casadi_agrees_with_the_interpreter_or_refuses():
             if name in ("rem", "div") and values[1] == 0:
                 continue
             (expected_number,) = interpret.run_block(block, values, ())
-            found = float(function(*map(float, values)))
-            np.testing.assert_allclose(found, float(expected_number), rtol=1e-9, atol=1e-9, err_msg=name)
+            computed = float(function(*map(float, values)))
+            np.testing.assert_allclose(computed, float(expected_number), rtol=1e-9, atol=1e-9, err_msg=name)
     assert {stage for _, stage in refused} == {"one"}
     assert {name for name, _ in refused} >= {"shift_left", "nextafter", "lgamma", "digamma", "bitcast_convert_type"}
 

@@ -250,8 +250,8 @@ def test_the_number_of_worlds_changes_nothing(env, start_state, random_flight):
     for step in range(4):
         assert {k: np.asarray(x) for k, x in obs.items()} in random_flight.env.observation_space
         for obs_name, x in state.obs.items():
-            found = np.asarray(obs[obs_name])[:N_WORLDS]
-            np.testing.assert_allclose(found, np.reshape(x, found.shape), rtol=1e-4, atol=1e-5)
+            result = np.asarray(obs[obs_name])[:N_WORLDS]
+            np.testing.assert_allclose(result, np.reshape(x, result.shape), rtol=1e-4, atol=1e-5)
         error = np.asarray(info["error"])[:N_WORLDS]
         np.testing.assert_allclose(error.ravel(), np.ravel(state.info["error"]), rtol=1e-4, atol=1e-5)
         obs, reward, terminated, truncated, info = jax.tree.map(lambda x: x[step], random_flight.results)  # noqa: B023
@@ -319,18 +319,18 @@ def test_the_kernel_of_a_step_agrees_with_the_stages(name, env, random_flight):
     vector_env._stepper.state = before
     obs, reward, terminated, truncated, info = vector_env.step(random_flight.actions[0])
     end = first_worlds(vector_env.state)
-    found = {"data": end.data, "action": end.action, "memory": end.memory}
+    result = {"data": end.data, "action": end.action, "memory": end.memory}
     info = {name: info[name] for name in before.info}
     outputs = {"obs": obs, "reward": reward, "terminated": terminated, "truncated": truncated, "info": info}
-    found |= jax.tree.map(lambda x: np.asarray(x)[:N_WORLDS], outputs)
+    result |= jax.tree.map(lambda x: np.asarray(x)[:N_WORLDS], outputs)
 
     after = plain.step(
         first_worlds(before), random_flight.actions[0][:N_WORLDS].reshape(N_WORLDS, *before.action.shape[1:])
     )
     np.testing.assert_array_equal(after.done, IS_ENDING | np.asarray(after.terminated))
-    expected = {name: getattr(after, name) for name in found} | {"reward": np.asarray(after.reward).mean(axis=1)}
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True):
+    expected = {name: getattr(after, name) for name in result} | {"reward": np.asarray(after.reward).mean(axis=1)}
+    assert jax.tree.structure(result) == jax.tree.structure(expected)
+    for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(result)[0], jax.tree.leaves(expected), strict=True):
         where = jax.tree_util.keystr(path)
         assert x.dtype == y.dtype, where
         if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):

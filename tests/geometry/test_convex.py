@@ -46,13 +46,13 @@ def test_float32_errs_by_little(rng, a, b):
     check_finite(DRONES[a], SHAPES[b], np.float32, N)
     pos, quat = poses(rng, N)
     rot = rotations(quat)
-    found, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
+    result, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
     with jax.enable_x64(True):
         exact, *_ = compile_distance_and_slopes(DRONES[a], SHAPES[b])(pos, rot)
     scale = 1 + np.linalg.norm(pos, axis=1)
-    assert np.max(np.abs(found - exact) / scale) < 1e-3
+    assert np.max(np.abs(result - exact) / scale) < 1e-3
     is_clear = np.abs(exact) > 2e-5 * scale
-    np.testing.assert_array_equal(found[is_clear] > 0, exact[is_clear] > 0)
+    np.testing.assert_array_equal(result[is_clear] > 0, exact[is_clear] > 0)
 
 
 def test_law_01_one_drone_then_many(x64, rng):

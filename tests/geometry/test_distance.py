@@ -63,21 +63,21 @@ def evaluate_points(kind, points, dtype=np.float64, one_by_one=False):
         return np.asarray(value)[:n], np.asarray(slope)[:n]
 
 
-def assert_same_signs(found, expected, at_least=100):
+def assert_same_signs(computed, expected, at_least=100):
     """Assert that signs are equal, with enough separated and enough overlapping samples."""
     assert np.sum(expected > 0) > at_least
     assert np.sum(expected < 0) > at_least
-    np.testing.assert_array_equal(found > 0, expected > 0)
+    np.testing.assert_array_equal(computed > 0, expected > 0)
 
 
 @pytest.mark.parametrize("kind", [*CLOSED_FORM_KINDS, "ellipsoid", "mesh"])
 def test_distance_of_a_sphere_equals_that_of_mujoco(x64, rng, kind):
     drone, (pos, quat) = DRONES["sphere"], poses(rng, N)
-    found = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
+    result = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
     expected = distances(drone, SHAPES[kind], pos, quat)
-    assert_same_signs(found, expected)
+    assert_same_signs(result, expected)
     is_compared = expected > 0 if kind in ("ellipsoid", "mesh") else slice(None)  # MuJoCo's depths in these are rough
-    np.testing.assert_allclose(found[is_compared], expected[is_compared], atol=1e-5)
+    np.testing.assert_allclose(result[is_compared], expected[is_compared], atol=1e-5)
 
 
 PAIRS = [
@@ -113,9 +113,9 @@ def test_distance_to_an_ellipsoid_is_the_height_above_its_surface(x64, rng, axes
     normal = normalize(foot / a**2)
     lowest = -(a.min() ** 2) / a.max()  # the least radius of curvature: the foot is the nearest point up to there
     height = np.concatenate([rng.uniform(lowest, 0, N // 2), rng.uniform(0, 3, N - N // 2)])
-    found = point_distance(Shape("ellipsoid", axes), foot + height[:, None] * normal)
-    assert_same_signs(np.asarray(found), height)
-    np.testing.assert_allclose(found, height, atol=1e-6)
+    result = point_distance(Shape("ellipsoid", axes), foot + height[:, None] * normal)
+    assert_same_signs(np.asarray(result), height)
+    np.testing.assert_allclose(result, height, atol=1e-6)
 
 
 def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
@@ -123,17 +123,17 @@ def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
     a, b, c = 0.5, 0.3, 0.2
     x = np.linspace(0, 0.999 * (a * a - c * c) / a, 20)
     expected = -c * np.sqrt(1 - x**2 / (a * a - c * c))
-    found = point_distance(Shape("ellipsoid", (a, b, c)), np.stack([x, 0 * x, 0 * x], axis=-1))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    result = point_distance(Shape("ellipsoid", (a, b, c)), np.stack([x, 0 * x, 0 * x], axis=-1))
+    np.testing.assert_allclose(result, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_errs_by_rounding_only(rng, kind):
     points = random_points(rng, N)
-    found, _ = evaluate_points(kind, points, np.float32, one_by_one=True)
+    result, _ = evaluate_points(kind, points, np.float32, one_by_one=True)
     exact, _ = evaluate_points(kind, np.float32(points))
     size = 0.5 + np.linalg.norm(points, axis=1)
-    assert np.max(np.abs(found - exact) / size) < 1e-6
+    assert np.max(np.abs(result - exact) / size) < 1e-6
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -168,10 +168,10 @@ def test_second_derivatives_of_an_ellipsoid_equal_differences(x64, rng):
     points, h = normalize(rng.normal(size=(50, 3))), 1e-5
     gradient = jax.grad(lambda p: point_distance(SHAPES["ellipsoid"], p))
     normal = jax.jit(jax.grad(lambda p: jnp.sum(point_distance(SHAPES["ellipsoid"], p))))
-    found = jax.jit(jax.vmap(jax.jacfwd(gradient)))(points)
+    result = jax.jit(jax.vmap(jax.jacfwd(gradient)))(points)
     steps = h * np.eye(3)[:, None]
     differences = normal(points + steps) - normal(points - steps)
-    np.testing.assert_allclose(found, np.moveaxis(np.asarray(differences), 0, -1) / (2 * h), atol=1e-5)
+    np.testing.assert_allclose(result, np.moveaxis(np.asarray(differences), 0, -1) / (2 * h), atol=1e-5)
 
 
 def special_points(shape):

@@ -68,14 +68,14 @@ def draw_poses_near_surface(rng, n):
 def test_drones_over_a_height_field(x64, rng, kind):
     pos, quat = draw_poses_near_surface(rng, N)
     pos[:, :2] = np.clip(pos[:, :2], -0.4, 0.4) if kind != "sphere" else pos[:, :2]
-    found, by_pos, _ = (x[:200] for x in compile_distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
+    result, by_pos, _ = (x[:200] for x in compile_distance_and_slopes(DRONES[kind], FIELD)(pos, rotations(quat)))
     expected = distances_to_prisms(DRONES[kind], pos[:200], quat[:200])
     is_apart = expected > 0
     assert min(np.sum(is_apart & (expected < 0.1)), np.sum(~is_apart)) > 30
-    np.testing.assert_array_equal(found > 0, is_apart)
+    np.testing.assert_array_equal(result > 0, is_apart)
     exact = is_apart & (expected < 0.08)
-    np.testing.assert_allclose(found[exact], expected[exact], atol=1e-5)
-    assert np.all(found[is_apart] > expected[is_apart] - 1e-5)  # beyond, an upper bound
+    np.testing.assert_allclose(result[exact], expected[exact], atol=1e-5)
+    assert np.all(result[is_apart] > expected[is_apart] - 1e-5)  # beyond, an upper bound
     np.testing.assert_allclose(np.linalg.norm(by_pos, axis=1), 1, atol=1e-6)
 
 

@@ -47,14 +47,14 @@ def contacts_of_boxes(pos, rot_a, rot_b):
 def largest_separation(pos, rot_a, rot_b):
     """Return the largest separation over the 15 axes, m, computed by loops in float64."""
     axes = [*rot_a.T, *rot_b.T, *(np.cross(x, y) for x in rot_b.T for y in rot_a.T)]
-    found = []
+    result = []
     for axis in axes:
         length = np.linalg.norm(axis)
         if length > 1e-3:
             axis = axis / length
             reach = np.abs(rot_a.T @ axis) @ HALF_A + np.abs(rot_b.T @ axis) @ HALF_B
-            found.append(abs(pos @ axis) - reach)
-    return max(found)
+            result.append(abs(pos @ axis) - reach)
+    return max(result)
 
 
 def test_boxes_overlap_where_no_axis_separates_them(rng):
@@ -70,11 +70,11 @@ def test_boxes_overlap_where_no_axis_separates_them(rng):
 
 
 def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
-    found = boxes(HALF_A, [0.03, 0.02, 0.139], EYE, HALF_B, ZERO, EYE)
-    is_contact = found.gap < 1
-    points = found.point[is_contact]
-    np.testing.assert_allclose(found.gap[is_contact], -0.001, atol=1e-6)
-    np.testing.assert_allclose(found.normal[is_contact], np.tile([0, 0, 1.0], (is_contact.sum(), 1)), atol=1e-6)
+    result = boxes(HALF_A, [0.03, 0.02, 0.139], EYE, HALF_B, ZERO, EYE)
+    is_contact = result.gap < 1
+    points = result.point[is_contact]
+    np.testing.assert_allclose(result.gap[is_contact], -0.001, atol=1e-6)
+    np.testing.assert_allclose(result.normal[is_contact], np.tile([0, 0, 1.0], (is_contact.sum(), 1)), atol=1e-6)
     expected = [(x, y) for x in (-0.07, 0.12) for y in (-0.03, 0.07)]
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
@@ -86,24 +86,24 @@ def test_rounding_does_not_turn_contacts_of_faces_into_contacts_of_edges(rng):
     world = rotations(normalize(rng.normal(size=(N, 4))))
     offset = np.stack([*rng.uniform(-0.01, 0.01, (2, N)), 0.2 + rng.uniform(-1e-7, 1e-7, N)], axis=-1)
     first = (0.1, 0.1, 0.1), np.einsum("nij,nj->ni", world, offset), world @ turned
-    found = boxes(*first, (0.1, 0.1, 0.1), ZERO, world)
-    assert (found.gap[:, -1] == OUTSIDE_DISTANCE).all()
-    assert (found.gap[:, :-1] < OUTSIDE_DISTANCE).sum(axis=1).min() >= 4
+    result = boxes(*first, (0.1, 0.1, 0.1), ZERO, world)
+    assert (result.gap[:, -1] == OUTSIDE_DISTANCE).all()
+    assert (result.gap[:, :-1] < OUTSIDE_DISTANCE).sum(axis=1).min() >= 4
 
 
 def test_points_without_contact_are_near_the_boxes_too(rng):
     """Edges may be parallel to a face up to rounding, but the lever arms of impulses must stay short."""
     turned = rotations(normalize(np.stack([np.ones(N), *rng.normal(size=(3, N)) * [[1e-8], [1.0], [1e-8]]], axis=-1)))
-    found = boxes((0.1, 0.1, 0.1), rng.uniform(-0.2, 0.2, (N, 3)), turned, (0.1, 0.08, 0.05), ZERO, EYE)
-    assert np.abs(found.point).max() < 1
+    result = boxes((0.1, 0.1, 0.1), rng.uniform(-0.2, 0.2, (N, 3)), turned, (0.1, 0.08, 0.05), ZERO, EYE)
+    assert np.abs(result.point).max() < 1
 
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_small_box_on_a_large_one_rests_on_its_four_corners_once_each(above):
     small, large = ((0.05, 0.04, 0.03), [0.1, 0.0, 0.089]), (HALF_B, ZERO)
     first, second = (small, large) if above else (large, small)
-    found = boxes(*first, EYE, *second, EYE)
-    points = found.point[found.gap < 1]
+    result = boxes(*first, EYE, *second, EYE)
+    points = result.point[result.gap < 1]
     expected = [(x, y) for x in (0.05, 0.12) for y in (-0.04, 0.04)]  # cut at the edge of the large one, at 0.12
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
 
@@ -114,24 +114,24 @@ def test_edges_that_cross_touch_at_one_point():
     about_x = rotations([[np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]])[0]
     along_y = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ about_x
     height = 2 * 0.1 * np.sqrt(2) - 0.004
-    found = boxes(half, [0.2, 0.3, height], about_x, half, ZERO, along_y)
-    contacts = np.flatnonzero(found.gap < 1)
+    result = boxes(half, [0.2, 0.3, height], about_x, half, ZERO, along_y)
+    contacts = np.flatnonzero(result.gap < 1)
     assert contacts.tolist() == [12]
-    np.testing.assert_allclose(found.gap[12], -0.004, atol=1e-5)
-    np.testing.assert_allclose(found.normal[12], [0, 0, 1], atol=1e-5)
-    np.testing.assert_allclose(found.point[12], [0.0, 0.3, height / 2], atol=1e-5)
+    np.testing.assert_allclose(result.gap[12], -0.004, atol=1e-5)
+    np.testing.assert_allclose(result.normal[12], [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(result.point[12], [0.0, 0.3, height / 2], atol=1e-5)
 
 
 def test_the_order_of_two_boxes_only_turns_the_normal(rng):
     pos, rot_a, rot_b = poses(rng, 50)
     other = boxes(HALF_B, ZERO, rot_b, HALF_A, pos, rot_a)
-    found = contacts_of_boxes(pos, rot_a, rot_b)
-    np.testing.assert_allclose(found.gap.min(axis=1), other.gap.min(axis=1), atol=1e-5)
-    deepest = np.argmin(found.gap, axis=1), np.argmin(other.gap, axis=1)
+    result = contacts_of_boxes(pos, rot_a, rot_b)
+    np.testing.assert_allclose(result.gap.min(axis=1), other.gap.min(axis=1), atol=1e-5)
+    deepest = np.argmin(result.gap, axis=1), np.argmin(other.gap, axis=1)
     rows = np.arange(50)
-    touching = found.gap.min(axis=1) < 0
+    touching = result.gap.min(axis=1) < 0
     np.testing.assert_allclose(
-        found.normal[rows, deepest[0]][touching], -other.normal[rows, deepest[1]][touching], atol=1e-4
+        result.normal[rows, deepest[0]][touching], -other.normal[rows, deepest[1]][touching], atol=1e-4
     )
 
 
@@ -142,9 +142,9 @@ def test_the_order_of_two_boxes_only_turns_the_normal(rng):
     ([-0.11, 0.0, 0.0], -0.01 - 0.05, [-1, 0, 0]),
 ])  # fmt: skip
 def test_a_ball_on_a_box_by_hand(centre, gap, normal):
-    found = ball_on_box(0.05, centre, HALF_B, ZERO, EYE)
-    np.testing.assert_allclose(found.gap, [gap], atol=1e-6)
-    np.testing.assert_allclose(found.normal[0], normal, atol=1e-5)
+    result = ball_on_box(0.05, centre, HALF_B, ZERO, EYE)
+    np.testing.assert_allclose(result.gap, [gap], atol=1e-6)
+    np.testing.assert_allclose(result.normal[0], normal, atol=1e-5)
 
 
 def test_gaps_are_those_of_mujoco(rng):
@@ -155,8 +155,8 @@ def test_gaps_are_those_of_mujoco(rng):
     data = mujoco.MjData(model)
     pos, _, rot = poses(rng, 40)
     pos *= 1.5
-    found = ball_on_box(0.05, pos, HALF_B, ZERO, rot)
-    for p, r, gap in zip(pos, rot, found.gap[:, 0], strict=True):
+    result = ball_on_box(0.05, pos, HALF_B, ZERO, rot)
+    for p, r, gap in zip(pos, rot, result.gap[:, 0], strict=True):
         data.qpos[:3], data.qpos[7:10] = p, 0
         mujoco.mju_mat2Quat(data.qpos[10:14], r.ravel())
         mujoco.mj_kinematics(model, data)
@@ -171,11 +171,11 @@ def test_law_07_values_and_gradients_are_finite(rng):
     rot_a, rot_b = (np.concatenate([r, np.tile(EYE, (3, 1, 1))]) for r in (rot_a, rot_b))
 
     def total(p, r, s):
-        found = manifold.box_contacts(jnp.asarray(HALF_A), p, r, jnp.asarray(HALF_B), jnp.zeros(3), s)
+        result = manifold.box_contacts(jnp.asarray(HALF_A), p, r, jnp.asarray(HALF_B), jnp.zeros(3), s)
         return (
-            jnp.sum(jnp.where(found.gap < OUTSIDE_DISTANCE, found.gap, 0.0))
-            + jnp.sum(found.normal)
-            + jnp.sum(found.point)
+            jnp.sum(jnp.where(result.gap < OUTSIDE_DISTANCE, result.gap, 0.0))
+            + jnp.sum(result.normal)
+            + jnp.sum(result.point)
         )
 
     box_gradients = jax.jit(jax.vmap(jax.value_and_grad(total, argnums=(0, 1))))(pos, rot_a, rot_b)

@@ -33,9 +33,9 @@ def trace_rays(kind, origin, direction, dtype=np.float64):
     """Return the distances, normals and gradients of up to ``N`` rays."""
     n = len(origin)
     with jax.enable_x64(dtype == np.float64):
-        found = compile_rays(kind)(*(np.resize(x, (N, 3)).astype(dtype) for x in (origin, direction)))
-        assert {x.dtype for x in jax.tree.leaves(found)} == {np.dtype(dtype)}
-        return jax.tree.map(lambda x: np.asarray(x)[:n], found)
+        result = compile_rays(kind)(*(np.resize(x, (N, 3)).astype(dtype) for x in (origin, direction)))
+        assert {x.dtype for x in jax.tree.leaves(result)} == {np.dtype(dtype)}
+        return jax.tree.map(lambda x: np.asarray(x)[:n], result)
 
 
 def draw_rays(rng, n=N):

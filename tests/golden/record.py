@@ -94,12 +94,12 @@ LAST_CLIPPED_STEP = 150
 
 def variants(dynamics: str, control: str) -> dict[str, tuple[str, dict[str, int]]]:
     """List the integrator and the controller rates of each variant recorded for a pair."""
-    found: dict[str, tuple[str, dict[str, int]]] = {"euler": ("euler", {}), "rk4": ("rk4", {})}
+    result: dict[str, tuple[str, dict[str, int]]] = {"euler": ("euler", {}), "rk4": ("rk4", {})}
     if (dynamics, control) == ("first_principles", "attitude"):
-        found["symplectic_euler"] = ("symplectic_euler", {})
+        result["symplectic_euler"] = ("symplectic_euler", {})
     if (dynamics, control) in SLOW_FREQS:
-        found["euler-slow"] = ("euler", SLOW_FREQS[dynamics, control])
-    return found
+        result["euler-slow"] = ("euler", SLOW_FREQS[dynamics, control])
+    return result
 
 
 def hover_thrust(params: dict) -> float:

@@ -33,11 +33,11 @@ def test_tasks_agree_with_the_cpu_and_stay_on_their_device(name):
     assert_agree(starts[ACCELERATOR], starts["cpu"], 1e-5)
     expected = run_steps(envs["cpu"], starts["cpu"], "cpu")
     moved = jax.device_put(starts["cpu"], DEVICES[ACCELERATOR])
-    for found in (
+    for result in (
         run_steps(envs[ACCELERATOR], starts[ACCELERATOR], ACCELERATOR),
         run_steps(envs["cpu"], moved, ACCELERATOR),
     ):
-        assert_agree(found, expected, 1e-4)
+        assert_agree(result, expected, 1e-4)
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -70,10 +70,10 @@ def test_training_learns_the_same(task, algorithm, tmp_path):
         )
         return train(config, tmp_path / device.replace(":", ""), evaluation_worlds=64, log=list, progress=False)
 
-    expected, found = (train_on(device) for device in NAMES)
-    require_device(ACCELERATOR, found.policy)
+    expected, result = (train_on(device) for device in NAMES)
+    require_device(ACCELERATOR, result.policy)
     for name in ("success", "crashed", "error", "reward"):
-        np.testing.assert_allclose(found.metrics[name], expected.metrics[name], rtol=0.02, atol=0.02, err_msg=name)
+        np.testing.assert_allclose(result.metrics[name], expected.metrics[name], rtol=0.02, atol=0.02, err_msg=name)
 
 
 def test_the_default_device_is_the_accelerator():

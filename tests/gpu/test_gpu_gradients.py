@@ -60,8 +60,8 @@ def compare_gradients(build, tolerance=ROUNDING, **options):
             assert "gradient: one kernel" in sim.explain()
         return floating_leaves(out)
 
-    expected, found = (require_device(name, run(name)) for name in NAMES)
-    for x, y in zip(found, expected, strict=True):
+    expected, result = (require_device(name, run(name)) for name in NAMES)
+    for x, y in zip(result, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * max(np.abs(y).max(), 1e-3))
 
 
@@ -121,30 +121,32 @@ def test_tangents_equal_those_of_the_reference_on_the_cpu(n_drones):
         assert name == "cpu" or "jvp: one kernel" in sim.explain()
         return out
 
-    expected, found = (require_device(name, run(name)) for name in NAMES)
-    for x, y in zip(found, expected, strict=True):
+    expected, result = (require_device(name, run(name)) for name in NAMES)
+    for x, y in zip(result, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=ROUNDING * max(np.abs(y).max(), 1e-3))
 
 
 def test_gradients_are_equal_to_the_bit_in_any_run_and_with_little_memory(monkeypatch):
     """With little memory, gradients are computed in intervals of steps, and in fewer blocks with more lanes."""
-    found = []
+    result = []
     for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
         monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
         fn, point = value_and_gradient(
             make_flying_sim(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True
         )
-        found.append(floating_leaves(jax.jit(fn)(point)))
-    assert trees_equal(found[0], found[1])
-    assert trees_equal(found[0], found[2])
+        result.append(floating_leaves(jax.jit(fn)(point)))
+    assert trees_equal(result[0], result[1])
+    assert trees_equal(result[0], result[2])
 
 
 def test_a_vmapped_gradient_equals_gradients_one_by_one():
     fn, point = value_and_gradient(make_flying_sim(ACCELERATOR, 5, control="attitude"), n_steps=10)
     many = jax.tree.map(lambda x: jnp.stack([x, 1.01 * x, 0.99 * x]), point)
-    found = floating_leaves(jax.jit(jax.vmap(fn))(many))
+    result = floating_leaves(jax.jit(jax.vmap(fn))(many))
     for k in range(3):
-        assert_agree([x[k] for x in found], floating_leaves(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6)
+        assert_agree(
+            [x[k] for x in result], floating_leaves(jax.jit(fn)(jax.tree.map(lambda x, k=k: x[k], many))), 1e-6
+        )
 
 
 @pytest.mark.parametrize("n_drones", [1, 12])
@@ -156,7 +158,7 @@ def test_the_gradient_runs_where_the_state_is(n_drones):
     sims = {name: make_flying_sim(name, 2, n_drones, control="attitude") for name in NAMES}
     for sim in sims.values():
         insert_fn_before(sim.step_pipeline, "integration", repulsion)
-    found = {}
+    result = {}
     for planned, sim in sims.items():
         for name in NAMES:
             step = Step(sim.step_pipeline, "fused", "cpu" if planned == "cpu" else "gpu")
@@ -165,8 +167,8 @@ def test_the_gradient_runs_where_the_state_is(n_drones):
             def loss(vel, step=step, data=data):
                 return jnp.sum(step(data.replace(states=data.states.replace(vel=vel)), 10).states.pos ** 2)
 
-            found[planned, name] = require_device(name, jax.jit(jax.grad(loss))(data.states.vel))
-    expected = found["cpu", "cpu"]
+            result[planned, name] = require_device(name, jax.jit(jax.grad(loss))(data.states.vel))
+    expected = result["cpu", "cpu"]
     assert np.any(np.asarray(expected))
-    for x in found.values():
+    for x in result.values():
         assert_agree(x, expected, 1e-5)

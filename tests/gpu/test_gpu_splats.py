@@ -76,10 +76,10 @@ def test_gradients_agree_with_plain_jax(sim, tmp_path):
             return jnp.mean(image.color**2) + jnp.mean(image.coverage)
 
         slopes.append(jax.jit(jax.grad(loss, argnums=(0, 1)))(gaussians, sim.data.states.pos))
-    for found, expected in zip(*map(jax.tree.leaves, slopes), strict=True):
-        found, expected = np.asarray(found), np.asarray(expected)
-        assert np.isfinite(found).all()
-        assert np.linalg.norm(found - expected) < 0.05 * np.linalg.norm(expected) + 1e-6
+    for result, expected in zip(*map(jax.tree.leaves, slopes), strict=True):
+        result, expected = np.asarray(result), np.asarray(expected)
+        assert np.isfinite(result).all()
+        assert np.linalg.norm(result - expected) < 0.05 * np.linalg.norm(expected) + 1e-6
 
 
 def test_the_functions_of_crazyflow_draw_with_splax(sim, tmp_path):

@@ -23,8 +23,8 @@ FALLBACK_TESTS = "law_01 or law_10 or on_each_other_are_differentiated or tangen
 
 def run_on_both(run):
     """Return the results of a function of a device on the accelerator and on the CPU, after checking their devices."""
-    expected, found = (require_device(name, run(name)) for name in NAMES)
-    return found, expected
+    expected, result = (require_device(name, run(name)) for name in NAMES)
+    return result, expected
 
 
 @pytest.mark.parametrize("name", sweep.CASES)
@@ -120,10 +120,10 @@ def test_queries_of_the_scene_agree_with_the_cpu():
         moved = sim.contact_report(ball, floor=False)
         return report, depth, moved, sim.contacts()
 
-    found, expected = run_on_both(run)
-    has_depth = [np.isfinite(x[1]) for x in (found, expected)]
+    result, expected = run_on_both(run)
+    has_depth = [np.isfinite(x[1]) for x in (result, expected)]
     assert_agree(*has_depth, 0)
-    assert_agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (found, expected)), 1e-5)
+    assert_agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (result, expected)), 1e-5)
 
 
 def test_kernels_are_launched_without_the_custom_call_of_xla():

@@ -105,7 +105,7 @@ def test_gradient_equals_central_differences(dynamics, control, engine, mode, x6
         directions[name] = np.zeros((3 * len(start), len(value)))
         directions[name][3 * k : 3 * k + 3] = direction
         x[name] = value + RELATIVE_STEP * np.tile([0.0, 1.0, -1.0], len(start))[:, None] * directions[name]
-    values, slopes = (np.asarray(found) for found in jax.jit(functools.partial(mode, losses))(x, directions))
+    values, slopes = (np.asarray(result) for result in jax.jit(functools.partial(mode, losses))(x, directions))
     compared = 0
     for k, name in enumerate(start):
         _, ahead, behind = values[3 * k : 3 * k + 3]

@@ -143,21 +143,21 @@ ALLOWED_CALLS = {"jnp.asarray", "jax.ensure_compile_time_eval"}
 
 def find_arithmetic(source):
     """Return the arithmetic of a module: operators outside ``HOST_ARITHMETIC``, and calls of array functions."""
-    found = []
+    result = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, (ast.BinOp, ast.AugAssign, ast.UnaryOp)):
             is_union = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr)  # str | Path
             is_not = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
             is_negative_number = isinstance(node, ast.UnaryOp) and isinstance(node.operand, ast.Constant)  # -1
             if not (is_union or is_not or is_negative_number or ast.unparse(node) in HOST_ARITHMETIC):
-                found.append(ast.unparse(node))
+                result.append(ast.unparse(node))
         elif isinstance(node, ast.Call):
             name = ast.unparse(node.func)
             if name.split(".")[0] in ARRAY_MODULES and name not in ALLOWED_CALLS:
-                found.append(name)
+                result.append(name)
         elif isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store):
-            found.append(ast.unparse(node))
-    return found
+            result.append(ast.unparse(node))
+    return result
 
 
 HOST_ARITHMETIC = {"self.freq // self.control_freq"}

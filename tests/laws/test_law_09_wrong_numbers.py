@@ -171,20 +171,20 @@ def describe_unless_refused(call, label):
 
 @pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
 def test_impossible_numbers_are_refused_where_they_are_given(kind):
-    rng, found = np.random.default_rng(len(kind.__name__)), []
+    rng, result = np.random.default_rng(len(kind.__name__)), []
     fields = numeric_fields(kind)
     for name, declared in fields:
         for value in impossible_values(kind, name, declared, rng):
-            found.append(
+            result.append(
                 describe_unless_refused(
                     lambda name=name, value=value: make_example(kind, **{name: value}), f"{name}={value!r}"
                 )
             )
     for name in allowed_types(kind):
         if name not in dict(fields) and type(None) not in allowed_types(kind)[name] and allowed_types(kind)[name]:
-            found += [describe_unless_refused(lambda name=name: make_example(kind, **{name: None}), f"{name}=None")]
-            found += [describe_unless_refused(lambda name=name: make_example(kind, **{name: np.nan}), f"{name}=nan")]
-    assert not [text for text in found if text], "\n".join(text for text in found if text)
+            result += [describe_unless_refused(lambda name=name: make_example(kind, **{name: None}), f"{name}=None")]
+            result += [describe_unless_refused(lambda name=name: make_example(kind, **{name: np.nan}), f"{name}=nan")]
+    assert not [text for text in result if text], "\n".join(text for text in result if text)
 
 
 @pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
@@ -239,7 +239,7 @@ def part_names(sim):
 
 @pytest.mark.parametrize("kind", PLUGINS, ids=lambda kind: kind.__name__)
 def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change_nothing(kind, sims):
-    sim, found = sims(kind), []
+    sim, result = sims(kind), []
     before = part_names(sim)
     for name, declared in numeric_fields(kind):
         if np.ndarray not in allowed_types(kind)[name] and not declared.is_parameter:
@@ -253,11 +253,11 @@ def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change
             def add(name=name, shape=shape, fill=fill):
                 sim.add(make_example(kind, **{name: np.full(shape, fill)}))
 
-            found.append(describe_unless_refused(add, f"{name} of shape {shape}"))
+            result.append(describe_unless_refused(add, f"{name} of shape {shape}"))
             if kind.__name__ in [type(x).__name__ for x in sim.plugins.values()]:
                 sim.remove(make_example(kind).name)
             elif part_names(sim) != before:
-                found.append(f"{name} of shape {shape} left something behind")
-    assert not [text for text in found if text], "\n".join(text for text in found if text)
+                result.append(f"{name} of shape {shape} left something behind")
+    assert not [text for text in result if text], "\n".join(text for text in result if text)
     sim.add(make_example(kind))
     sim.remove(make_example(kind).name)

@@ -126,10 +126,10 @@ def test_a_file_keeps_the_whole_flight(flight, tmp_path):
     for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(flight, name))
     assert len(loaded.shapes) == len(flight.shapes)
-    for found, expected in zip(loaded.shapes, flight.shapes, strict=True):
-        assert (found.kind, found.mocap) == (expected.kind, expected.mocap)
+    for result, expected in zip(loaded.shapes, flight.shapes, strict=True):
+        assert (result.kind, result.mocap) == (expected.kind, expected.mocap)
         for name in ("size", "rgba", "pos", "quat", "vertices", "faces"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+            np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
 
 
 def test_another_simulation_shows_the_flight(flight, opengl):
@@ -155,8 +155,8 @@ def test_setpoints_replace_the_feedforward_of_earlier_ones(flight):
     other_sim = build()
     other_sim.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
     show_flight_at(other_sim, flight, 0.25)
-    found = np.asarray(other_sim.data.controls.state.staged_feedforward)
-    np.testing.assert_array_equal(found, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
+    result = np.asarray(other_sim.data.controls.state.staged_feedforward)
+    np.testing.assert_array_equal(result, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
 
 
 def test_objects_with_handles_are_recorded_and_shown():

@@ -23,8 +23,8 @@ def error_message(error, fn, *args):
     """Return the message of the error that a call must raise."""
     try:
         fn(*args)
-    except error as found:
-        return str(found)
+    except error as refusal:
+        return str(refusal)
     raise SystemExit(f"{fn} did not raise {error}")
 
 

@@ -84,8 +84,8 @@ def test_files_of_all_kinds_are_read(name, tmp_path):
         assert name.endswith(".pcd") or name == "cloud.ply"
         np.testing.assert_allclose(points, CORNERS)
     else:
-        found = {tuple(map(tuple, t)) for t in points[triangles]}
-        assert found == {tuple(map(tuple, t)) for t in CORNERS[TRIANGLES]}
+        result = {tuple(map(tuple, t)) for t in points[triangles]}
+        assert result == {tuple(map(tuple, t)) for t in CORNERS[TRIANGLES]}
 
 
 @pytest.mark.parametrize("name", MAP_FILES)
@@ -220,13 +220,13 @@ def test_distances_to_many_boxes_of_different_sizes_are_exact(box, rng):
     )
     sim.scene.add(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", "many", mocap=False)
     teleport(sim, rng.uniform([-2, -2, 0.5], [2, 2, 2.5], (3, 1, 3)))
-    found = np.asarray(jax.jit(sim.scene.contact_fn(floor=False, drones=False))(sim.data).object_distance)
+    result = np.asarray(jax.jit(sim.scene.contact_fn(floor=False, drones=False))(sim.data).object_distance)
     drone = sim.scene.collision_model.drones[0].geoms[0]
     half, radius = (np.array(drone.shape.size), 0.0) if box else (np.zeros(3), drone.shape.size[0])
     gap = np.abs(np.asarray(sim.data.states.pos) + drone.pos - pos) - size / 2 - half  # (3, 18, 3)
     outside = np.linalg.norm(np.maximum(gap, 0), axis=-1)
     expected = np.where((gap > 0).any(axis=-1), outside, gap.max(axis=-1)) - radius
-    np.testing.assert_allclose(found[:, 0, 0], expected.min(axis=1), atol=1e-4)
+    np.testing.assert_allclose(result[:, 0, 0], expected.min(axis=1), atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["upright", "turned", "balls", "balls and a box"])
@@ -249,8 +249,8 @@ def test_code_of_one_drone_finds_the_nearest_of_many_geoms(kind, rng):
         return contacts(sim.data.replace(states=states.replace(pos=pos, quat=quat))).object_distance[0]
 
     expected = np.asarray(jax.jit(contacts)(sim.data).object_distance)[:, 0, 0]
-    found, slope = jax.jit(jax.vmap(jax.value_and_grad(gap_of_drone)))(states.pos[:, 0], states.quat[:, 0])
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    result, slope = jax.jit(jax.vmap(jax.value_and_grad(gap_of_drone)))(states.pos[:, 0], states.quat[:, 0])
+    np.testing.assert_allclose(result, expected, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-3)
     assert (expected < 0).any()
     assert (expected > 0).any()

@@ -134,8 +134,8 @@ def test_drawing_uses_no_global_random_numbers(sim):
     before = np.random.get_state()  # noqa: NPY002
     draw_line(sim, np.zeros((5, 3)))
     take_picture(sim)
-    for found, expected in zip(np.random.get_state(), before, strict=True):  # noqa: NPY002
-        np.testing.assert_array_equal(found, expected)  # the position in the generator's block of numbers, too
+    for result, expected in zip(np.random.get_state(), before, strict=True):  # noqa: NPY002
+        np.testing.assert_array_equal(result, expected)  # the position in the generator's block of numbers, too
 
 
 # Text and setpoints ---------------------------------------------------------------------------------------------

@@ -128,12 +128,12 @@ def test_a_scene_looks_the_same_at_any_pose_and_scale(sim, draw_splats, tmp_path
     changes |= {f"f_rest_{15 * c + k}": colors[:, c, 1 + k] for c in range(3) for k in range(15)}
     write_splats(tmp_path / "file.ply", **changes)
     registered = SplatScene(tmp_path / "file.ply", pos=pos, quat=quat, scale=scale)
-    expected, found = (
+    expected, result = (
         draw_splats(sim.data, SplatScene(tmp_path / "world.ply").gaussians),
         draw_splats(sim.data, registered.gaussians),
     )
-    np.testing.assert_allclose(found.color, expected.color, atol=2e-3)
-    np.testing.assert_allclose(found.coverage, expected.coverage, atol=2e-3)
+    np.testing.assert_allclose(result.color, expected.color, atol=2e-3)
+    np.testing.assert_allclose(result.coverage, expected.coverage, atol=2e-3)
     assert np.asarray(expected.coverage).std() > 0.1
 
 

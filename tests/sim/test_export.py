@@ -74,11 +74,11 @@ def compare(sim, step, data):
         for drone in range(sim.n_drones):
             index = world, drone
             parts = [part.of(data, *index) for part in (step.x, step.u, step.p) if len(part)]
-            found = np.asarray(step(*parts)).ravel()
+            result = np.asarray(step(*parts)).ravel()
             expected = step.x.of(after, *index)
-            assert len(found) == len(step.x)
+            assert len(result) == len(step.x)
             for name in step.x.sizes:
-                a, b = found[step.x[name]], expected[step.x[name]]
+                a, b = result[step.x[name]], expected[step.x[name]]
                 scale = max(1.0, np.abs(b).max())
                 np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * scale, err_msg=f"{name} of {index}")
 
@@ -124,8 +124,8 @@ def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
         return jnp.concatenate([value[0, 0] for value in fields(step(data, 1), exported.x.sizes)])
 
     expected = jax.jit(jax.jacfwd(advance, argnums=(0, 1)))(x, u)
-    found = exported.function.jacobian()(x, u, 0)
-    for a, b in zip(found, expected, strict=True):
+    result = exported.function.jacobian()(x, u, 0)
+    for a, b in zip(result, expected, strict=True):
         largest = np.abs(b).max(axis=1, keepdims=True)  # of each number of the next state
         assert (largest > 0).sum() >= 4
         size = np.where(largest > 0, largest, 1.0)

@@ -37,22 +37,22 @@ def place_drones(sim, pos, quat=(0, 0, 0, 1), vel=(0, 0, 0)):
 
 def fly_and_return_errors(sim, mppi, setpoint_at, seconds):
     """Return the distance of every drone from its setpoint after each control step. (n, n_worlds)"""
-    n_steps, found = round(mppi.period * sim.freq), []
+    n_steps, result = round(mppi.period * sim.freq), []
     for k in range(round(seconds / mppi.period)):
         sim.attitude_control(mppi.command(sim.data, setpoint_at(jnp.float32(k * mppi.period))))
         sim.step(n_steps)
         target = setpoint_at(jnp.float32((k + 1) * mppi.period)).pos
-        found.append(np.linalg.norm(np.asarray(sim.data.states.pos)[:, 0] - target, axis=-1))
-    return np.array(found)
+        result.append(np.linalg.norm(np.asarray(sim.data.states.pos)[:, 0] - target, axis=-1))
+    return np.array(result)
 
 
 def test_it_hovers_from_a_bad_start(sim, mppi):
     """1.5 m away and rolled by 69 degrees."""
     mppi.reset()
     place_drones(sim, [1.0, -1.0, 1.5], [np.sin(0.6), 0, 0, np.cos(0.6)])
-    found = fly_and_return_errors(sim, mppi, lambda t: setpoint(), 4.0)
-    assert found[0].min() > 1.0
-    assert found[-50:].max() < 0.3
+    result = fly_and_return_errors(sim, mppi, lambda t: setpoint(), 4.0)
+    assert result[0].min() > 1.0
+    assert result[-50:].max() < 0.3
     assert mppi._compiled_plan._cache_size() == 1
 
 
@@ -62,8 +62,8 @@ def test_it_follows_a_figure_eight(sim, mppi):
     start = jax.tree.map(np.asarray, eight.evaluate(jnp.float32(0)))
     mppi.reset()
     place_drones(sim, start.pos, vel=start.vel)
-    found = fly_and_return_errors(sim, mppi, jax.jit(eight.evaluate), 4.0)
-    assert np.sqrt(np.mean(found**2)) < 0.25
+    result = fly_and_return_errors(sim, mppi, jax.jit(eight.evaluate), 4.0)
+    assert np.sqrt(np.mean(result**2)) < 0.25
 
 
 def test_equal_seeds_give_equal_commands(sim, mppi):

@@ -48,8 +48,8 @@ def test_the_fraction_of_the_teachers_actions_decays():
     for iteration, fraction in ((0, 1.0), (1, 0.5), (30, 0.0)):
         learner = learner.replace(iteration=jnp.int32(iteration))
         after, _ = dagger.iterate(learner, env, (config,))
-        found = (np.asarray(after.env.action) == 1.0).mean()
-        assert abs(found - fraction) < 0.2
+        result = (np.asarray(after.env.action) == 1.0).mean()
+        assert abs(result - fraction) < 0.2
 
 
 def test_the_teacher_observes_true_states_and_the_student_measurements():

@@ -144,8 +144,8 @@ def test_a_run_continues_on_another_number_of_devices(tmp_path, monkeypatch):
     assert re.search(r"in 16 worlds, 8 on each of 2 devices, .*; continues after iteration 2", lines[0])
     arrays, meta = checkpoint.read(tmp_path / CHECKPOINT_FILE)
     one = Training(ppo, PPO_CONFIG, 1, 16, 1).learner
-    found = checkpoint.restore("", {k: x for k, x in arrays.items() if k.startswith("['learner']")}, {"learner": one})
-    assert_same(found["learner"], one, atol=1e-5)
+    result = checkpoint.restore("", {k: x for k, x in arrays.items() if k.startswith("['learner']")}, {"learner": one})
+    assert_same(result["learner"], one, atol=1e-5)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0, 2, 3]
     assert not {"devices", "mesh"} & {*meta["runs"][""]["settings"], *load_policy(tmp_path)[1].options}
 

@@ -87,9 +87,9 @@ def test_outputs_and_gradients_of_the_kernels_are_those_of_jax(on_host, sizes):
 
         return jax.jit(jax.vmap(compute_for_seed))(layers, x, cotangent)
 
-    found, expected = (jax.tree.leaves(outputs_and_gradients(apply)) for apply in (apply_mlp, mlp))
-    assert len(found) == 2 * len(sizes) - 1
-    for a, b in zip(found, expected, strict=True):
+    result, expected = (jax.tree.leaves(outputs_and_gradients(apply)) for apply in (apply_mlp, mlp))
+    assert len(result) == 2 * len(sizes) - 1
+    for a, b in zip(result, expected, strict=True):
         assert a.shape == b.shape
         for seed_a, seed_b in zip(a, b, strict=True):  # of each seed
             assert np.linalg.norm(seed_a - seed_b) < 3e-3 * np.linalg.norm(seed_b)  # 11 bits
@@ -108,8 +108,8 @@ def test_each_device_runs_the_kernels_for_its_own_worlds(on_host, shape):
         out, backward = jax.vjp(lambda layers: apply(layers, x), layers)
         return out, backward(cotangent)[0]
 
-    found, expected = (jax.tree.leaves(compute_outputs_and_gradients(apply)) for apply in (apply_distributed, mlp))
-    for a, b in zip(found, expected, strict=True):
+    result, expected = (jax.tree.leaves(compute_outputs_and_gradients(apply)) for apply in (apply_distributed, mlp))
+    for a, b in zip(result, expected, strict=True):
         assert np.linalg.norm(a - b) < 3e-3 * np.linalg.norm(b)  # 11 bits
 
 
@@ -127,10 +127,10 @@ def test_gradients_that_grow_through_large_weights_are_finite(on_host):
     """The gradient is multiplied by 12 up to the 32 units, by 1,536 up to the 48: a tenth of the range of 16 bits."""
     layers = [(jnp.full(w.shape[1:], 4.0), jnp.zeros(b.shape[1:])) for w, b in networks((13, 48, 32, 3), 1)]
     x = jnp.zeros((5, 13))
-    found, expected = (
+    result, expected = (
         jax.vjp(lambda layers, f=f: f(layers, x), layers)[1](jnp.ones((5, 3)))[0] for f in (apply_mlp, mlp)
     )
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=3e-3)
 
 

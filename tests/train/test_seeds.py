@@ -69,11 +69,11 @@ def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters
         for name, x in block_observations(separate[i].env, 0).items():
             np.testing.assert_allclose(block_observations(joint.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
     policies = joint.as_policy()
-    found = evaluate_blocks(make("hover", 16, **SHORT_EPISODES), Policies(policies), n_blocks=2)
+    result = evaluate_blocks(make("hover", 16, **SHORT_EPISODES), Policies(policies), n_blocks=2)
     for i in range(2):
         expected = evaluate(make("hover", 8, **SHORT_EPISODES), take_seed(policies, i))
         for name, x in expected.items():
-            np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
+            np.testing.assert_allclose(result[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_the_random_numbers_of_a_block_depend_only_on_its_key():

@@ -517,10 +517,10 @@ class ConstantPolicy(PyTree):
 def test_evaluation_uses_tolerance_and_hold_of_the_task():
     """A policy of zeros hovers at its start, so it fails unless the goal is there."""
     idle, falling = ConstantPolicy(jnp.zeros(4)), ConstantPolicy(-jnp.ones(4))
-    found = evaluate(make("hover", 16, seconds=2.0, reach=1.0), idle)
-    assert found["success"] == 0
-    assert 0.3 < found["error"] < 3
-    assert found["crashed"] < 1
+    result = evaluate(make("hover", 16, seconds=2.0, reach=1.0), idle)
+    assert result["success"] == 0
+    assert 0.3 < result["error"] < 3
+    assert result["crashed"] < 1
     easy = make("hover", 16, seconds=2.0, reach=1e-3, tolerance=1e3)
     assert evaluate(easy, idle)["success"] == 1
     # A crash is no success, however small the error was.

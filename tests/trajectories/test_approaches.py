@@ -33,11 +33,11 @@ def test_distances_agree_with_dense_samples(seed, n_drones):
         for n in rng.integers(2, 6, n_drones)
     ]
     table = PieceTable.create(trajectories, rng.uniform(0, 3, n_drones))
-    found = closest_approaches(table, TOLERANCE)
-    assert sorted(x.drones for x in found) == [(i, j) for i in range(n_drones) for j in range(i + 1, n_drones)]
-    assert [x.distance for x in found] == sorted(x.distance for x in found)
+    result = closest_approaches(table, TOLERANCE)
+    assert sorted(x.drones for x in result) == [(i, j) for i in range(n_drones) for j in range(i + 1, n_drones)]
+    assert [x.distance for x in result] == sorted(x.distance for x in result)
     times = np.linspace(0, table.duration, 20_001)
-    for x in found:
+    for x in result:
         assert x.distance <= distances(table, *x.drones, times).min() + TOLERANCE
         np.testing.assert_allclose(x.distance, distances(table, *x.drones, np.array([x.time]))[0], rtol=1e-12)
 
@@ -111,6 +111,6 @@ def test_blocks_and_tables_do_not_change_the_result(table, seed, monkeypatch):
     expected = closest_approaches(pieces)
     monkeypatch.setattr(approaches, "MAX_TABLE_CELLS", table)
     monkeypatch.setattr(approaches, "CELLS_PER_BATCH", 7)
-    found = closest_approaches(pieces)
-    assert [x.drones for x in found] == [x.drones for x in expected]
-    np.testing.assert_allclose([x.distance for x in found], [x.distance for x in expected], atol=TOLERANCE)
+    result = closest_approaches(pieces)
+    assert [x.drones for x in result] == [x.drones for x in expected]
+    np.testing.assert_allclose([x.distance for x in result], [x.distance for x in expected], atol=TOLERANCE)

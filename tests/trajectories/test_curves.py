@@ -22,8 +22,8 @@ def check_curve(trajectory, curve, duration, scale=1.0):
     np.testing.assert_allclose(trajectory.duration, duration, rtol=1e-12)
     t = np.linspace(0.01, 0.99, 500) * duration
     s = evaluate(trajectory, t)
-    found = np.concatenate([s.pos, s.yaw], axis=-1)
-    assert np.abs(found - curve(t)).max() < 1e-5
+    result = np.concatenate([s.pos, s.yaw], axis=-1)
+    assert np.abs(result - curve(t)).max() < 1e-5
     h = 1e-5 * duration
     np.testing.assert_allclose(s.vel, (curve(t + h) - curve(t - h))[:, :3] / (2 * h), atol=1e-3 * scale)
     h = 1e-3 * duration

@@ -31,9 +31,9 @@ def test_peaks_agree_with_dense_samples(seed):
         for n in rng.integers(2, 7, 3)
     ]
     table = PieceTable.create(trajectories, rng.uniform(0, 2, 3))
-    found = find_peaks(table, [name for name in QUANTITIES if name != "body_rate"])
+    result = find_peaks(table, [name for name in QUANTITIES if name != "body_rate"])
     times = np.linspace(0, table.duration, 20_001)[:-1]
-    for name, peak in found.items():
+    for name, peak in result.items():
         quantity = QUANTITIES[name]
         for k in range(3):
             derivatives = [table.evaluate(np.full(len(times), k), times, order) for order in quantity.orders]
@@ -62,10 +62,10 @@ def test_peaks_by_hand():
     """Derivatives at the start, largest there or constant: 3-4-5 triangles, and 0.75 g sideways."""
     g = 9.81
     moving = fly_from_derivatives([0, 0, 1, 0], [3, 0, -4, -0.5])
-    found = check(moving, Limits()).peaks
+    result = check(moving, Limits()).peaks
     for name, value in (("speed", 5), ("horizontal_speed", 3), ("vertical_speed", 4), ("yaw_rate", 0.5), ("height", 1)):
-        np.testing.assert_allclose(found[name].value, [value], rtol=1e-6)
-    np.testing.assert_allclose(found["body_rate"].value, [0.5], rtol=1e-6)  # hover that turns
+        np.testing.assert_allclose(result[name].value, [value], rtol=1e-6)
+    np.testing.assert_allclose(result["body_rate"].value, [0.5], rtol=1e-6)  # hover that turns
     pushed = check(fly_from_derivatives([0] * 4, [0] * 4, [3 * g / 4, 0, 0, 0]), Limits()).peaks
     np.testing.assert_allclose(pushed["acceleration"].value, [0.75 * g], rtol=1e-6)
     np.testing.assert_allclose([pushed["thrust"].value[0], pushed["min_thrust"].value[0]], 1.25, rtol=1e-6)
@@ -113,8 +113,8 @@ def test_every_limit_can_be_exceeded():
         fly_straight([0, 0, 1], [1, 0, 1], 1.0),
     ]
     tight = Limits(0.1, 0.1, 0.1, 0.1, 0.1, 1.01, 0.99, 0.1, 0.1, 0.7, 0.5, floor=0.6)
-    found = {violation.limit for violation in check(wild, tight).violations}
-    assert found == set(tight.as_dict())
+    result = {violation.limit for violation in check(wild, tight).violations}
+    assert result == set(tight.as_dict())
     loose = Limits(*[1000.0] * 6, 1e-3, 1000.0, 1000.0, 1000.0, 1e-9)
     assert check([wild[0], wild[0].moved([9, 0, 0])], loose).ok
 

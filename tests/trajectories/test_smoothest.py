@@ -34,8 +34,8 @@ def test_float32_is_as_accurate_as_documented(n):
     trajectory, _ = jax.jit(smoothest)(jnp.float32(waypoints), jnp.float32(durations))
     expected = minimum_snap(waypoints, durations)
     u = np.linspace(0, 1, 21)[:, None] ** np.arange(8)
-    found, exact = (np.asarray(t.coefficients) @ u.T for t in (trajectory, expected))
-    np.testing.assert_allclose(found, exact, atol=4e-3)  # 1e-3 of 4 m
+    result, exact = (np.asarray(t.coefficients) @ u.T for t in (trajectory, expected))
+    np.testing.assert_allclose(result, exact, atol=4e-3)  # 1e-3 of 4 m
 
 
 def test_gradients_equal_differences(x64):

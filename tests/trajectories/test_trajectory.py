@@ -95,11 +95,11 @@ def test_stacked_trajectories_keep_their_setpoints_within_and_beyond_their_ends(
         end = durations.sum()
         t = np.concatenate([np.linspace(-1, end + 2, 50), [end, np.nextafter(end, 0), np.nextafter(end, 9e9)]])
         from_stack = jax.tree.map(lambda x, k=k: np.asarray(x)[k], stacked)
-        expected, found = (evaluate(x, t) for x in (trajectory, from_stack))
+        expected, result = (evaluate(x, t) for x in (trajectory, from_stack))
         inside = (t < end - 1e-9) | (t > end + 1e-9) | (k == 1)  # at the end itself padding is already at rest
-        for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(result), strict=True):
             np.testing.assert_allclose(x[inside], y[inside], atol=1e-9)
-        np.testing.assert_allclose(expected.pos, found.pos, atol=1e-9)
+        np.testing.assert_allclose(expected.pos, result.pos, atol=1e-9)
 
 
 def test_then_appends_a_trajectory():
@@ -230,12 +230,12 @@ def test_coefficients_that_are_not_finite_are_refused():
 def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
     trajectory = Trajectory.of_pieces(*random_pieces(n_pieces=20))
     times = np.linspace(-0.5, float(trajectory.duration) + 0.5, 60)
-    found = np.asarray(jax.jit(jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order))))(times))
+    result = np.asarray(jax.jit(jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order))))(times))
     setpoints = evaluate(trajectory, times)
-    assert found.shape == (60, order + 1, 4)
+    assert result.shape == (60, order + 1, 4)
     for k in range(order + 1):
-        np.testing.assert_allclose(found[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(found[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(result[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(result[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)
 
 
 EIGHT, UP = figure_eight(), line([0, 0, 0], [0, 0, 1], 2.0)

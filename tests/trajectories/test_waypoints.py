@@ -86,8 +86,8 @@ def coefficients_by_kkt(waypoints, durations, order, velocity):
             add_constraint([(1, derivative_rows(0.0, size)[1])], velocity[axis])
         a = np.array(rows)
         system = np.block([[cost, a.T], [a, np.zeros((len(a), len(a)))]])
-        found = np.linalg.lstsq(system, np.concatenate([np.zeros(len(cost)), right]), rcond=None)[0]
-        solution[:, axis] = found[: n * size].reshape(n, size)
+        result = np.linalg.lstsq(system, np.concatenate([np.zeros(len(cost)), right]), rcond=None)[0]
+        solution[:, axis] = result[: n * size].reshape(n, size)
     return solution
 
 
@@ -112,8 +112,8 @@ def test_sixty_pieces_equal_the_spline_of_scipy(method, x64):
     table = PieceTable.create([method(waypoints, durations)])
     for k in range(3):
         values = expected.derivative(k)(times) if k else expected(times)
-        found = table.evaluate(np.zeros(500, int), times, k)[:, :3]
-        np.testing.assert_allclose(found, values, atol=1e-8 * np.abs(values).max())
+        result = table.evaluate(np.zeros(500, int), times, k)[:, :3]
+        np.testing.assert_allclose(result, values, atol=1e-8 * np.abs(values).max())
 
 
 @settings(max_examples=10)
@@ -200,12 +200,12 @@ def test_yaw_turns_the_shorter_way_and_ends_at_rest(x64):
 
 def deviations(trajectory, waypoints):
     """Return the largest distance of each piece from its line segment, m."""
-    table, found = PieceTable.create([trajectory]), []
+    table, result = PieceTable.create([trajectory]), []
     for p, (a, b) in enumerate(pairwise(waypoints)):
         pos = table.evaluate_pieces(np.full(2001, p), np.linspace(0, 1, 2001))[:, :3]
         part = np.clip((pos - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
-        found.append(np.linalg.norm(pos - a - part[:, None] * (b - a), axis=-1).max())
-    return np.array(found)
+        result.append(np.linalg.norm(pos - a - part[:, None] * (b - a), axis=-1).max())
+    return np.array(result)
 
 
 @settings(max_examples=15)
@@ -216,8 +216,8 @@ def test_flights_stay_in_their_corridors(method, seed, n, radius):
     waypoints = rng.uniform(-2, 2, (n, 3))
     radii = radius * rng.uniform(0.5, 1.5, n - 1)
     trajectory = method(waypoints, rng.uniform(0.5, 2.0, n - 1), corridors=radii)
-    found = deviations(trajectory, waypoints)
-    assert np.all(found <= radii + 1e-5)
+    result = deviations(trajectory, waypoints)
+    assert np.all(result <= radii + 1e-5)
 
 
 def test_a_wide_corridor_changes_nothing_and_a_single_piece_may_be_bounded():
@@ -232,7 +232,7 @@ def test_a_wide_corridor_changes_nothing_and_a_single_piece_may_be_bounded():
 def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     """Two pieces in a plane; SciPy minimises the same cost, with a bound on the distances at 61 times of each piece."""
     waypoints, durations, radius = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1.0]]), np.array([1.0, 1.0]), 0.05
-    found = pieces(minimum_snap(waypoints, durations, corridors=radius))
+    result = pieces(minimum_snap(waypoints, durations, corridors=radius))
 
     def coefficients(x):
         """Return both pieces for velocity, acceleration and jerk in x and y at the second waypoint."""
@@ -266,7 +266,7 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     min_cost = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
     free = cost(pieces(minimum_snap(waypoints, durations))[:, :2])
     assert free < 0.7 * min_cost  # the corridor matters
-    np.testing.assert_allclose(cost(found[:, :2]), min_cost, rtol=3e-3)
+    np.testing.assert_allclose(cost(result[:, :2]), min_cost, rtol=3e-3)
 
 
 def test_coincident_waypoints_are_allowed_with_durations():

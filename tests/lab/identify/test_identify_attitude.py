@@ -48,14 +48,14 @@ def test_names_of_crazyflow_find_the_parameters(flight):
     data |= {"quat": stack_columns(flight, "qx", "qy", "qz", "qw")}
     data |= {"cmd_rpy": stack_columns(flight, "roll_command", "pitch_command", "yaw_command")}
     log, airframe = derivatives_svf(preprocessing(data)), load_airframe("cf2x_L250")
-    found = sys_id_translation(MODEL, float(airframe.value("rigid_body.mass")), log)
+    result = sys_id_translation(MODEL, float(airframe.value("rigid_body.mass")), log)
     true = {key: airframe.value(f"fitted.{MODEL}.{key}") for key in ("cmd_f_coef", "thrust_dyn_coef")}
     drag = airframe.value(f"fitted.{MODEL}.drag_coefficients")
-    assert found["cmd_f_coef"] == pytest.approx(true["cmd_f_coef"], rel=0.005)
+    assert result["cmd_f_coef"] == pytest.approx(true["cmd_f_coef"], rel=0.005)
     # Products of attitude, thrust and velocity are formed after the filter. This biases lag and drag by less than 1%.
-    assert found["thrust_dyn_coef"] == pytest.approx(true["thrust_dyn_coef"], rel=0.01)
-    assert found["drag_xy_coef"] == pytest.approx(drag[0], rel=0.01)
-    assert found["drag_z_coef"] == pytest.approx(drag[2], rel=0.01)
+    assert result["thrust_dyn_coef"] == pytest.approx(true["thrust_dyn_coef"], rel=0.01)
+    assert result["drag_xy_coef"] == pytest.approx(drag[0], rel=0.01)
+    assert result["drag_z_coef"] == pytest.approx(drag[2], rel=0.01)
     rotation = sys_id_rotation(log)
     for key, x in rotation.items():
         np.testing.assert_allclose(x, airframe.value(f"fitted.{MODEL}.{key}"), rtol=0.01, err_msg=key)
@@ -127,8 +127,8 @@ def test_outliers_are_interpolated_and_fast_turns_are_not():
 
 def test_filter_keeps_slow_signals_and_their_derivatives():
     t = np.arange(0, 6, 0.01)
-    found = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)
+    result = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)
     inner = slice(100, -100)
     # Twice a Butterworth low-pass at 1/19 of its cutoff: flat to (1/19)^8; linear interpolation costs 4e-5.
-    for x, true in zip(found, (np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)), strict=True):
+    for x, true in zip(result, (np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)), strict=True):
         np.testing.assert_allclose(x[inner], true[inner], atol=1e-3)

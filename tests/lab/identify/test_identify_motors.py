@@ -24,7 +24,7 @@ def test_voltage_and_lag_give_the_speeds():
     """A step of the commands in the middle, at 3.8 V, against a fine integration of the airframe's equation."""
     airframe = load_airframe(AIRFRAME)
     command = np.where(np.arange(N) < N // 2, 0.6, 0.7)
-    found = with_speeds(create_log(np.tile(command[:, None], 4), np.full(N, 3.8)), airframe)
+    result = with_speeds(create_log(np.tile(command[:, None], 4), np.full(N, 3.8)), airframe)
     low, high = (airframe.rotor_vel(np.polyval(airframe.value("battery.thrust_over_voltage")[::-1], 3.8 * x))
                  for x in (0.6, 0.7))  # fmt: skip
     a, b, _, _ = airframe.value("rotors.lag")
@@ -34,28 +34,28 @@ def test_voltage_and_lag_give_the_speeds():
         if k % 200 == 199:
             fine_speeds.append(speed)
     middle = N // 2 - 100
-    np.testing.assert_allclose(found.rotor_vel[:middle, 0], np.ravel(low)[0], rtol=1e-4)
-    np.testing.assert_allclose(found.rotor_vel[middle + 1 : middle + 21, 0], fine_speeds, rtol=1e-3)
-    assert "modelled" in found.repairs[0]
+    np.testing.assert_allclose(result.rotor_vel[:middle, 0], np.ravel(low)[0], rtol=1e-4)
+    np.testing.assert_allclose(result.rotor_vel[middle + 1 : middle + 21, 0], fine_speeds, rtol=1e-3)
+    assert "modelled" in result.repairs[0]
 
 
 def test_rotors_that_need_more_command_pull_the_same():
     command = np.tile([0.6, 0.63, 0.6, 0.66], (N, 1))
     command[50, 2] = -9.9
-    found = with_speeds(create_log(command, np.full(N, 3.8)), load_airframe(AIRFRAME))
-    np.testing.assert_allclose(found.rotor_vel, found.rotor_vel[:, :1] * np.ones(4), rtol=1e-5)
-    assert "interpolated 1 commands" in found.repairs[1]
+    result = with_speeds(create_log(command, np.full(N, 3.8)), load_airframe(AIRFRAME))
+    np.testing.assert_allclose(result.rotor_vel, result.rotor_vel[:, :1] * np.ones(4), rtol=1e-5)
+    assert "interpolated 1 commands" in result.repairs[1]
 
 
 def test_samples_on_the_ground_are_left_out():
     command = np.full((N, 4), 0.6)
     command[:200] = command[-100:] = 0.1
-    found = with_speeds(
+    result = with_speeds(
         replace(create_log(command, np.full(N, 3.8)), gaps=np.array([50, 400])), load_airframe(AIRFRAME)
     )
-    assert (found.t[0], found.t[-1]) == pytest.approx((200 * DT + 1, (N - 102) * DT - 1))
-    assert found.gaps.tolist() == [100]
-    assert len(found.pos) == len(found.rotor_vel) == len(found.t)
+    assert (result.t[0], result.t[-1]) == pytest.approx((200 * DT + 1, (N - 102) * DT - 1))
+    assert result.gaps.tolist() == [100]
+    assert len(result.pos) == len(result.rotor_vel) == len(result.t)
 
 
 def test_measured_speeds_stay_and_commands_in_other_units_are_refused():
@@ -75,7 +75,7 @@ def test_lag_is_found_behind_noise_and_delay(rate):
     t, response = DT * np.arange(N), lag_signal(command, DT, rate)
     speeds = np.stack([np.interp(t - 0.012, t, x) for x in (8000 + 9000 * response + 6000 * response**2).T], axis=-1)
     speeds += rng.normal(scale=0.1 * speeds.std(), size=speeds.shape)
-    found = motor_lag([create_log(command, rotor_vel=speeds), create_log(command)])
-    assert found.shape == (1, 4)
-    np.testing.assert_allclose(np.median(found), rate, rtol=0.04)
+    result = motor_lag([create_log(command, rotor_vel=speeds), create_log(command)])
+    assert result.shape == (1, 4)
+    np.testing.assert_allclose(np.median(result), rate, rtol=0.04)
     assert np.all(np.isnan(motor_lag([replace(create_log(command, rotor_vel=1e4 * command))])))

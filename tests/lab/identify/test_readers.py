@@ -53,10 +53,10 @@ def test_angles_after_a_sample_that_is_missing_are_kept():
     logged[20] = 1e30
     table = {"x": angle, "y": angle, "z": angle, "roll": 0 * angle, "pitch": 0 * angle, "yaw": logged}
     columns = Columns(rpy=("roll", "pitch", "yaw"), rad_per_angle=np.pi / 180)
-    found = resample("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
-    is_missing = np.isnan(found)
+    result = resample("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
+    is_missing = np.isnan(result)
     assert 0 < np.sum(is_missing) < 3
-    np.testing.assert_allclose(found[~is_missing], angle[: len(found)][~is_missing], atol=1e-6)
+    np.testing.assert_allclose(result[~is_missing], angle[: len(result)][~is_missing], atol=1e-6)
 
 
 def test_compressed_attitudes_are_unpacked():
@@ -66,9 +66,9 @@ def test_compressed_attitudes_are_unpacked():
     unit = np.sqrt(0.5) / 511
     expected = np.array([[255, -511, 0, 511], [0, -100, 1, 0]]) * unit
     expected[0, 2], expected[1, 3] = 0.0, np.sqrt(1 - (100**2 + 1) * unit**2)
-    found = decompress_quat(np.array(packed, np.uint32))
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
-    np.testing.assert_allclose(found[0, [0, 1, 3]], expected[0, [0, 1, 3]], atol=1e-12)
+    result = decompress_quat(np.array(packed, np.uint32))
+    np.testing.assert_allclose(result[1], expected[1], atol=1e-12)
+    np.testing.assert_allclose(result[0, [0, 1, 3]], expected[0, [0, 1, 3]], atol=1e-12)
 
 
 def test_a_malformed_interval_is_refused(tmp_path, capsys):

@@ -437,6 +437,6 @@ def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
                 np.testing.assert_allclose(measured.field, rotation.T @ MAGNETIC_FIELD, atol=1e-10)
                 np.testing.assert_allclose(measured.ang_vel, states.ang_vel[k, 0])
                 if has_measured:
-                    found = np.concatenate([measured.gyro, measured.accel])
+                    result = np.concatenate([measured.gyro, measured.accel])
                     value = np.asarray(aligned.read(sim.data).samples.value)[k, 0]
-                    np.testing.assert_allclose(found, value, atol=1e-5)
+                    np.testing.assert_allclose(result, value, atol=1e-5)

@@ -69,10 +69,10 @@ PUBLIC = "DAMHBQYFDQwACAAA/zIKMgj/AAAyCjIIAP8AMgoyCP//ADIKMggA//8yCjII/wD/MgoyCz
 
 def test_a_public_light_program_gives_its_colours():
     lights = Lights.stack([decode_lights(PUBLIC, 20.0)])
-    found = lights.colors([0.05, 0.15, 0.25, 0.6, 1.1, 1.6, 3.1, 3.6, 13.6, 14.6])[:, 0]
+    result = lights.colors([0.05, 0.15, 0.25, 0.6, 1.1, 1.6, 3.1, 3.6, 13.6, 14.6])[:, 0]
     blue, red = (0, 0, 1), (1, 0, 0)
     expected = [WHITE, BLACK, WHITE, BLACK, (0, 0, 0.5), blue, (0.5, 0, 0), red, WHITE, BLACK]
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(result, expected, atol=1e-4)
 
 
 WRONG_PROGRAMS = {

@@ -171,9 +171,9 @@ def test_a_report_lists_distances_and_durations(flight):
 
 
 def test_collisions_are_listed(flight):
-    (found,) = collisions(flight)
-    assert found["drones"] == ["a", "b"]
-    assert 0.5 < found["time"] < 1.4
+    (result,) = collisions(flight)
+    assert result["drones"] == ["a", "b"]
+    assert 0.5 < result["time"] < 1.4
     text = summary(flight, report(flight))
     assert "a and b" in text
     assert "1 of 3 pairs closer than the show's 0.3 m" in text

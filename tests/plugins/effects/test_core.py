@@ -164,10 +164,10 @@ def test_law_01_a_stage_computes_the_same_for_one_and_for_all(sim_with_effects, 
         expected = jax.tree.map(select, scopes(flight_data), all_at_once)
         if name == "downwash":  # a single drone has no neighbours
             world = jax.tree.map(lambda scope, x, w=index[0]: at_world(scope, x, w), scopes(flight_data), flight_data)
-            found = jax.tree.map(lambda x, k=index[1]: x[k], on_host(apply_to_world(world)))
+            result = jax.tree.map(lambda x, k=index[1]: x[k], on_host(apply_to_world(world)))
         else:
-            found = apply_to_one(jax.tree.map(select, scopes(flight_data), flight_data))
-        for x, y in zip(*map(jax.tree.leaves, (expected, found)), strict=True):
+            result = apply_to_one(jax.tree.map(select, scopes(flight_data), flight_data))
+        for x, y in zip(*map(jax.tree.leaves, (expected, result)), strict=True):
             if jnp.issubdtype(y.dtype, jnp.floating):
                 # float32: one drone's arithmetic is fused in another way
                 np.testing.assert_allclose(y, x, rtol=1e-4, atol=1e-5)
@@ -240,12 +240,12 @@ def test_a_reset_restores_the_records_of_its_worlds_only(sim_with_effects):
     sim.reset(mask)
     drawn, default = sim.data.plugins, dict(sim.default_data.plugins)
     for name, fields in (("randomize", ("factors", "thrust_factors", "air_vel")), ("wind_field", ("shift",))):
-        found = {field: getattr(drawn[name], field) for field in fields}
-        changed = np.asarray(found[fields[0]]) != np.asarray(getattr(before_reset[name], fields[0]))
+        result = {field: getattr(drawn[name], field) for field in fields}
+        changed = np.asarray(result[fields[0]]) != np.asarray(getattr(before_reset[name], fields[0]))
         np.testing.assert_array_equal(
             changed[..., 0], np.broadcast_to(mask[:, None], (3, 2)), f"{name}: drawn at resets"
         )
-        default[name] = default[name].replace(**found)
+        default[name] = default[name].replace(**result)
     pairs = zip(*map(jax.tree.leaves, (scopes(before_reset), before_reset, sim.data.plugins, default)), strict=True)
     for scope, before, after, default in pairs:
         if scope == "drone":

@@ -18,14 +18,14 @@ def test_interpolation_is_that_of_numpy_axis_by_axis(rng):
         plane = np.apply_along_axis(lambda v, x=p[0]: np.interp(x, np.arange(4), v), 0, values)
         line = np.apply_along_axis(lambda v, y=p[1]: np.interp(y, np.arange(5), v), 0, plane)
         expected.append(np.interp(p[2], np.arange(3), line))
-    found = jax.jit(interpolate)(np.float32(values), np.float32(points))
-    np.testing.assert_allclose(found, expected, atol=3e-6)  # float32, eight products
+    result = jax.jit(interpolate)(np.float32(values), np.float32(points))
+    np.testing.assert_allclose(result, expected, atol=3e-6)  # float32, eight products
 
 
 def test_vectors_and_axes_of_one_node(rng):
     values = rng.normal(size=(1, 4, 1, 3))
-    found = jax.jit(interpolate)(values, np.array([[0.3, 1.25, -2.0], [0.0, 3.0, 0.0]]))
-    np.testing.assert_allclose(found, [0.75 * values[0, 1, 0] + 0.25 * values[0, 2, 0], values[0, 3, 0]], rtol=1e-6)
+    result = jax.jit(interpolate)(values, np.array([[0.3, 1.25, -2.0], [0.0, 3.0, 0.0]]))
+    np.testing.assert_allclose(result, [0.75 * values[0, 1, 0] + 0.25 * values[0, 2, 0], values[0, 3, 0]], rtol=1e-6)
 
 
 def test_law_08_gradients_are_the_slopes_of_the_cell_and_zero_outside(x64, rng):
@@ -41,8 +41,8 @@ def test_law_08_gradients_are_the_slopes_of_the_cell_and_zero_outside(x64, rng):
 
 @pytest.mark.parametrize("y", [np.nan, np.inf, -np.inf, 1e30])
 def test_law_07_positions_that_are_not_finite_read_no_memory_beyond_the_grid(y):
-    found = jax.jit(interpolate)(np.ones((3, 3, 3)), np.array([1.0, y, 1.0]))
-    np.testing.assert_array_equal(found, np.nan if np.isnan(y) else 1.0)
+    result = jax.jit(interpolate)(np.ones((3, 3, 3)), np.array([1.0, y, 1.0]))
+    np.testing.assert_array_equal(result, np.nan if np.isnan(y) else 1.0)
 
 
 def test_inside_is_the_box_of_the_nodes():

@@ -91,10 +91,10 @@ def test_rotors_fail_at_random_at_their_rate():
     sim.step(20)
     early = effectiveness(sim)
     sim.step(30)
-    for steps, found in ((20, early), (50, effectiveness(sim))):
+    for steps, result in ((20, early), (50, effectiveness(sim))):
         working = np.exp(-np.array([0.0, 5.0, 20.0, 5.0]) * steps * DT)
         # four standard errors of a binomial fraction
-        np.testing.assert_array_less(np.abs((found == 1).mean(axis=(0, 1)) - working), 4 * np.sqrt(0.25 / n))
+        np.testing.assert_array_less(np.abs((result == 1).mean(axis=(0, 1)) - working), 4 * np.sqrt(0.25 / n))
     assert np.all(effectiveness(sim) <= early)
     assert set(np.unique(effectiveness(sim))) == {0.0, 1.0}
     pairs = (effectiveness(sim)[:, 0, 1] == 1) & (effectiveness(sim)[:, 0, 3] == 1)

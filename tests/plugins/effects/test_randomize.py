@@ -79,8 +79,8 @@ def test_factors_act_as_changed_parameters(thousand_worlds):
     np.testing.assert_array_equal(random_plugin.read(random_sim.data).factors, record.factors)
     for name in ("pos", "vel", "ang_vel", "rotor_vel"):
         # float32 over 20 steps
-        found, expected = (np.asarray(getattr(x.data.states, name)) for x in (random_sim, changed_sim))
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5, err_msg=name)
+        result, expected = (np.asarray(getattr(x.data.states, name)) for x in (random_sim, changed_sim))
+        np.testing.assert_allclose(result, expected, rtol=1e-4, atol=2e-5, err_msg=name)
     assert random_sim.data.params.mass.shape == (1,)
 
 

@@ -112,8 +112,8 @@ def test_a_ceiling_gives_thrust_by_mass_momentum_and_energy():
     """The far wake solves ``rho A v v_w = T - rho A v^2 (R / d)^2 / 16`` and ``T = rho A v_w^2 / 2`` at v = 1."""
     for gap in (0.1 * R, R, 5 * R):
         wake = max(np.roots([0.5, -1.0, -((R / gap) ** 2) / 16]))
-        found = float(inflow.ceiling_factor(np.float64(gap), np.float64(R)))
-        np.testing.assert_allclose(found, wake / 2, rtol=1e-5)
+        result = float(inflow.ceiling_factor(np.float64(gap), np.float64(R)))
+        np.testing.assert_allclose(result, wake / 2, rtol=1e-5)
     assert inflow.ceiling_factor(np.float64(-1.0), R) == 1.0, "a rotor above it is in free air"
 
 

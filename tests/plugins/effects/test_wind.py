@@ -107,9 +107,9 @@ def test_gusts_have_the_correlation_in_time_of_dryden(samples):
     for i, lag in enumerate(LAGS):
         x = airspeed * lag / 20 / length
         expected = np.exp(-x) * np.array([1, 1 - x[1] / 2, 1 - x[2] / 2])
-        found = np.mean(samples[0] * samples[i], axis=0) / np.mean(samples[0] ** 2, axis=0)
+        result = np.mean(samples[0] * samples[i], axis=0) / np.mean(samples[0] ** 2, axis=0)
         # four standard errors of a correlation of N pairs; the trapezoidal rule's step of 0.033 adds less than 3e-4
-        np.testing.assert_allclose(found, expected, atol=4 / np.sqrt(N))
+        np.testing.assert_allclose(result, expected, atol=4 / np.sqrt(N))
     assert np.exp(-x[2]) - expected[2] > 3 * 4 / np.sqrt(N), "a filter of first order would fail"
 
 
@@ -168,8 +168,8 @@ def test_profiles_by_hand():
     """ln(3.048 / 0.04572) / ln(6.096 / 0.04572) at 10 ft, Category C; (10 / 80)^0.2 of a turbine's hub."""
     one = np.ones(1, np.float32)
     heights = np.float32([[3.048], [6.096], [0.04572], [0.01], [-1.0]])
-    found = np.asarray(jax.jit(wind.log_profile)(heights, 6.096 * one, 0.04572 * one))
-    np.testing.assert_allclose(found[:, 0], [0.85834, 1, 0, 0, 0], atol=1e-5)
+    result = np.asarray(jax.jit(wind.log_profile)(heights, 6.096 * one, 0.04572 * one))
+    np.testing.assert_allclose(result[:, 0], [0.85834, 1, 0, 0, 0], atol=1e-5)
     np.testing.assert_allclose(wind.power_profile(10 * one, 80 * one, 0.2 * one), 0.65975, atol=1e-5)
     for slope in (
         jax.grad(lambda z: wind.log_profile(z, 6.0, 0.05).sum()),

@@ -49,16 +49,16 @@ def test_law_10_displacements_depend_on_world_and_episode():
         sim.step(3)
         shifts.append(np.asarray(sim.data.plugins["wind_field"].shift))
     np.testing.assert_array_equal(shifts[0], shifts[1][:2])
-    found = shifts[1]
-    np.testing.assert_array_equal(found[:, 0], found[:, 1])
-    assert len(np.unique(found[:, 0, 0])) == 4
-    assert 0.05 < np.abs(found[..., 1]).max() <= 2
-    assert not found[..., 2].any()
+    result = shifts[1]
+    np.testing.assert_array_equal(result[:, 0], result[:, 1])
+    assert len(np.unique(result[:, 0, 0])) == 4
+    assert 0.05 < np.abs(result[..., 1]).max() <= 2
+    assert not result[..., 2].any()
     sim.reset(np.array([True, False, False, False]))
     sim.step(2)
     redrawn = np.asarray(sim.data.plugins["wind_field"].shift)
-    np.testing.assert_array_equal(redrawn[1:], found[1:])
-    assert not np.isclose(redrawn[0], found[0]).all(axis=-1).any()
+    np.testing.assert_array_equal(redrawn[1:], result[1:])
+    assert not np.isclose(redrawn[0], result[0]).all(axis=-1).any()
 
 
 def test_displacements_follow_the_setting_spread():
@@ -122,10 +122,10 @@ def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
         return jnp.sum(data.states.vel * np.array([1.0, 2.0, 3.0]))
 
     start, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
-    found = np.asarray(end(start)[1])
+    result = np.asarray(end(start)[1])
     central = [float(end(start + h * e)[0] - end(start - h * e)[0]) / (2 * h) for e in np.eye(3)]
     assert np.abs(central).max() > 1e-3
-    np.testing.assert_allclose(found[0, 0], central, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(result[0, 0], central, rtol=1e-5, atol=1e-9)
 
 
 def test_other_velocities_compile_nothing():

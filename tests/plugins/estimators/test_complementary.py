@@ -16,11 +16,11 @@ from crazysim.plugins.sensors import IMU
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
 def test_the_filter_agrees_with_the_compiled_firmware(kind):
     """In 2,000 steps of 1 ms, except for the rounding of 500 updates in float32."""
-    found, recorded = firmware_filters.complementary_states(kind)
+    result, recorded = firmware_filters.complementary_states(kind)
     assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved in the recording"
-    np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
-    np.testing.assert_allclose(found[:, 4], recorded[:, 4], rtol=0, atol=5e-6)
-    np.testing.assert_allclose(found[:, 5], recorded[:, 5], rtol=0, atol=5e-4)  # differences over 10 ms
+    np.testing.assert_allclose(result[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(result[:, 4], recorded[:, 4], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(result[:, 5], recorded[:, 5], rtol=0, atol=5e-4)  # differences over 10 ms
 
 
 def fly(estimator, n_worlds=4, engine="auto", seconds=2.0):

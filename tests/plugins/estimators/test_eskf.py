@@ -53,9 +53,9 @@ def estimate(x64):
     """Return an estimate in motion, with a full covariance."""
     quat = jnp.array([0.3, -0.2, 0.4, 0.8])
     pos, vel, bias = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
-    found = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, bias, 0.1 * bias)
+    result = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, bias, 0.1 * bias)
     root = np.random.default_rng(1).normal(size=(15, 15))
-    return found.replace(cov=jnp.asarray(0.01 * root @ root.T)[np.triu_indices(15)])
+    return result.replace(cov=jnp.asarray(0.01 * root @ root.T)[np.triu_indices(15)])
 
 
 def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
@@ -120,9 +120,9 @@ def test_updates_have_the_gain_of_the_derivatives_of_the_measurement(estimate, k
     h = jax.jit(jax.jacfwd(lambda e: MEASURED[kind](add_error(estimate, e), rot)))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
     gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + variance)
-    found = error_of(error_state.finalize(after, min_angle=0.0), estimate)
+    result = error_of(error_state.finalize(after, min_angle=0.0), estimate)
     # rounding of float64 and the 1e-6 that the firmware adds to norms
-    np.testing.assert_allclose(found, gain @ error, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(result, gain @ error, rtol=0, atol=1e-11)
     np.testing.assert_allclose(error_state.covariance(after.cov), p - gain @ h @ p, rtol=1e-6, atol=1e-8)
 
 

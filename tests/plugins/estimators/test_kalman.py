@@ -17,11 +17,11 @@ from crazysim.plugins.sensors import IMU, Barometer, MotionCapture, Triad
 @pytest.mark.parametrize("kind", firmware_filters.MEASUREMENT_KINDS)
 def test_the_filter_agrees_with_the_compiled_firmware(kind):
     """In fast flights of 4 s, except for the rounding in float32 of 4,000 loops of 1 ms."""
-    found, recorded = firmware_filters.kalman_states(kind)
+    result, recorded = firmware_filters.kalman_states(kind)
     assert np.ptp(recorded[:, :3], axis=0).max() > (0.01 if kind == "ground" else 1.0), "nothing moved"
-    np.testing.assert_allclose(found[:, :9], recorded[:, :9], rtol=0, atol=2e-4)
-    np.testing.assert_allclose(found[:, 9:13], recorded[:, 9:13], rtol=0, atol=5e-6)
-    np.testing.assert_allclose(found[:, 13:], recorded[:, 13:], rtol=5e-3, atol=5e-8)
+    np.testing.assert_allclose(result[:, :9], recorded[:, :9], rtol=0, atol=2e-4)
+    np.testing.assert_allclose(result[:, 9:13], recorded[:, 9:13], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(result[:, 13:], recorded[:, 13:], rtol=5e-3, atol=5e-8)
 
 
 def test_flow_is_two_updates_from_one_prediction(x64):
@@ -196,8 +196,8 @@ def test_a_task_flies_and_observes_with_one_argument():
     env = make("hover", n_worlds=4, estimator=Kalman([IMU(), MotionCapture(pos=(0.1, 0.0, 0.0))]), engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))
     state = env.step(state, jnp.zeros_like(state.action))
-    found = np.asarray(state.data.plugins["kalman"].estimate.pos - state.data.states.pos)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 0.1, rtol=0, atol=0.01)
+    result = np.asarray(state.data.plugins["kalman"].estimate.pos - state.data.states.pos)
+    np.testing.assert_allclose(np.linalg.norm(result, axis=-1), 0.1, rtol=0, atol=0.01)
     assert env.measure_states is not None
 
 

@@ -131,8 +131,8 @@ def flights():
 
 @pytest.mark.parametrize("case", CASES)
 def test_five_seconds_as_in_mujoco(case, flights):
-    expected, found = flights[case]
-    error = np.linalg.norm(found - expected, axis=-1).max(axis=0)
+    expected, result = flights[case]
+    error = np.linalg.norm(result - expected, axis=-1).max(axis=0)
     swing_width = np.ptp(expected[:, 1] - expected[:, 0], axis=0).max()
     print(f"{case}: drone {error[0]:.1e} m, tip {error[1]:.1e} m; the tip swings over {swing_width:.2f} m")
     assert swing_width > 0.15

@@ -87,16 +87,16 @@ def test_clearance_is_the_distance_of_the_contact_report(half_forest):
     rng = np.random.default_rng(0)
     clearance = jax.jit(forest.clearance)
     clearance_of_drones = jax.jit(vmap_worlds(vmap_drones(lambda d: forest.clearance(d, d.states.pos))))
-    found, expected = [], []
+    result, expected = [], []
     for _ in range(200):
         data = with_states(sim.data, pos=rng.uniform([-10, -13, -1], [18, 9, 7], (3, 2, 3)))
-        found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
+        result.append(clearance(data, data.states.pos + np.float32(ball.pos)))
         expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
     np.testing.assert_array_equal(clearance(data, data.states.pos), clearance_of_drones(data))
-    found, expected = np.array(found), np.array(expected)
-    assert found.min() < 0
-    assert np.mean(found < 4) > 0.5
-    np.testing.assert_allclose(found, np.minimum(expected, 4.0), atol=2e-6)
+    result, expected = np.array(result), np.array(expected)
+    assert result.min() < 0
+    assert np.mean(result < 4) > 0.5
+    np.testing.assert_allclose(result, np.minimum(expected, 4.0), atol=2e-6)
 
 
 def test_clearance_points_away_from_the_nearest_tree(half_forest):

@@ -37,16 +37,16 @@ def test_clearance_is_the_distance_of_the_contact_report(name):
     sim = build(plugin)
     ball = sim.scene.collision_model.drones[0].geoms[0]
     contacts, clearance = jax.jit(sim.scene.contact_fn(floor=False, drones=False)), jax.jit(plugin.clearance)
-    rng, data, found, expected = np.random.default_rng(0), data_at(sim, 7.3), [], []
+    rng, data, result, expected = np.random.default_rng(0), data_at(sim, 7.3), [], []
     pos = plugin.poses(data)[0]
     for _ in range(100):
         near = np.asarray(pos)[:, rng.integers(pos.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
         data = with_states(data, pos=near + rng.normal(0, 0.7, (3, 2, 3)))
-        found.append(clearance(data, data.states.pos + np.float32(ball.pos)))
+        result.append(clearance(data, data.states.pos + np.float32(ball.pos)))
         expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
     limit = plugin.cell if isinstance(plugin, Pillars) else np.inf
-    assert np.min(found) < 0.02
-    np.testing.assert_allclose(found, np.minimum(expected, limit), atol=3e-6)
+    assert np.min(result) < 0.02
+    np.testing.assert_allclose(result, np.minimum(expected, limit), atol=3e-6)
 
 
 @pytest.mark.parametrize("name", KINDS)

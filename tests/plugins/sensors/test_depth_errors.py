@@ -141,17 +141,17 @@ def test_gradients_pass_through_noise_and_lens(wall_images):
 
 
 def test_engines_agree_on_the_images_of_a_step():
-    found = []
+    result = []
     for engine in ("auto", "plain"):
         sim = Sim(2, control="attitude", engine=engine, rng_key=3)
         sim.scene.add("sphere", pos=[1.4, 0.1, 0.9], radius=0.3, mocap=False)
         camera = sim.add(Camera(8, 6, freq=250, noise=StereoNoise(), outputs=("depth", "segmentation")))
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.array([0.0, 0, 1])))
         sim.step(3)
-        found.append(jax.device_get(camera.read(sim.data).images))
-    np.testing.assert_array_equal(found[0]["segmentation"], found[1]["segmentation"])
-    np.testing.assert_allclose(found[0]["depth"], found[1]["depth"], atol=1e-3)  # a step of the resolution
-    assert np.mean(found[0]["depth"] == found[1]["depth"]) > 0.9
+        result.append(jax.device_get(camera.read(sim.data).images))
+    np.testing.assert_array_equal(result[0]["segmentation"], result[1]["segmentation"])
+    np.testing.assert_allclose(result[0]["depth"], result[1]["depth"], atol=1e-3)  # a step of the resolution
+    assert np.mean(result[0]["depth"] == result[1]["depth"]) > 0.9
 
 
 def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inside_of_a_geom_around_it(tmp_path):

@@ -46,9 +46,9 @@ def test_specific_force_is_the_second_derivative_of_the_position(x64):
         ang_vel, ang_acc = (2.0 + 3.0 * t) * axis, 3.0 * axis
         return expected, specific_force(quat(t), acc(t, 0 * r), ang_vel, ang_acc, g, r)
 
-    expected, found = expected_and_found(t)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    assert np.linalg.norm(found - specific_force(quat(t), jnp.zeros(3), 0 * r, 0 * r, g, r)) > 1
+    expected, result = expected_and_found(t)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+    assert np.linalg.norm(result - specific_force(quat(t), jnp.zeros(3), 0 * r, 0 * r, g, r)) > 1
 
 
 def test_accelerations_in_hover_in_a_fall_and_at_rest():
@@ -107,13 +107,13 @@ def test_the_low_pass_has_the_step_response_of_first_order():
     sim, _ = build(IMU(gyro=Triad(bandwidth=20.0)))
     sim.step()
     sim.data = with_states(sim.data, ang_vel=[0, 0, 1.0])
-    found = []
+    result = []
     for _ in range(10):
         sim.data = with_states(sim.data, ang_vel=[0, 0, 1.0])
         sim.step()
-        found.append(read(sim, "gyro")[0, 0, 2])
+        result.append(read(sim, "gyro")[0, 0, 2])
     expected = 1 - np.exp(-2 * np.pi * 20 * np.arange(1, 11) / sim.freq)
-    np.testing.assert_allclose(found, expected, rtol=1e-3)  # drag of one step
+    np.testing.assert_allclose(result, expected, rtol=1e-3)  # drag of one step
 
 
 def test_each_episode_draws_new_errors():
@@ -212,14 +212,14 @@ def expected_deviation(kind, t):
 def test_the_allan_deviation_agrees_with_the_parameters(measurements_at_rest, kind):
     times = np.array([0.01, 0.1, 0.5, 0.95, 2.0, 10.0])[1 if kind == 2 else 0 :]
     variance = [np.square(allantools.oadev(x, FREQ, "freq", times)[1]) for x in measurements_at_rest[kind]]
-    found = np.sqrt(np.mean(variance, axis=0))
+    result = np.sqrt(np.mean(variance, axis=0))
     # Each channel has about N / (FREQ t) independent differences: four standard errors of a mean square, halved by the
     # root. Ten samples of the process in 0.1 s differ from their integral by less than 1 %.
     tolerance = 4 * 0.5 * np.sqrt(2 / (len(variance) * N / (FREQ * times)) * 1.5) + 0.01
-    assert np.all(np.abs(found / expected_deviation(kind, times) - 1) < tolerance)
+    assert np.all(np.abs(result / expected_deviation(kind, times) - 1) < tolerance)
     assert tolerance.max() < 0.2
     if kind == 2:  # the largest deviation of a Gauss-Markov bias, as the docstring of Triad says
-        np.testing.assert_allclose(found[2], 0.618 * INSTABILITY, rtol=tolerance[2])
+        np.testing.assert_allclose(result[2], 0.618 * INSTABILITY, rtol=tolerance[2])
 
 
 def test_presets_have_the_numbers_of_their_data_sheets():

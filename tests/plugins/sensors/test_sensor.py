@@ -81,8 +81,8 @@ def test_jitter_delays_within_its_bounds_and_never_goes_back():
     # Every step sends a measurement: the last one is the newest whose delay of 2 + round(5 u) steps is over.
     probability = np.array([0.1, 0.2, 0.2, 0.2, 0.2, 0.1])
     expected = np.cumsum(probability) * np.concatenate([[1], np.cumprod(1 - np.cumsum(probability))[:-1]])
-    found = [np.mean(np.isclose(age[10:], 2 + k)) for k in range(6)]
-    np.testing.assert_allclose(found, expected, atol=4 * np.sqrt(0.25 / 5000) * 2)  # neighbours are correlated
+    result = [np.mean(np.isclose(age[10:], 2 + k)) for k in range(6)]
+    np.testing.assert_allclose(result, expected, atol=4 * np.sqrt(0.25 / 5000) * 2)  # neighbours are correlated
 
 
 def test_lost_measurements_leave_the_last_one():

@@ -133,6 +133,6 @@ def test_gradients_pass_through_rounding(x64):
         end = step(sim.data.replace(states=sim.data.states.replace(rotor_vel=rotor_vel)), 3)
         return jnp.stack([jnp.sum(jnp.square(sensor.read(end).samples.value)) for sensor in rounding_sensors])
 
-    found = np.asarray(gradients(jnp.asarray(sim.data.states.rotor_vel)))
-    assert np.isfinite(found).all()
-    assert np.abs(found).min() > 1e-9
+    result = np.asarray(gradients(jnp.asarray(sim.data.states.rotor_vel)))
+    assert np.isfinite(result).all()
+    assert np.abs(result).min() > 1e-9

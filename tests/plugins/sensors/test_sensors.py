@@ -80,9 +80,9 @@ def test_optical_flow_by_hand():
                                    atol=1e-4)  # the motion of one step # fmt: skip
     sim = build(sensors.OpticalFlow(0.3, resolution=0.1), n_worlds=N)
     sim.step()
-    found = read(sim, "optical_flow.flow")
-    np.testing.assert_allclose(found.std(), np.sqrt(0.3**2 + 0.1**2 / 12), rtol=std_tolerance(2 * N))
-    np.testing.assert_allclose(found / 0.1, np.round(found / 0.1), atol=1e-4)
+    result = read(sim, "optical_flow.flow")
+    np.testing.assert_allclose(result.std(), np.sqrt(0.3**2 + 0.1**2 / 12), rtol=std_tolerance(2 * N))
+    np.testing.assert_allclose(result / 0.1, np.round(result / 0.1), atol=1e-4)
 
 
 @pytest.mark.parametrize("plugin, channel, expected", [
@@ -116,8 +116,8 @@ def test_time_of_flight_by_hand():
     pos = np.array([1.0, 1.0, 3.9, 1.0])[:, None, None] * [0, 0, 1]
     sim = build(sensors.TimeOfFlight(far_noise=0.0, freq=None), n_worlds=4, pos=pos, quat=quat)
     sim.step()
-    found = read(sim, "time_of_flight.distance")[:, 0, 0]
-    np.testing.assert_allclose(found, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # the motion of one step, and rounding
+    result = read(sim, "time_of_flight.distance")[:, 0, 0]
+    np.testing.assert_allclose(result, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # the motion of one step, and rounding
     for height in (0.5, 2.5, 3.5):
         deviation = 0.01 + 0.0025 * (1 + 80 ** ((height - 2.5) / 1.5))
         sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=N, pos=[0, 0, height])
@@ -147,13 +147,13 @@ def test_barometer_has_its_errors():
 
     drifting = sensors.Barometer(drift=5.0, drift_time=0.1, offset_spread=20.0, freq=100)
     sim = build(drifting, n_worlds=N)
-    found = []
+    result = []
     for n_steps in (1, 50):
         sim.step(n_steps)
-        found.append(read(sim, "barometer.pressure")[:, 0, 0])
-    np.testing.assert_allclose(found[0].std(), np.hypot(5, 20), rtol=std_tolerance(N))
+        result.append(read(sim, "barometer.pressure")[:, 0, 0])
+    np.testing.assert_allclose(result[0].std(), np.hypot(5, 20), rtol=std_tolerance(N))
     np.testing.assert_allclose(
-        (found[1] - found[0]).std(), 5 * np.sqrt(2 - 2 * np.exp(-1)), rtol=std_tolerance(N) + 0.01
+        (result[1] - result[0]).std(), 5 * np.sqrt(2 - 2 * np.exp(-1)), rtol=std_tolerance(N) + 0.01
     )
 
 
@@ -235,13 +235,13 @@ def test_a_lighthouse_sees_drones_in_front_of_it_with_noise():
 
 def test_satellite_navigation_wanders():
     sim = build(sensors.GPS((1.0, 1.0, 2.0), 3.0, 0.2, 0.1, freq=100), n_worlds=N)
-    found = []
+    result = []
     for n_steps in (1, 100):
         sim.step(n_steps)
-        found.append(read(sim, "gps.pos")[:, 0] - np.asarray(sim.data.states.pos)[:, 0])
-    np.testing.assert_allclose(found[0].std(axis=0), np.hypot([1, 1, 2], 3), rtol=std_tolerance(N))
+        result.append(read(sim, "gps.pos")[:, 0] - np.asarray(sim.data.states.pos)[:, 0])
+    np.testing.assert_allclose(result[0].std(axis=0), np.hypot([1, 1, 2], 3), rtol=std_tolerance(N))
     change = np.sqrt(2 * np.array([1, 1, 4]) + 9 * (2 - 2 * np.exp(-1)))
-    np.testing.assert_allclose((found[1] - found[0]).std(axis=0), change, rtol=std_tolerance(N))
+    np.testing.assert_allclose((result[1] - result[0]).std(axis=0), change, rtol=std_tolerance(N))
     vel = read(sim, "gps.vel")[:, 0] - np.asarray(sim.data.states.vel)[:, 0]
     np.testing.assert_allclose(vel.std(axis=0), 0.1, rtol=std_tolerance(N))
 

@@ -73,9 +73,9 @@ def test_yaw_rates_after_a_step_of_the_steering_agree():
         car.step()
         yaw_rates.append(car.yaw_rate)
     path = simulate(single_track, [0.15, 0.2], 1.0, speed)
-    expected, found = np.array(yaw_rates), np.asarray(path.yaw_rate)[:, 0]
-    assert found[-1] == pytest.approx(expected[-1], rel=0.01)
-    rise_time, expected_time = (np.argmax(x > 0.9 * x[-1]) / 1000 for x in (found, expected))
+    expected, result = np.array(yaw_rates), np.asarray(path.yaw_rate)[:, 0]
+    assert result[-1] == pytest.approx(expected[-1], rel=0.01)
+    rise_time, expected_time = (np.argmax(x > 0.9 * x[-1]) / 1000 for x in (result, expected))
     assert rise_time == pytest.approx(expected_time, abs=0.03)
 
 

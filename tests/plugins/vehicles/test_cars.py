@@ -158,8 +158,8 @@ def test_gradients_are_finite_at_rest():
     for n_steps in (0, 60):
         if n_steps:
             sim.step(n_steps)
-        found = jax.tree.leaves(slopes(cars.read(sim.data), sim.data))
-        assert all(x.dtype == jax.dtypes.float0 or np.all(np.isfinite(x)) for x in found)
+        result = jax.tree.leaves(slopes(cars.read(sim.data), sim.data))
+        assert all(x.dtype == jax.dtypes.float0 or np.all(np.isfinite(x)) for x in result)
 
 
 def test_resets_restore_the_start():

@@ -69,10 +69,10 @@ def test_a_show_is_a_source():
 
 def test_a_thread_sends_in_real_time():
     with RealTimeSource(FunctionSource(poses_at, freq=200.0)).start() as source:
-        found = []
-        wait_for(lambda: found.extend(source.poll(0, 500).frames) or len(found) >= 20)
-    np.testing.assert_allclose(np.diff([f.stamp for f in found]), 1 / 200)
-    assert found[19].received - found[0].received > 0.05
+        result = []
+        wait_for(lambda: result.extend(source.poll(0, 500).frames) or len(result) >= 20)
+    np.testing.assert_allclose(np.diff([f.stamp for f in result]), 1 / 200)
+    assert result[19].received - result[0].received > 0.05
 
 
 class FailingSource(ThreadSource):
@@ -195,9 +195,9 @@ def create_polls():
     return [Poll(7.0, frames[:2]), Poll(7.1, [], 4), Poll(7.2, frames[2:])]
 
 
-def assert_polls_equal(found, expected):
-    assert [(p.now, p.lost, len(p.frames)) for p in found] == [(p.now, p.lost, len(p.frames)) for p in expected]
-    for a, b in zip([f for p in found for f in p.frames], [f for p in expected for f in p.frames], strict=True):
+def assert_polls_equal(computed, expected):
+    assert [(p.now, p.lost, len(p.frames)) for p in computed] == [(p.now, p.lost, len(p.frames)) for p in expected]
+    for a, b in zip([f for p in computed for f in p.frames], [f for p in expected for f in p.frames], strict=True):
         assert (a.stamp, a.received, a.names) == (b.stamp, b.received, b.names)
         np.testing.assert_array_equal(a.pos, b.pos)
         np.testing.assert_array_equal(a.quat, b.quat)
