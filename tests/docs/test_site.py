@@ -2,35 +2,20 @@
 
 import importlib.util
 import re
-from pathlib import Path
 
 import pytest
+from pages import GENERATED, ROOT, navigation_pages
 
-ROOT = Path(__file__).parents[2]
 spec = importlib.util.spec_from_file_location("llms", ROOT / "docs" / "llms.py")
 llms = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(llms)
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
-GENERATED = {
-    "index.md": "README.md",
-    "contributing.md": "CONTRIBUTING.md",
-    "security.md": "SECURITY.md",
-    "changelog.md": "CHANGELOG.md",
-}
-"""Pages of the site that come from outside docs/, by their place on the site."""
 LINK = re.compile(r"\]\((?!https?://)([^)#\s]*)(?:#([^)\s]+))?\)")
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
 
 def read_prose(page):
     return FENCE.sub("", page.read_text())
-
-
-def navigation_pages():
-    """Return the pages of the navigation in order, without generated ones."""
-    text = (ROOT / "mkdocs.yml").read_text()
-    section = re.search(r"^nav:\n((?: .*\n)+)", text, re.MULTILINE)[1]
-    return [page for page in re.findall(r"(\S+\.md)$", section, re.MULTILINE) if page != "contents.md"]
 
 
 def heading_anchors(page):
