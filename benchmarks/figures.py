@@ -46,6 +46,8 @@ STEP = (*BASE, *ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control"
 SCENE = ("crazysim/geometry", "crazysim/scene")
 ENVS = (*STEP, "crazysim/envs")
 PLUGINS = (*STEP, "crazysim/plugins")
+TRAIN = (*ENVS, "crazysim/train", ":(exclude)crazysim/train/show.py")
+"""Sources of a training, without its plots and films, which are made afterwards and are in no figure."""
 VERSUS = ("benchmarks/versus_crazyflow.py", "benchmarks/contestant.py")
 
 
@@ -474,7 +476,7 @@ FIGURES: dict[str, Figure] = {
     ),
     "envs-training": Figure(
         PAGE,
-        (*ENVS, "crazysim/train"),
+        TRAIN,
         gpu="envs.py --actions training --worlds 4096 65536 262144",
         table=tables.env_rates,
     ),
@@ -575,19 +577,19 @@ FIGURES: dict[str, Figure] = {
     ),
     "devices": Figure(
         "docs/guides/devices.md",
-        (*ENVS, *SCENE, "crazysim/train"),
+        (*TRAIN, *SCENE),
         gpu="devices.py --devices 1 2 4 --processes 12 --hosts 2",
         table=tables.devices,
     ),
     "trainers": Figure(
         "docs/concepts/training-results.md",
-        (*ENVS, "crazysim/train"),
+        TRAIN,
         gpu="trainers.py --worlds 1024 65536 --seeds 3",
         table=tables.trainers,
     ),
     "training": Figure(
         "docs/concepts/training-results.md",
-        (*ENVS, *SCENE, "crazysim/plugins", "crazysim/train"),
+        (*TRAIN, *SCENE, "crazysim/plugins"),
         commits=training_commits,
     ),
     "validation": Figure(

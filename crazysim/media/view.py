@@ -228,11 +228,11 @@ class View:
 def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
     """Draw a picture with a border at the bottom right of an image.
 
-    Its pixels are repeated as often as fits into a third of the image's width and half of its height.
+    Its pixels are repeated as often as fits into a quarter of the image's width and a third of its height.
     """
     if picture is None:
         return
-    scale = max(min(tile.shape[1] // (3 * picture.shape[1]), tile.shape[0] // (2 * picture.shape[0])), 1)
+    scale = max(min(tile.shape[1] // (4 * picture.shape[1]), tile.shape[0] // (3 * picture.shape[0])), 1)
     picture = np.pad(picture.repeat(scale, axis=0).repeat(scale, axis=1), ((2, 0), (2, 0), (0, 0)))
     height, width = (min(n, limit) for n, limit in zip(picture.shape[:2], tile.shape[:2], strict=True))
     tile[tile.shape[0] - height :, tile.shape[1] - width :] = picture[:height, :width]

@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
+from crazysim.envs.phases import select_states
 from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
-from crazysim.sim.visualize import draw_points
+from crazysim.sim.visualize import draw_points, draw_text
 from crazysim.storage import wrap_read_errors, write_figure
 from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
 from crazysim.train.networks import Policy
@@ -47,7 +49,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         success = [100 * point["success"] for point in curve]
         axes[0].plot(steps, success, label=name)
         axes[1].plot(seconds, success)
-        axes[2].plot(steps, [point["error"] for point in curve])
+        axes[2].plot(steps, [point["error"] for point in curve], marker=".")  # there is no error if all drones crash
     _use_log_scale(axes[2])
     first_curve = next(iter(curves.values()))
     steps = np.array([point["env_steps"] for point in first_curve]) / 1e6
@@ -61,6 +63,8 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         axes, (steps_label, "time with compilation, s", steps_label, steps_label), labels, strict=True
     ):
         axis.set(xlabel=x, ylabel=y)
+    for axis in axes[:2]:
+        axis.set_ylim(-2, 102)
     if len(curves) > 1:
         axes[0].legend()
     _save_figure(figure, path)
@@ -98,6 +102,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
     _use_log_scale(axes[1])
     for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
         axis.set(xlabel="environment steps, millions", ylabel=label)
+    axes[0].set_ylim(-2, 102)
     axes[0].legend(fontsize="small")
     axes[0].set_title("median, quartiles and extremes", fontsize=9)
     _save_figure(figure, path)
@@ -131,22 +136,31 @@ def plot_episode(
     axes[1].plot(t, np.cumsum(sum(terms.values())), "k--", label="sum")
     error = flight["error"].reshape(len(is_over), -1)
     axes[2].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
-    axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
+    if "succeeded" not in flight:  # otherwise the tolerance does not decide
+        axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
     labels = ("reward of a step, by term", "reward until then, by term", f"error, {env.task.unit}")
     for axis, y in zip(axes, labels, strict=True):
         axis.set(xlabel="time in the episode, s", ylabel=y)
         axis.legend(fontsize="small")
+    has_succeeded = flight["succeeded"].all(axis=-1) if "succeeded" in flight else np.zeros_like(is_over[-1])
     axes[0].set_title(
-        f"flying: 100% of {is_over.shape[1]:,} worlds at 0 s, {(~is_over[-1]).mean():.0%} at the end", fontsize=9
+        f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.0%} fly until the end, "
+        + f"{has_succeeded.mean():.0%} succeed, " * ("succeeded" in flight)
+        + f"{(is_over[-1] & ~has_succeeded).mean():.0%} crash",
+        fontsize=9,
     )
     _save_figure(figure, Path(path))
     return terms
 
 
 def _use_log_scale(axis: Any) -> None:
-    """Make the vertical axis logarithmic if any value is positive; the error of a finished race is zero."""
-    if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axis.lines):
+    """Make the vertical axis logarithmic if all values are positive; the error of a finished race is zero."""
+    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines] or [np.zeros(0)])
+    values = values[np.isfinite(values)]
+    if len(values) and (values > 0).all():
         axis.set_yscale("log")
+    elif not len(values):
+        axis.text(0.5, 0.5, "all drones crashed", ha="center", transform=axis.transAxes)
 
 
 def _make_figure(n: int) -> Any:
@@ -210,6 +224,9 @@ def color_depth(depth: np.ndarray, far: float) -> np.ndarray:
 def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
+    A world whose episode ends early, by success or by a crash, stands still from then on, and its text says which of
+    them ended it. The film ends with the episodes, or a second after the last of them ended early.
+
     If the policy observes images, the first depth image of the first drone, or else its first segmentation of the
     target, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles then also
     show a map from above.
@@ -258,7 +275,15 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     @jax.jit
     def step(state: EnvState, memory: Any) -> tuple[EnvState, Any]:
         action, memory = act(policy, state.obs, memory)
-        return env.step(state, action), memory
+        return select_states(~state.terminated, env.step(state, action), state), memory
+
+    def draw_overlays(sim: Sim, world: int) -> None:
+        draw_target(sim, world)
+        outcome = ""
+        if state.terminated[world]:
+            succeeded = env.succeeded(state)
+            outcome = ": crashed" if succeeded is None or not succeeded[world].all() else ": succeeded"
+        draw_text(sim, f"{int(state.data.core.steps[world, 0]) / sim.freq:.1f} s{outcome}")
 
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
     n_shown = min(worlds, sim.n_worlds)
@@ -270,8 +295,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         width=width,
         height=height,
         trail=1.5,
-        text="{time:.1f} s",
-        draw=draw_target,
+        draw=draw_overlays,
         cam_config=camera,
         follow=camera.pop("follow", None),
         inset=draw_image,
@@ -281,9 +305,17 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     )
     n_frames = env.max_steps // frame_steps + 1
     with Film(path, view, fps=freq / frame_steps, progress=progress, total=n_frames) as recording:
+        last_step = env.max_steps
         for i in range(env.max_steps + 1):
             if i % frame_steps == 0:
-                sim.data = state.data
+                core = state.data.core
+                steps = jnp.full_like(core.steps, i * (sim.freq // freq))  # the clock of the film does not stand still
+                sim.data = state.data.replace(core=core.replace(steps=steps))
                 recording.add(sim)
+                if state.terminated[:n_shown].all():
+                    last_step = min(last_step, i + freq)
+            if i >= last_step:
+                break
             state, memory = step(state, memory)
+        sim.data = state.data
         return recording.n_frames

@@ -196,7 +196,7 @@ def test_an_inset_is_drawn_enlarged_at_the_bottom_right_of_each_world(sim):
     options = {"worlds": [1, 3], "width": 2 * WIDTH, "border": 0}
     place(sim, POSITIONS, 0.0)
     shown = make_view(**options, inset=lambda sim, world: pictures[world] if world == 3 else None).render(sim)
-    plain, scale = make_view(**options).render(sim), WIDTH // 9
+    plain, scale = make_view(**options).render(sim), WIDTH // 12
     block = slice(HEIGHT - 2 * scale, HEIGHT), slice(2 * WIDTH - 3 * scale, 2 * WIDTH)
     np.testing.assert_array_equal(shown[block], pictures[3].repeat(scale, axis=0).repeat(scale, axis=1))
     frame = slice(block[0].start - 2, None), slice(block[1].start - 2, None)

@@ -16,6 +16,7 @@ from pictures import HEIGHT, WIDTH, pixel
 from screens import screen_pixels, virtual_screen
 
 from crazysim.errors import RenderError
+from crazysim.scene.build import SCENE_FILE
 from crazysim.sim import Sim
 
 POSITIONS = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
@@ -508,3 +509,21 @@ def test_a_program_that_does_not_close_its_simulation_exits_without_errors(openg
     assert done.returncode == 0
     assert not done.stderr
     assert not done.stdout
+
+
+def test_the_floor_casts_no_shadow_on_itself(opengl, rng):
+    """No pixel of the empty floor is darker with shadows than without; a shadow takes 40 of 255 levels."""
+    model = mujoco.MjModel.from_xml_path(str(SCENE_FILE))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    with mujoco.Renderer(model, 180, 320) as renderer:
+        for _ in range(40):
+            camera.lookat[:] = *rng.uniform(-0.5, 0.5, 2), 0.4
+            camera.distance, camera.azimuth, camera.elevation = rng.uniform([1, 0, -60], [4, 360, -15])
+            images = []
+            for casts_shadow in (True, False):
+                model.light_castshadow[:] = casts_shadow
+                renderer.update_scene(data, camera)
+                images.append(renderer.render().astype(int))
+            assert (images[1] - images[0]).max() < 15, f"{camera.azimuth} {camera.elevation} {camera.distance}"

@@ -171,7 +171,7 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     assert np.ptp(depth) > 3
     expected = color_depth(depth, 10.0)
     assert expected.sum(axis=-1)[depth.argmin() // 5, depth.argmin() % 5] == expected.sum(axis=-1).max()
-    scale = 480 // 15
+    scale = 480 // 20
     rows, columns = 360 - scale * (4 - np.arange(4)) + scale // 2, 480 - scale * (5 - np.arange(5)) + scale // 2
     np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 

@@ -230,6 +230,41 @@ def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
     assert set(drawn) == {(24, 3)}
 
 
+def test_a_film_stands_still_where_an_episode_has_ended_and_says_so(monkeypatch):
+    from crazysim.train.show import film
+
+    heights, texts = [], []
+
+    class Frames:
+        """Film that stores the height of the first drone and the text of each frame."""
+
+        n_frames = 0
+
+        def __init__(self, path, view, **_):
+            self.view = view
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def add(self, sim):
+            heights.append(float(sim.data.states.pos[0, 0, 2]))
+            self.view.draw(sim, 0)
+
+    monkeypatch.setattr("crazysim.train.show.Film", Frames)
+    monkeypatch.setattr("crazysim.train.show.draw_text", lambda sim, text: texts.append(text))
+    env = envs.make("hover")
+    film(env, lambda obs: jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, -1.0]), (1, 1, 4)), "fall.mp4", worlds=1)
+    n_crashed = sum(text.endswith("crashed") for text in texts)
+    assert texts[0] == "0.0 s"
+    assert n_crashed == 26, "the frame of the crash and a second of 25 frames"
+    assert len(set(texts[-n_crashed:])) == 1
+    assert len(set(heights[-n_crashed:])) == 1
+    assert len(set(heights[:-n_crashed])) == len(heights) - n_crashed > 5
+
+
 @pytest.mark.parametrize("camera", [None, {"elevation": -30}, {"lookat": (0, 0, 1), "distance": 2.0}])
 def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distance(
     tmp_path, monkeypatch, opengl, camera
