@@ -509,7 +509,7 @@ def test_auto_takes_the_kernel_and_says_so():
 def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
     monkeypatch.setattr("crazysim.engine.backends.native.compiler", lambda: None)
     sim = Sim(control="rotor_vel")
-    assert sim.explain().startswith("engine: lanes (no C++ compiler was computed")
+    assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
     sim.step(2)
     with pytest.raises(
         ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was computed.*engine='lanes'"
