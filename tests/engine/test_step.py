@@ -512,7 +512,7 @@ def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
     assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
     sim.step(2)
     with pytest.raises(
-        ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was computed.*engine='lanes'"
+        ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was found.*engine='lanes'"
     ):
         Sim(engine="fused")
 
