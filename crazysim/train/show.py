@@ -29,6 +29,8 @@ TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
 """Colour, RGBA, and smallest radius, m, of the mark at a drone's target."""
 DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))
 """Colours of depths from far to near, RGB."""
+SUCCESS_LIMITS = (-2, 102)
+"""Limits of axes with a success, %."""
 
 
 def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
@@ -64,7 +66,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     ):
         axis.set(xlabel=x, ylabel=y)
     for axis in axes[:2]:
-        axis.set_ylim(-2, 102)
+        axis.set_ylim(SUCCESS_LIMITS)
     if len(curves) > 1:
         axes[0].legend()
     _save_figure(figure, path)
@@ -102,7 +104,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
     _use_log_scale(axes[1])
     for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
         axis.set(xlabel="environment steps, millions", ylabel=label)
-    axes[0].set_ylim(-2, 102)
+    axes[0].set_ylim(SUCCESS_LIMITS)
     axes[0].legend(fontsize="small")
     axes[0].set_title("median, quartiles and extremes", fontsize=9)
     _save_figure(figure, path)
@@ -270,7 +272,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
             return color_depth(pixels, image["far"]) if name in depths else color_depth(1 - pixels, 1.0)
         return None
 
-    targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
+    targets, subjects, find_success = jax.jit(env.target), jax.jit(env.subjects), jax.jit(env.succeeded)
 
     @jax.jit
     def step(state: EnvState, memory: Any) -> tuple[EnvState, Any]:
@@ -281,7 +283,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         draw_target(sim, world)
         outcome = ""
         if state.terminated[world]:
-            succeeded = env.succeeded(state)
+            succeeded = find_success(state)
             outcome = ": crashed" if succeeded is None or not succeeded[world].all() else ": succeeded"
         draw_text(sim, f"{int(state.data.core.steps[world, 0]) / sim.freq:.1f} s{outcome}")
 
