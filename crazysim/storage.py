@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import glob
+import hashlib
 import io
+import itertools
 import math
 import os
+import platform
+import re
+import shutil
 import stat
+import time
 import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -30,6 +38,10 @@ MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO = 2**30, 100
 times the size of the file."""
 FOLDER_REMEDY = "Remove it, since its files may not be yours, or use another."
 """End of the message for a folder that is refused."""
+UNFINISHED_SUFFIX = ".part"
+"""Suffix of files that are being written."""
+ABANDONMENT_AGE = 86400.0
+"""Age at which remains of processes on other machines are removed, s."""
 SYSTEM_USERS = (0, 65534)
 """Ids of users that may own parent folders: root, and the user that containers show instead of an unmapped root."""
 
@@ -127,9 +139,86 @@ def wrap_read_errors(path: str | Path, content: str, remedy: str) -> Iterator[No
         ) from error
 
 
+_unfinished_numbers = itertools.count()
+
+
 def unfinished_path(path: Path) -> Path:
-    """Return the path of the temporary file that replaces ``path`` once it is complete."""
-    return path.with_name(path.name + ".part")
+    """Return a new path for the file that replaces ``path`` once it is complete.
+
+    Processes and threads that write the same file at the same time get different paths. What processes that were
+    killed have left of ``path`` is removed.
+    """
+    remove_abandoned_files(path.parent, f"{glob.escape(path.name)}.*{UNFINISHED_SUFFIX}")
+    return path.with_name(f"{path.name}.{process_name()}-{next(_unfinished_numbers)}{UNFINISHED_SUFFIX}")
+
+
+def process_name() -> str:
+    """Return the name of this process for the names of its files: machine and process ID."""
+    return f"{_machine()}-{os.getpid()}"
+
+
+@functools.cache
+def _machine() -> str:
+    """Return a short name of this machine and its namespace of process IDs, such as a container."""
+    try:
+        pid_namespace = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        pid_namespace = ""
+    return hashlib.sha256(f"{platform.node()} {pid_namespace}".encode()).hexdigest()[:8]
+
+
+def remove_abandoned_files(folder: Path, pattern: str) -> None:
+    """Remove this user's files and folders of processes that have ended without removing them.
+
+    Args:
+        folder: Folder that holds them.
+        pattern: Pattern of their names.
+    """
+    for path in folder.glob(pattern):
+        with suppress(OSError):
+            status = path.lstat()
+            is_own = not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
+            if not is_own or not _is_abandoned(path.name, time.time() - status.st_mtime):
+                continue
+            if stat.S_ISDIR(status.st_mode):
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
+
+
+def _is_abandoned(name: str, age: float) -> bool:
+    """Return True if no process needs a file or folder any more.
+
+    Args:
+        name: Its name, which contains the name of its process.
+        age: Time since it was written, s.
+    """
+    matches = re.findall(r"[.-]([0-9a-f]{8})-(\d+)-", name)
+    if not matches:
+        return name.endswith(".tmp") and age > ABANDONMENT_AGE  # of an earlier version
+    machine, pid = matches[-1]
+    if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
+        return age > ABANDONMENT_AGE
+    try:
+        os.kill(int(pid), 0)
+    except (OSError, OverflowError):  # there is no such process, or it belongs to another user
+        return True
+    return False
+
+
+def write_private_file(path: Path, content: bytes) -> None:
+    """Write a file that only this user can read or write, as a whole or not at all.
+
+    Raises:
+        OSError: If the folder cannot be written, or its disk is full.
+    """
+    temporary_path = unfinished_path(path)
+    try:
+        temporary_path.touch(mode=0o700)
+        temporary_path.write_bytes(content)
+        temporary_path.replace(path)
+    finally:
+        temporary_path.unlink(missing_ok=True)
 
 
 @contextmanager

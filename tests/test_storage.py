@@ -2,15 +2,26 @@
 
 import io
 import os
+import subprocess
+import sys
 import tracemalloc
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from disks import full_disk
 
 from crazysim.errors import ConfigError, DamagedFileError
-from crazysim.storage import check_writable, open_replacement, read_arrays, wrap_read_errors, write_figure, write_file
+from crazysim.storage import (
+    check_writable,
+    open_replacement,
+    process_name,
+    read_arrays,
+    wrap_read_errors,
+    write_figure,
+    write_file,
+)
 
 
 def write_to_a_full_disk(path):
@@ -38,6 +49,46 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         pass
     with pytest.raises(ConfigError, match="expected a file that can be written"), open_replacement(tmp_path):
         pass
+
+
+WRITERS = """
+import sys
+from crazysim.storage import open_replacement
+letter, n = sys.argv[2].encode(), 2**20
+for _ in range(50):
+    with open_replacement(sys.argv[1]) as file:
+        for _ in range(4):
+            file.write(n // 4 * letter)
+            file.flush()
+"""
+
+
+def test_processes_and_threads_that_write_one_file_do_not_mix_their_contents(tmp_path):
+    path = tmp_path / "a.bin"
+    with ThreadPoolExecutor() as pool:
+        writers = [pool.submit(subprocess.run, [sys.executable, "-c", WRITERS, path, x], check=True) for x in "ab"]
+        for writer in writers:
+            writer.result()
+    assert path.read_bytes() in (2**20 * b"a", 2**20 * b"b")
+    with open_replacement(path) as outer, open_replacement(path) as inner:
+        outer.write(b"outer")
+        inner.write(b"inner")
+    assert path.read_bytes() == b"outer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next_one(tmp_path):
+    path = tmp_path / "a[1].bin"
+    code = (
+        "import os, sys; from crazysim.storage import *; x = open_replacement(sys.argv[1]); x.__enter__(); os._exit(1)"
+    )
+    subprocess.run([sys.executable, "-c", code, path], check=False)
+    others = [tmp_path / "a[1].bin.part", tmp_path / f"a1.bin.{process_name()}-0.part"]
+    for other in others:
+        other.write_text("mine")
+    assert len(list(tmp_path.iterdir())) == 3
+    write_file(path, "x")
+    assert sorted(tmp_path.iterdir()) == sorted([path, *others])
 
 
 def pack(save=np.savez, **arrays):

@@ -56,7 +56,7 @@ class Film:
         progress: bool = False,
         total: int | None = None,
     ):
-        """Prepare a film. Until it is closed, its frames are in the file ``NAME.part``.
+        """Prepare a film. Until it is closed, its frames are in a file that ends with ``.part``.
 
         Args:
             path: Path of an ``.mp4`` or ``.gif`` file.
@@ -73,6 +73,7 @@ class Film:
         check_writable(self.path, tuple(ENCODERS))
         # The working directory may change, and ffmpeg would take the relative path -y.mp4 for an option.
         self._absolute_path = self.path.absolute()
+        self._unfinished_path = unfinished_path(self._absolute_path)
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
@@ -173,11 +174,10 @@ class Film:
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
-        temporary_path = unfinished_path(self._absolute_path)
         if ffmpeg.wait() == 0:
-            temporary_path.replace(self._absolute_path)
+            self._unfinished_path.replace(self._absolute_path)
         else:
-            temporary_path.unlink(missing_ok=True)
+            self._unfinished_path.unlink(missing_ok=True)
             raise RenderError(
                 f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
             )
@@ -191,7 +191,7 @@ class Film:
         input_options += ["-i", "-"]
         key_frame_options = ["-g", f"{math.ceil(self.fps)}"]  # a key frame every second
         encoder_options = [*ENCODERS[self.path.suffix.lower()], *key_frame_options]
-        output = str(unfinished_path(self._absolute_path))
+        output = str(self._unfinished_path)
         format_options = ["-f", self.path.suffix[1:].lower()]
         return [get_ffmpeg_exe(), "-loglevel", "error", *input_options, *encoder_options, *format_options, "-y", output]
 

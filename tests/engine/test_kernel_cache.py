@@ -9,6 +9,7 @@ import warnings
 
 import pytest
 
+from crazysim import storage
 from crazysim.engine.backends import kernel_cache
 from crazysim.errors import ConfigError
 from crazysim.storage import untrusted_reason
@@ -135,9 +136,9 @@ def make_remains(tmp_path):
 
 
 def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
-    here, other, gone = kernel_cache.process_name(), "0" * 8, finished_process_id()
+    here, other, gone = storage.process_name(), "0" * 8, finished_process_id()
     machine = here.split("-")[0]
-    old = 1.01 * kernel_cache.ABANDONMENT_AGE
+    old = 1.01 * storage.ABANDONMENT_AGE
     remains = [
         make_remains(f"key.{machine}-{gone}-140.tmp"),
         make_remains(f"crazysim-{machine}-{gone}-abc"),
@@ -152,24 +153,24 @@ def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
         make_remains("crazysim-mine", old),
     ]
     for pattern in ("*.tmp", "crazysim-*"):
-        kernel_cache.remove_abandoned_files(tmp_path, pattern)
+        storage.remove_abandoned_files(tmp_path, pattern)
     assert sorted(tmp_path.iterdir()) == sorted(needed)
     assert not any(path.exists() for path in remains)
 
 
 def test_processes_are_not_signalled_on_windows(monkeypatch):
     """On Windows, the call that tests for a process on POSIX systems would send Ctrl+C."""
-    name = f"key.{kernel_cache.process_name()}-140.tmp"
+    name = f"key.{storage.process_name()}-140.tmp"
     with monkeypatch.context() as faked:
-        faked.setattr(kernel_cache.os, "kill", None)
-        faked.setattr(kernel_cache.os, "name", "nt")
-        is_abandoned = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONMENT_AGE) for age in (0.9, 1.1)]
+        faked.setattr(storage.os, "kill", None)
+        faked.setattr(storage.os, "name", "nt")
+        is_abandoned = [storage._is_abandoned(name, age * storage.ABANDONMENT_AGE) for age in (0.9, 1.1)]
     assert is_abandoned == [False, True]
 
 
 def test_the_folders_are_swept_at_the_next_start(cache, make_remains):
     (cache / "crazysim").mkdir(mode=0o700)
-    machine = kernel_cache.process_name().split("-")[0]
+    machine = storage.process_name().split("-")[0]
     remains = make_remains(f"crazysim/key.{machine}-{finished_process_id()}-1.tmp")
     assert kernel_cache.folder() == cache / "crazysim"
     assert not remains.exists()

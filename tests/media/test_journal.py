@@ -14,7 +14,6 @@ from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.journal import CHUNK_HEADER, Journal, is_journal, read_journal
 from crazysim.sim import Sim
-from crazysim.storage import unfinished_path
 
 CHUNKS = [(b"AAAA", b"first"), (b"BBBB", b""), (b"CCCC", bytes(range(256)))]
 """Kind and content of each chunk."""
@@ -113,12 +112,13 @@ KILLED_PROGRAM = textwrap.dedent("""
 
 def test_a_film_survives_the_end_of_its_process(tmp_path):
     """A killed simulation loses no frame; a killed encoder loses the last seconds, which it had not encoded yet."""
-    film = path = tmp_path / "film.mp4"
-    ended = subprocess.run([sys.executable, "-c", KILLED_PROGRAM, path, "200", "python"], check=False)
+    film = tmp_path / "film.mp4"
+    ended = subprocess.run([sys.executable, "-c", KILLED_PROGRAM, film, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
-    path = unfinished_path(path)  # only a film that is closed gets its name
-    wait_for(lambda: path.exists() and path.stat().st_size and len(read_frames(path, 48, 64)) == 200)
+    (path,) = tmp_path.glob("film.mp4.*.part")  # only a film that is closed gets its name
+    wait_for(lambda: path.stat().st_size and len(read_frames(path, 48, 64)) == 200)
     subprocess.run([sys.executable, "-c", KILLED_PROGRAM, film, "400", "ffmpeg"], check=True)
+    (path,) = tmp_path.glob("film.mp4.*.part")  # the earlier one is removed
     assert len(read_frames(path, 48, 64)) > 200
 
 

@@ -17,25 +17,28 @@ import contextlib
 import functools
 import hashlib
 import os
-import platform
-import re
 import shutil
-import stat
 import tempfile
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from crazysim import cache
 from crazysim.errors import warn
-from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reason
+from crazysim.storage import (
+    FOLDER_REMEDY,
+    UNFINISHED_SUFFIX,
+    make_private_folder,
+    process_name,
+    remove_abandoned_files,
+    untrusted_reason,
+    write_private_file,
+)
 
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
 
-ABANDONMENT_AGE = 86400.0
-"""Age at which remains of processes on other machines are removed, s."""
+UNFINISHED_SUFFIXES = (UNFINISHED_SUFFIX, ".tmp")
+"""Suffixes of kernels that are being written, now and in version 0.1."""
 
 
 def digest(*parts: str | bytes) -> str:
@@ -75,7 +78,8 @@ def _warn_once(kernel_folder: Path, reason: str) -> None:
 @functools.cache
 def _remove_abandoned_files_once(kernel_folder: Path) -> None:
     """Remove unfinished files of processes that have ended from a folder, once."""
-    remove_abandoned_files(kernel_folder, "*.tmp")
+    for suffix in UNFINISHED_SUFFIXES:
+        remove_abandoned_files(kernel_folder, f"*{suffix}")
 
 
 def temporary_folder() -> Path:
@@ -99,63 +103,10 @@ def _make_temporary_folder(pid: int) -> Path:
     return folder
 
 
-def process_name() -> str:
-    """Return the name of this process for the names of its files: machine and process ID."""
-    return f"{_machine()}-{os.getpid()}"
-
-
-@functools.cache
-def _machine() -> str:
-    """Return a short name of this machine and its namespace of process IDs, such as a container."""
-    try:
-        pid_namespace = os.readlink("/proc/self/ns/pid")
-    except OSError:
-        pid_namespace = ""
-    return digest(platform.node(), pid_namespace)[:8]
-
-
-def remove_abandoned_files(cache_folder: Path, pattern: str) -> None:
-    """Remove files and folders of processes that have ended without removing them.
-
-    Args:
-        cache_folder: Folder that holds them.
-        pattern: Pattern of their names.
-    """
-    for path in cache_folder.glob(pattern):
-        with contextlib.suppress(OSError):
-            status = path.lstat()
-            if not _is_abandoned(path.name, time.time() - status.st_mtime) or untrusted_reason(path):
-                continue
-            if stat.S_ISDIR(status.st_mode):
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink()
-
-
-def _is_abandoned(name: str, age: float) -> bool:
-    """Return True if no process needs a file or folder any more.
-
-    Args:
-        name: Its name, which contains the name of its process.
-        age: Time since it was written, s.
-    """
-    match = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
-    if match is None:
-        return name.endswith(".tmp") and age > ABANDONMENT_AGE
-    machine, pid = match.groups()
-    if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
-        return age > ABANDONMENT_AGE
-    try:
-        os.kill(int(pid), 0)
-    except OSError:  # there is no such process, or it belongs to another user
-        return True
-    return False
-
-
 def find_files(cache_folder: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
     for path in sorted(cache_folder.glob(f"{key}-*")):
-        if path.suffix == ".tmp" or untrusted_reason(path):
+        if path.suffix in UNFINISHED_SUFFIXES or untrusted_reason(path):
             continue
         try:
             is_intact = path.stem == f"{key}-{digest(path.read_bytes())}"
@@ -181,11 +132,5 @@ def store_file(cache_folder: Path, key: str, content: bytes, suffix: str) -> Pat
         OSError: If the folder cannot be written, or its disk is full.
     """
     path = cache_folder / f"{key}-{digest(content)}{suffix}"
-    unfinished_path = cache_folder / f"{path.stem}.{process_name()}-{threading.get_ident()}.tmp"
-    try:
-        unfinished_path.touch(mode=0o700)
-        unfinished_path.write_bytes(content)
-        unfinished_path.replace(path)
-    finally:
-        unfinished_path.unlink(missing_ok=True)
+    write_private_file(path, content)
     return path
