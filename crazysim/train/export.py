@@ -3,6 +3,10 @@
 The exported functions take the observations of one drone, concatenated in the order of their names, and return its
 action in [-1, 1]. Both files describe these inputs and outputs, with the camera of each image. A policy with memory
 also takes and returns its memory, which is zero at the start of an episode.
+
+Actions and memory are finite whatever is observed: an observation that is NaN counts as its mean in training, an
+infinite one as the largest normalised value, and a pixel that is neither counts as 0. A controller that should stop
+without a valid state has to check the state itself, as the out of tree controller does.
 """
 
 from __future__ import annotations
@@ -137,17 +141,16 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
     numbers = _policy_numbers(policy, meta)
     constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
+    constants["zero"] = np.float32(0.0)
     nodes = []
 
     def add_node(operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
         nodes.append(helper.make_node(operator, inputs, [output], **attributes))
         return output
 
-    x = add_node(
-        "Clip",
-        [add_node("Div", [add_node("Sub", ["observation", "mean"], "centred"), "std"], "scaled"), "low", "high"],
-        "x",
-    )
+    add_node("Div", [add_node("Sub", ["observation", "mean"], "centred"), "std"], "scaled")
+    add_node("Clip", ["scaled", "low", "high"], "clipped")
+    x = add_node("Where", [add_node("IsNaN", ["scaled"], "is_nan"), "zero", "clipped"], "x")
     if numbers.images:
         x = _add_convolutions(add_node, constants, numbers, x)
     if numbers.n_memory:
@@ -220,6 +223,8 @@ def _add_convolutions(
         x = add_slice("observation", image.pixels)
         if image.is_depth:
             x = add_node("Reciprocal", [add_node("Add", [x, "one_metre"], f"distance{i}")], f"nearness{i}")
+        is_invalid = add_node("IsNaN", [add_node("Mul", [x, "zero"], f"nought{i}")], f"is_invalid{i}")  # inf * 0 is NaN
+        x = add_node("Where", [is_invalid, "zero", x], f"valid{i}")
         x = add_node("Reshape", [x, f"shape{i}"], f"pixels{i}")
         x = add_node("Transpose", [x], f"image{i}", perm=[0, 3, 1, 2])
         for k, (weight, bias) in enumerate(layers):
@@ -354,7 +359,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
         yield f"for (int i = {indices.start}; i < {indices.stop}; ++i) {{"
         yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
         target = "i" if indices.start == offset else f"i - {indices.start - offset}"
-        yield f"    x0[{target}] = x < -{limit} ? -{limit} : (x > {limit} ? {limit} : x);"
+        yield f"    x0[{target}] = isnan(x) ? 0.0f : (x < -{limit} ? -{limit} : (x > {limit} ? {limit} : x));"
         yield "}"
         offset += len(indices)
     for i, (image, layers) in enumerate(zip(numbers.images, numbers.convolutions, strict=True)):
@@ -389,9 +394,11 @@ def _convolution_lines(name: str, i: int, image: Image, layers: Sequence[Any], o
     """Yield the lines that write the features of an image into ``x0``, from index ``offset`` on."""
     shapes = list(image.shapes([len(bias) for _, bias in layers]))
     yield f"float image{i}_0[{len(image.pixels)}];"
-    yield f"for (int p = 0; p < {len(image.pixels)}; ++p)"
+    yield f"for (int p = 0; p < {len(image.pixels)}; ++p) {{"
     pixel = f"observation[{image.start} + p]"
-    yield f"    image{i}_0[p] = {f'1.0f / (1.0f + {pixel})' if image.is_depth else pixel};"
+    yield f"    const float x = {f'1.0f / (1.0f + {pixel})' if image.is_depth else pixel};"
+    yield f"    image{i}_0[p] = isfinite(x) ? x : 0.0f;"
+    yield "}"
     for k, ((height, width, n_in), (rows, columns, n_out)) in enumerate(itertools.pairwise(shapes)):
         target, start = f"image{i}_{k + 1}", 0
         if k == len(layers) - 1:

@@ -124,6 +124,13 @@ def episode(meta):
     return policy, np.concatenate([obs[name] for name in sorted(obs)], axis=-1), np.stack(actions)
 
 
+def break_numbers(obs, seed):
+    """Return observations of which a third are what a broken sensor may report."""
+    rng = np.random.default_rng(seed)
+    values = rng.choice(np.array([np.nan, np.inf, -np.inf, 3e38, -1.0], np.float32), obs.shape)
+    return np.where(rng.uniform(size=obs.shape) < 0.3, values, obs).astype(np.float32)
+
+
 def test_onnx_gives_the_actions_of_jax_and_holds_the_model_of_the_camera(tmp_path, meta, episode):
     runtime = pytest.importorskip("onnxruntime")
     policy, obs, actions = episode
@@ -132,6 +139,10 @@ def test_onnx_gives_the_actions_of_jax_and_holds_the_model_of_the_camera(tmp_pat
     for t in range(5):
         action, memory = session.run(None, {"observation": obs[t], "memory": memory})
         np.testing.assert_allclose(action, actions[t], atol=1e-5)
+    for t in range(5):  # actions and memory stay finite, whatever is observed
+        action, memory = session.run(None, {"observation": break_numbers(obs[t], t), "memory": memory})
+        assert (np.abs(action) <= 1).all()
+        assert (np.abs(memory) <= 1).all()
     camera = json.loads(session.get_modelmeta().custom_metadata_map["images"])["depth"]
     assert (camera["width"], camera["height"], camera["unit"], camera["far"]) == (5, 4, "m", 10.0)
     assert camera["pos"] == [0.03, 0, 0]
@@ -157,6 +168,11 @@ def test_c_gives_the_actions_of_jax(tmp_path, meta, episode):
     for t, drone in np.ndindex(5, 3):
         step(*(np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (state[drone], obs[t, drone], action)))
         np.testing.assert_allclose(action, actions[t, drone], atol=1e-5)
+    for t in range(5):  # actions and memory stay finite, whatever is observed
+        numbers = break_numbers(obs[t, 0], t)
+        step(*(x.ctypes.data_as(ctypes.c_void_p) for x in (state[0], numbers, action)))
+        assert (np.abs(action) <= 1).all()
+        assert (np.abs(state[0]) <= 1).all()
 
 
 @pytest.mark.long("renders a film")

@@ -1,6 +1,7 @@
 """Policies as out of tree controllers of the Crazyflie's firmware, compiled against stubs of its headers."""
 
 import ctypes
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -127,6 +128,23 @@ def command_of(policy, actions, x):
     return np.asarray(actions["centre"]) + np.asarray(actions["scale"]) * action
 
 
+def compile_driver(folder, level):
+    """Return the function of mode, step and inputs, (16,), that returns what the controller gives the firmware."""
+    (folder / "controller.h").write_text(CONTROLLER)
+    (folder / "controller_pid.h").write_text(CONTROLLER_PID)
+    (folder / "driver.c").write_text(DRIVER.replace("RESULTS", RESULTS[level]))
+    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
+    subprocess.run([cc, *FLAGS, folder / "driver.c", "-o", folder / "driver.so", "-lm"], check=True)
+    drive = ctypes.CDLL(str(folder / "driver.so")).drive
+
+    def call(mode, step, x):
+        out = np.empty(9, np.float32)
+        drive(mode, step, *(a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (x, out)))
+        return out[: RESULTS[level].count(",") + 1]
+
+    return call
+
+
 @pytest.mark.parametrize("level", RESULTS)
 def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmware(exported, level):
     """Angles are in degrees, pitch positive with the nose up, and thrusts relative to the largest.
@@ -134,20 +152,10 @@ def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmwar
     The motors are off if the setpoint has no position.
     """
     policy, actions, folder = exported(level)
-    (folder / "controller.h").write_text(CONTROLLER)
-    (folder / "controller_pid.h").write_text(CONTROLLER_PID)
-    (folder / "driver.c").write_text(DRIVER.replace("RESULTS", RESULTS[level]))
-    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
-    subprocess.run([cc, *FLAGS, folder / "driver.c", "-o", folder / "driver.so", "-lm"], check=True)
-    drive = ctypes.CDLL(str(folder / "driver.so")).drive
+    call = compile_driver(folder, level)
     x = np.array([0.3, -0.2, 1.0, 0.1, 0.2, 0.9, 0.1, -0.2, 0.3, 0.0, 0.4, -0.5, 0.2, 20.0, -30.0, 40.0], np.float32)
     x[9] = np.sqrt(1 - np.sum(x[6:9] ** 2))
-    flying, off, later, moved = (np.empty(9, np.float32) for _ in range(4))
-
-    def call(mode, step, x, out):
-        drive(mode, step, *(a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (x, out)))
-
-    call(1, 40, x, flying)
+    flying = call(1, 40, x)
     command = command_of(policy, actions, x)
     if level in ("attitude", "body_rate"):
         mode = 1 if level == "attitude" else 2
@@ -158,15 +166,53 @@ def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmwar
         thrust = np.polynomial.polynomial.polyval(command, AIRFRAME.value("rotors.thrust_curve"))
         expected = [*4 * thrust / MAX_THRUST, 2]
     np.testing.assert_allclose(flying[: len(expected)], expected, rtol=3e-5, atol=1e-6)
-    call(1, 41, x + np.float32(0.1), later)  # between two ticks of the policy
-    call(1, 60, x + np.float32(0.1), moved)
+    later = call(1, 41, x + np.float32(0.1))  # between two ticks of the policy
+    moved = call(1, 60, x + np.float32(0.1))
     np.testing.assert_array_equal(later[:4], flying[:4])
     assert not np.allclose(moved[:4], flying[:4], rtol=1e-3)
-    call(0, 60, x, off)
+    off = call(0, 60, x)
     assert off[3] == 0
     assert off[len(expected) - 1] == expected[-1]
-    call(1, 61, x, later)  # switched on between two ticks, it does not fly the last command from before
+    later = call(1, 61, x)  # switched on between two ticks, it does not fly the last command from before
     np.testing.assert_array_equal(later[:4], flying[:4])
+
+
+@pytest.mark.parametrize("level", RESULTS)
+def test_the_motors_are_off_without_a_finite_state_and_stay_within_limits(exported, level):
+    """With NaN or infinity in any input, at any tick; and within the limits for any state that is finite."""
+    x = np.array([0.3, -0.2, 1.0, 0.1, 0.2, 0.9, 0.0, 0.0, 0.0, 1.0, 0.4, -0.5, 0.2, 20.0, -30.0, 40.0], np.float32)
+    call, rng = compile_driver(exported(level)[2], level), np.random.default_rng(0)
+    off = call(0, 0, x)
+    motors = slice(0, 4) if level in ("rotor_vel", "force_torque") else slice(3, 4)  # thrust of the firmware's PID
+    np.testing.assert_array_equal(off[motors], 0)
+    for value in (np.nan, np.inf, -np.inf):
+        for i in range(16):
+            broken = x.copy()
+            broken[i] = value
+            assert np.abs(call(1, 1, x)[motors]).max() > 0
+            np.testing.assert_array_equal(call(1, 20, broken)[motors], 0, err_msg=f"{value} as input {i}")
+            np.testing.assert_array_equal(call(1, 21, broken)[motors], 0)
+    high = {"rotor_vel": 1.0, "force_torque": np.inf}.get(level, 65535.0)
+    for step in range(300):
+        states = np.float32(10.0 ** rng.uniform(-3, 37.5) * rng.normal(size=16)) + x
+        out = call(1, 20 * step, states)[motors]
+        assert np.isfinite(out).all()
+        assert (out <= high).all()
+        assert (out[:1] >= 0).all()
+
+
+@pytest.mark.parametrize("level", RESULTS)
+def test_the_exported_file_reads_well(exported, level):
+    """Each line of a comment begins with a star, and no line is wider than the firmware's style allows."""
+    lines = (exported(level)[2] / "controller.c").read_text().splitlines()
+    assert max(map(len, lines)) <= 120
+    first = lines[: next(i for i, line in enumerate(lines) if line.endswith("*/")) + 1]
+    assert first[0].startswith("/* Out of tree controller generated by crazysim ")
+    assert first[-1] == " */"
+    assert all(re.fullmatch(r" \*( \S[^*]*)?", line) for line in first[1:-1])
+    text = " ".join(line.removeprefix(" *").strip() for line in first[1:-1])
+    assert "and set the parameter stabilizer.controller to the out of tree controller." in text
+    assert text.endswith(".")
 
 
 def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):

@@ -197,6 +197,43 @@ def test_onnx_gives_the_actions_of_jax(tmp_path, policy, meta, observations_and_
     assert len(json.loads(properties["scale"])) == 4
 
 
+VALUES = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, -1.0, 0.0], np.float32)
+"""Numbers that a broken sensor or estimator may report."""
+
+
+def broken(obs, rng):
+    """Return observations with several ``VALUES`` in each row, and nothing else in some rows."""
+    mask = rng.uniform(size=obs.shape) < rng.choice([0.05, 0.3, 1.0], (len(obs), 1))
+    return np.where(mask, rng.choice(VALUES, obs.shape), obs).astype(np.float32)
+
+
+@pytest.mark.parametrize("language", ["c", "onnx"])
+def test_exported_actions_are_finite_whatever_is_observed(tmp_path, policy, meta, observations_and_actions, language):
+    """An observation of NaN counts as its mean; an infinite one as the limit of a normalised observation."""
+    obs, rng = broken(observations_and_actions[0], np.random.default_rng(5)), np.random.default_rng(6)
+    if language == "c":
+        act = compile_header(to_c(policy, tmp_path / "policy.h", meta), tmp_path)
+    else:
+        runtime = pytest.importorskip("onnxruntime")
+        session = runtime.InferenceSession(to_onnx(policy, tmp_path / "policy.onnx", meta))
+        act = lambda x: session.run(None, {"observation": x})[0]  # noqa: E731
+    actions = act(obs)
+    assert np.isfinite(obs).all(axis=-1).mean() < 0.5
+    assert (np.abs(actions) <= 1).all()
+    limit = 11 * np.sqrt(np.asarray(policy.stats.var) + 1e-6)
+    mean = np.asarray(policy.stats.mean)
+    counted = np.clip(np.where(np.isnan(obs), mean, obs), mean - limit, mean + limit).astype(np.float32)
+    np.testing.assert_allclose(actions, policy({"x": jnp.asarray(counted)}), atol=1e-5)  # sums in another order
+    if language == "onnx":
+        with_state = with_memory(policy, 9)
+        session = runtime.InferenceSession(to_onnx(with_state, tmp_path / "memory.onnx", meta))
+        memory = np.zeros((500, 9), np.float32)
+        for _ in range(3):
+            action, memory = session.run(None, {"observation": rng.permuted(obs, axis=0), "memory": memory})
+            assert (np.abs(action) <= 1).all()
+            assert (np.abs(memory) <= 1).all()
+
+
 def test_every_command_level_is_described(tmp_path, policy, meta):
     for level, unit in {"body_rate": "rate about x, rad/s", "rotor_vel": "speed of rotor 0, rpm",
                         "force_torque": "collective thrust, N"}.items():  # fmt: skip
