@@ -23,8 +23,15 @@ from typing import Any
 import jax
 
 from crazysim import jaxcompat
-from crazysim.errors import ConfigError
-from crazysim.storage import FOLDER_REMEDY, make_private_folder, untrusted_reason
+from crazysim.errors import ConfigError, warn
+from crazysim.storage import (
+    FOLDER_REMEDY,
+    UNFINISHED_SUFFIX,
+    make_private_folder,
+    remove_abandoned_files,
+    untrusted_reason,
+    write_private_file,
+)
 
 CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
@@ -156,7 +163,60 @@ def _prepare_folder(root: Path, path: Path) -> None:
             f"expected {MIN_FREE_BYTES / 1e6:g} MB of free space for compiled programs, got {free_bytes / 1e6:.1f} MB "
             f"in {str(path)!r}. Free some, or use another folder."
         )
+    remove_abandoned_files(path, f"*{UNFINISHED_SUFFIX}")
     trim(root)
+    jaxcompat.use_cache(str(path), CheckedPrograms)
+
+
+class CheckedPrograms:
+    """JAX's cache in a folder that crazysim has chosen, in files that JAX's own cache can read.
+
+    JAX's own cache never replaces a file: a damaged one stays, and a warning in every process. It does not notice a
+    changed bit, because the frames of Zstandard that it writes have no checksum, and it loads files of other users.
+    Here each file ends with a checksum, which JAX's own skips. A file without it, or that others can write, is not
+    loaded, and is replaced when its program has been compiled.
+    """
+
+    def __init__(self, path: str):
+        self._path = Path(path)
+        self._has_warned = False
+
+    def get(self, key: str) -> bytes | None:
+        """Return the intact program of a key; None if there is none."""
+        path = self._file(key)
+        if not path.is_file() or untrusted_reason(path):
+            return None
+        try:
+            content = path.read_bytes()
+        except OSError:
+            return None
+        program = content[:-CHECKSUM_BYTES]
+        return program if content == program + _checksum(key, program) else None
+
+    def put(self, key: str, value: bytes) -> None:
+        """Write the program of a key, or warn once that it cannot be written."""
+        try:
+            write_private_file(self._file(key), value + _checksum(key, value))
+        except OSError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                warn(
+                    f"expected room for compiled programs in {str(self._path)!r}, got: {error}. Later processes "
+                    f"compile them again. Make room, or set {CACHE_VARIABLE} to another folder."
+                )
+
+    def _file(self, key: str) -> Path:
+        return self._path / f"{key}-cache"
+
+
+def _checksum(key: str, program: bytes) -> bytes:
+    """Return the checksum in a skippable frame of Zstandard (RFC 8878); zlib ignores what follows its stream."""
+    digest = hashlib.sha256(key.encode() + b"\0" + program).digest()
+    return 0x184D2A50.to_bytes(4, "little") + len(digest).to_bytes(4, "little") + digest
+
+
+CHECKSUM_BYTES = len(_checksum("", b""))
+"""Length of the end of a file that holds its checksum."""
 
 
 def enable_cache(

@@ -20,6 +20,8 @@ replaced if a release removed it, and whether the replacement is implemented:
   ``engine/backends/interpret.py``, for that engine only.
 - **The compilation cache of one thread** (``compilation_cache``): without it, programs are only kept in the folder that
   JAX is configured with. It is used where these names are missing.
+- **The files of the compilation cache** (``use_cache``): JAX's own, which it neither checks nor replaces. They are used
+  where the name is missing.
 - **The log level of XLA** (``set_xla_log_level``): the variable ``TF_CPP_MIN_LOG_LEVEL`` alone, which has no effect if
   JAX was imported before crazysim. It is used where jaxlib lacks the function.
 - **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
@@ -102,6 +104,7 @@ __all__ = [
     "set_xla_log_level",
     "threefry2x32_p",
     "threefry_prng_impl",
+    "use_cache",
     "versions",
 ]
 
@@ -482,6 +485,19 @@ def compilation_cache(folder: str) -> Iterator[None]:
             stack.enter_context(setting)
         stack.enter_context(_close_cache_outside(close))
         yield
+
+
+@functools.cache
+def use_cache(folder: str, make_cache: Callable[[str], Any]) -> None:
+    """Let JAX use ``make_cache(folder)``, with the methods ``get`` and ``put``, where it opens its cache in a folder.
+
+    If JAX lacks the name used here, it opens its own.
+    """
+    with contextlib.suppress(ImportError, AttributeError):
+        from jax._src import compilation_cache
+
+        open_cache = compilation_cache.get_file_cache
+        compilation_cache.get_file_cache = lambda path: (make_cache(path), path) if path == folder else open_cache(path)
 
 
 _n_cache_blocks = 0

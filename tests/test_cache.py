@@ -4,12 +4,18 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+import zlib
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from disks import full_disk
+from hypothesis import given
+from hypothesis import strategies as st
 from jax._src import compilation_cache
 
 from crazysim import cache
@@ -148,6 +154,92 @@ def _outside(x):
 
 def _of_user(x):
     return jnp.cos(x) * 5
+
+
+def _compute():
+    """Compile a function that is in the cache, or is not there yet, and return its result and the cache's file."""
+
+    def damaged(x):  # a new function, so that JAX finds nothing in memory
+        return jnp.sin(x) @ x + 7
+
+    with keep_programs():
+        result = jax.jit(damaged)(X)
+    return np.asarray(result), next(default_folder().glob("jit_damaged-*-cache"), None)
+
+
+X = np.linspace(0.0, 1.0, 9, dtype=np.float32).reshape(3, 3)
+damages = st.one_of(
+    st.tuples(st.just("cut"), st.floats(0, 1, exclude_max=True)),
+    st.tuples(st.just("flip"), st.floats(0, 1, exclude_max=True)),
+    st.sampled_from([("append", 1), ("mode", 0o622), ("mode", 0o660), ("other program", 0), ("older", 0), ("link", 0)]),
+    st.sampled_from([("full disk", 0), ("full disk", 4000), *([("owner", 12345)] if os.geteuid() == 0 else [])]),
+)
+"""Kinds of damage to a file of the cache, with a number: a fraction of its length, permissions, bytes or a user."""
+
+
+def _damage(path, kind, x):
+    content = path.read_bytes()
+    k = int(x * len(content)) if kind in ("cut", "flip") else 0
+    if kind == "cut":
+        path.write_bytes(content[:k])
+    elif kind == "flip":
+        path.write_bytes(content[:k] + bytes([content[k] ^ 0x10]) + content[k + 1 :])
+    elif kind == "append":
+        path.write_bytes(content + bytes(x))
+    elif kind == "mode":
+        path.chmod(x)
+    elif kind == "owner":
+        os.chown(path, x, x)
+    elif kind == "older":  # as JAX's own cache writes it
+        path.write_bytes(content[: -cache.CHECKSUM_BYTES])
+    elif kind == "other program":
+        with keep_programs():
+            jax.jit(lambda x: jnp.cos(x) - 3)(X)
+        path.write_bytes(next(path.parent.glob("jit__lambda*-cache")).read_bytes())
+    elif kind == "link":
+        path.unlink()
+        path.symlink_to(path.parent / "nothing")
+    else:
+        path.unlink()
+        with full_disk(x), pytest.warns(UserWarning, match="expected room for compiled programs in"):
+            np.testing.assert_allclose(_compute()[0], RESULT, rtol=1e-6)
+        assert not path.exists()
+
+
+RESULT = np.sin(X) @ X + 7
+
+
+@pytest.mark.long("compiles its program after each damage")
+@given(st.lists(damages, min_size=1, max_size=3))
+def test_a_damaged_program_is_compiled_again_and_replaced(chosen):
+    """There is no warning, and the next process loads the new file."""
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        patch.setenv(cache.CACHE_VARIABLE, folder)
+        configured = jax.config.jax_compilation_cache_dir
+        jax.config.update("jax_compilation_cache_dir", None)
+        try:
+            path = _compute()[1]
+            for damage in chosen:
+                _damage(path, *damage)
+                before = path.lstat().st_ino if os.path.lexists(path) else None
+                result, path = _compute()
+                np.testing.assert_allclose(result, RESULT, rtol=1e-6)
+                status = path.stat()
+                assert status.st_ino != before, "the file is replaced"
+                assert (status.st_uid, status.st_mode & 0o077) == (os.geteuid(), 0)
+                np.testing.assert_array_equal(_compute()[0], result)
+                assert path.stat().st_ino == status.st_ino, "it is loaded"
+                assert not list(path.parent.glob("*.part"))
+        finally:
+            jax.config.update("jax_compilation_cache_dir", configured)
+
+
+def test_the_cache_of_jax_skips_the_checksum():
+    program = bytes(range(256)) * 50
+    for compress in (compilation_cache.compress_executable, zlib.compress):
+        content = compress(program) + cache._checksum("key", program)
+        read = zlib.decompress if compress is zlib.compress else compilation_cache.decompress_executable
+        assert read(content) == program
 
 
 SNIPPET = """
