@@ -56,6 +56,47 @@ def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
     np.testing.assert_allclose(momentum() - before, [0, 0, -9.81 * 0.2 * (4 * mass + 0.3)], atol=1e-10)
 
 
+def throw_apart(integrator, freq, n_worlds=32):
+    """Throw one to four drones apart for 1 s, on cables of 1 m without gravity, in all directions.
+
+    Returns:
+        Largest length of a cable, m, and largest relative error of angular momentum, of each world.
+    """
+    sim = Sim(n_worlds, 4, **SETTINGS, integrator=integrator, freq=freq)
+    sim.data = with_params(with_states(sim.data, pos=CORNERS), gravity_vec=np.zeros(3))
+    load = sim.add(SharedLoad(mass=0.3, length=1.0, in_scene=False))
+    is_held = np.arange(4) <= np.arange(n_worlds)[:, None] % 4
+    vel = np.random.default_rng(0).normal(size=(n_worlds, 4, 3))
+    sim.data = load.release(with_states(sim.data, vel=vel), ~is_held)
+    masses = np.append(np.where(is_held, float(sim.data.params.mass[0]), 0.0), np.full((n_worlds, 1), 0.3), 1)[
+        ..., None
+    ]
+
+    def observe():
+        record = load.read(sim.data)
+        pos, vel = (np.append(getattr(sim.data.states, x), getattr(record, x), 1) for x in ("pos", "vel"))
+        offset, rel_vel = (x - (masses * x).sum(1, keepdims=True) / masses.sum(1, keepdims=True) for x in (pos, vel))
+        distance = np.linalg.norm(pos[:, :4] - pos[:, 4:], axis=-1)
+        return np.where(is_held, distance, 0.0).max(1), (masses * np.cross(offset, rel_vel)).sum(1)
+
+    _, momentum = observe()
+    lengths, momenta = zip(*[(sim.step(freq // 50), observe())[1] for _ in range(50)], strict=True)
+    error = np.linalg.norm(np.array(momenta) - momentum, axis=-1).max(0) / np.linalg.norm(momentum, axis=-1)
+    return np.max(lengths, 0), error
+
+
+@pytest.mark.long("compiles two steps of four drones")
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "rk4"])
+def test_cables_of_drones_thrown_apart_keep_their_length_and_angular_momentum(integrator, x64):
+    """A taut cable of 1 m becomes longer by v^2 dt^2 / 2 in a straight step across it at a relative speed v."""
+    (length, coarse_error), (fine_length, fine_error) = (throw_apart(integrator, freq) for freq in (250, 1000))
+    speed = 8.0  # twice the largest speed of a drone at the start
+    assert np.max(length) < 1 + (speed / 250) ** 2 / 2
+    assert np.max(fine_length) < 1 + (speed / 1000) ** 2 / 2
+    assert np.max(coarse_error) < 1e-3
+    assert np.median(coarse_error) > 8 * np.median(fine_error)  # order 2: a sixteenth
+
+
 def test_slack_and_released_cables_do_not_pull(x64):
     """The first drone has released the load, and the third is so near that its cable is slack."""
     sim, load = build(3, "symplectic_euler", "interpret")
