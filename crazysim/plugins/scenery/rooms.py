@@ -19,8 +19,8 @@ from crazysim.plugins.scenery.scenery import HIDDEN_DEPTH, Model, Scenery
 class Rooms(Scenery):
     """A building of square rooms in rows, with a door at a random position in each wall between two rooms.
 
-    There is a path between any two rooms. A wall between rooms consists of panels; its door is a missing panel, as high
-    as the wall. The outer walls have no doors. ``free`` and ``speed`` have no effect.
+    There is a path between any two rooms. A wall between rooms consists of panels between two posts; its door is a
+    missing panel, as high as the wall. The outer walls have no doors. ``free`` and ``speed`` have no effect.
 
     ``difficulty`` is the fraction of the walls between rooms that are present: with 0 the building is a hall.
     """
@@ -30,7 +30,7 @@ class Rooms(Scenery):
     room: float = setting(default=4.0, positive=True)
     """Length of the sides of a room, m."""
     door: float = setting(default=1.0, positive=True)
-    """Width of a door, m; ``room`` is divided into panels of at least this width."""
+    """Width of a door and of a panel, m; posts of equal width fill the rest of a wall."""
     center: ArrayLike = setting(default=(0.0, 0.0), shapes=((2,),))
     """Middle of the building, x and y, m. (2,)"""
     height: float = setting(default=2.5, positive=True)
@@ -43,22 +43,27 @@ class Rooms(Scenery):
         super().__post_init__()
         if self.n_panels < 2:
             raise ConfigError(
-                f"expected rooms at least twice as wide as a door, got rooms of {self.room:g} m and doors of "
-                f"{self.door:g} m"
+                f"expected rooms at least twice as wide as a door between their walls, got rooms of {self.room:g} m, "
+                f"walls of {self.thickness:g} m and doors of {self.door:g} m. Use a larger room= or a smaller door=."
             )
-        self.check_count(4 + self.n_walls * self.n_panels, "Use fewer or smaller rooms, or wider doors.")
+        self.check_count(4 + self.n_walls * (self.n_panels + 2), "Use fewer or smaller rooms, or wider doors.")
 
     @property
     def n_panels(self) -> int:
         """Number of panels of a wall."""
-        return int(self.room / self.door + 1e-6)
+        return int((self.room - self.thickness) / self.door + 1e-6)
 
     def models(self) -> Sequence[Model]:
         outer_walls = [Model(*self._wall_model(length), np.array([middle])) for length, middle in self._outer_walls()]
-        inner_walls = (
-            [Model(*self._wall_model(self.room / self.n_panels), self._panel_positions())] if self.n_walls else []
-        )
-        return [*outer_walls, *inner_walls]
+        if not self.n_walls:
+            return outer_walls
+        panels, posts = self._piece_positions()
+        post_width = (self.room - self.n_panels * self.door) / 2
+        return [
+            *outer_walls,
+            Model(*self._wall_model(self.door), panels),
+            Model(*self._wall_model(post_width), posts),
+        ]
 
     @property
     def n_walls(self) -> int:
@@ -72,10 +77,13 @@ class Rooms(Scenery):
         is_along_x = wall >= (self._room_counts()[0] - 1) * self._room_counts()[1]
         is_standing = record.uniform(self.n_walls + wall) < record.difficulty
         is_door = jnp.floor(record.uniform(wall) * n_panels) == panel
-        depth = jnp.where(is_standing & ~is_door, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
+        is_post_standing = jnp.repeat(is_standing[..., ::n_panels], 2, axis=-1)
+        is_present = jnp.concatenate([is_standing & ~is_door, is_post_standing], axis=-1)
+        depth = jnp.where(is_present, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
         outer_walls = np.array([middle for _, middle in self._outer_walls()])
-        pos = jnp.asarray(np.concatenate([outer_walls, self._panel_positions()]), depth.dtype)
+        pos = jnp.asarray(np.concatenate([outer_walls, *self._piece_positions()]), depth.dtype)
         depth = jnp.concatenate([jnp.zeros((*depth.shape[:-1], 4), depth.dtype), depth], axis=-1)
+        is_along_x = np.concatenate([is_along_x, np.repeat(is_along_x[::n_panels], 2)])
         half_yaw = np.concatenate([[0.0, 0.0, np.pi / 4, np.pi / 4], is_along_x * np.pi / 4])
         quat = jnp.asarray(np.stack([0 * half_yaw, 0 * half_yaw, np.sin(half_yaw), np.cos(half_yaw)], axis=-1))
         pos = jnp.broadcast_to(pos, (*depth.shape, 3)) - depth[..., None] * np.array([0, 0, 1], depth.dtype)
@@ -101,12 +109,17 @@ class Rooms(Scenery):
             (float(size[0]) + self.thickness, np.array([x, y + side * size[1] / 2, 0.0])) for side in (-1, 1)
         ]
 
-    def _panel_positions(self) -> np.ndarray:
-        """Return the middles of all panels, first in walls along y, then along x, m. (n_walls * n_panels, 3)"""
+    def _piece_positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the middles of all panels and of all posts, first in walls along y, then along x, m. (n, 3) each"""
         n_x, n_y = self._room_counts()
         corner = np.asarray(self.center, np.float64) - self.room * np.array([n_x, n_y]) / 2
-        offsets = self.room * (np.arange(self.n_panels) + 0.5) / self.n_panels
-        panels = [
-            [self.room * (i + 1), self.room * j + a, 0.0] for i in range(n_x - 1) for j in range(n_y) for a in offsets
-        ] + [[self.room * i + a, self.room * (j + 1), 0.0] for i in range(n_x) for j in range(n_y - 1) for a in offsets]
-        return np.array(panels).reshape(-1, 3) + [*corner, 0.0]
+        panels = self.room / 2 + self.door * (np.arange(self.n_panels) - (self.n_panels - 1) / 2)
+        post = (self.room - self.n_panels * self.door) / 4
+
+        def in_all_walls(offsets: ArrayLike) -> np.ndarray:
+            along_y = [(i + 1, j, 0, a) for i in range(n_x - 1) for j in range(n_y) for a in np.asarray(offsets)]
+            along_x = [(i, j + 1, a, 0) for i in range(n_x) for j in range(n_y - 1) for a in np.asarray(offsets)]
+            x, y, dx, dy = np.array(along_y + along_x).reshape(-1, 4).T
+            return np.stack([self.room * x + dx + corner[0], self.room * y + dy + corner[1], 0 * x], axis=-1)
+
+        return in_all_walls(panels), in_all_walls([post, self.room - post])

@@ -122,6 +122,26 @@ def test_a_path_leads_from_each_room_to_all_others():
     assert len(set(doors)) > 2
 
 
+@pytest.mark.parametrize(
+    "plugin",
+    [Rooms(), Rooms(count=(2, 1), room=2.35, door=0.75, thickness=0.3), Rooms(count=(1, 3), room=5.0, door=1.2)],
+    ids=["default", "two", "three"],
+)
+def test_doors_have_the_stated_width_wherever_they_are(plugin):
+    """Along the middle of every wall the clearance is positive over the width of one door only."""
+    sim = build(plugin, 64, 1)
+    (n_x, n_y), room = plugin.count, plugin.room
+    walls = [(room * (i + 1), room * (j + 0.5), 0) for i in range(n_x - 1) for j in range(n_y)]
+    walls += [(room * (i + 0.5), room * (j + 1), 1) for i in range(n_x) for j in range(n_y - 1)]
+    t = np.linspace(-room / 2, room / 2, 2001)
+    for x, y, is_along_x in walls:
+        line = np.stack([x + t * is_along_x, y + t * (1 - is_along_x), t * 0 + 1], axis=-1)
+        line -= [n_x * room / 2, n_y * room / 2, 0]
+        points = jnp.broadcast_to(np.float32(line), (64, *line.shape))
+        is_open = np.asarray(jax.jit(plugin.clearance)(sim.data, points)) > 0
+        np.testing.assert_allclose(is_open.sum(axis=1) * (t[1] - t[0]), plugin.door, atol=2 * (t[1] - t[0]))
+
+
 WRONG_SETTINGS = {
     "widths": (lambda: Pillars(widths=(0.8, 0.3)), "expected the smallest before the largest size of 'pillars'"),
     "pillars": (lambda: Pillars(density=2.0), "Use a lower density, or a smaller gap"),
