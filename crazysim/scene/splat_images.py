@@ -36,6 +36,9 @@ MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.999
 is not drawn there."""
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance below which nothing more is drawn in a pixel (Kerbl et al. 2023)."""
+MAX_LOG_SCALE = float(np.log(1e4))
+"""Largest logarithm of a standard deviation that is drawn, of 10 km: larger ones fill the image as well, and their
+squares overflow."""
 BLOCK_SIZE = 32
 """Number of Gaussians that are drawn at a time."""
 MAX_ALPHAS = 1 << 24
@@ -152,8 +155,8 @@ def _draw_with_splax(
     """Return the same as ``_draw_with_jax``. ``batch_size`` is not used, since kernels store no alphas."""
     del batch_size
     parameters = (
-        gaussians.pos, gaussians.log_scale, jnp.roll(gaussians.quat, 1, axis=-1), gaussians.color,
-        gaussians.logit_opacity,
+        gaussians.pos, jnp.minimum(gaussians.log_scale, MAX_LOG_SCALE), jnp.roll(gaussians.quat, 1, axis=-1),
+        gaussians.color, gaussians.logit_opacity,
     )  # fmt: skip
 
     def draw(view: Array) -> tuple[Array, Array]:
@@ -211,13 +214,16 @@ def _draw_image(
     y, x = (np.arange(n, dtype=np.float32) + 0.5 for n in (height, width))
     zero = jnp.zeros((height, width), gaussians.pos.dtype)
 
-    def blend(carry: tuple[Array, Array, Array], block: Array) -> tuple[tuple[Array, Array, Array], None]:
-        color, depth, transmittance = carry
+    def blend(carry: tuple[Array, ...], block: Array) -> tuple[tuple[Array, ...], None]:
+        # The transmittance includes the Gaussian at which a pixel is finished, which is not drawn, so that the next
+        # block knows it.
+        color, depth, coverage, transmittance = carry
         block_gaussians = jax.tree.map(lambda leaf: leaf[block], gaussians)
         center, (a, b, c), z, opacity = _project(block_gaussians, pos, rot, focal, width, height)
         dx, dy = (e[:, None, None] - p for e, p in zip(center, (x, y[:, None]), strict=True))
         a, b, c, opacity = (e[:, None, None] for e in (a, b, c, jnp.where(block < 0, 0.0, opacity)))
-        alpha = jnp.minimum(MAX_ALPHA, opacity * jnp.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy))
+        exponent = jnp.minimum(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy, 0.0)  # rounding may make it positive
+        alpha = jnp.minimum(MAX_ALPHA, opacity * jnp.exp(exponent))
         alpha = jnp.where(alpha < MIN_ALPHA, 0.0, alpha)
         remaining = transmittance * jnp.cumprod(1 - alpha, axis=0)
         alpha = jnp.where(remaining > MIN_TRANSMITTANCE, alpha, 0.0)
@@ -226,13 +232,12 @@ def _draw_image(
         # With the default precision, a GPU may round matrix products to 10 bits.
         color = color + jnp.einsum("kyx,kc->yxc", weight, gaussian_colors, precision="highest")
         depth = depth + jnp.sum(weight * z[:, None, None], axis=0)
-        return (color, depth, transmittance - jnp.sum(weight, axis=0)), None
+        return (color, depth, coverage + jnp.sum(weight, axis=0), remaining[-1]), None
 
-    start = jnp.zeros((height, width, 3), zero.dtype), zero, zero + 1
-    (color, depth, transmittance), _ = jax.lax.scan(blend, start, order)
-    coverage = 1 - transmittance
+    start = jnp.zeros((height, width, 3), zero.dtype), zero, zero, zero + 1
+    (color, depth, coverage, _), _ = jax.lax.scan(blend, start, order)
     is_covered = coverage > 0
-    color = jnp.clip(color + transmittance[..., None] * jnp.asarray(background, zero.dtype), 0.0, 1.0)
+    color = jnp.clip(color + (1 - coverage[..., None]) * jnp.asarray(background, zero.dtype), 0.0, 1.0)
     return color, jnp.where(is_covered, depth / jnp.where(is_covered, coverage, 1.0), 0.0), coverage
 
 
@@ -251,15 +256,14 @@ def _project(
     slopes = [jnp.clip(t, -s, s) for t, s in zip((u, v), _max_slopes(focal, width, height), strict=True)]
     rows = [scale[:, None] * (axis - t[:, None] * forward) for axis, t in zip((right, -up), slopes, strict=True)]
     quat = gaussians.quat * jax.lax.rsqrt(jnp.sum(gaussians.quat**2, axis=-1, keepdims=True))
-    deviation = jnp.exp(gaussians.log_scale)
+    deviation = jnp.exp(jnp.minimum(gaussians.log_scale, MAX_LOG_SCALE))
     axes = rotation.matrix(quat)
     px, py = (jnp.sum(row[:, :, None] * axes, axis=1) * deviation for row in rows)
-    xx, xy, yy = (
-        jnp.sum(px * px, axis=-1) + BLUR_VARIANCE,
-        jnp.sum(px * py, axis=-1),
-        jnp.sum(py * py, axis=-1) + BLUR_VARIANCE,
-    )
-    determinant = xx * yy - xy * xy
+    pxx, xy, pyy = (jnp.sum(p * q, axis=-1) for p, q in ((px, px), (px, py), (py, py)))
+    xx, yy = pxx + BLUR_VARIANCE, pyy + BLUR_VARIANCE
+    # ``xx * yy - xy * xy``, as a sum of positive terms: the difference of a needle may be rounded to zero.
+    normal = rotation.cross(px, py)
+    determinant = BLUR_VARIANCE * (BLUR_VARIANCE + pxx + pyy) + jnp.sum(normal * normal, axis=-1)
     opacity = jnp.where(is_near, jax.nn.sigmoid(gaussians.logit_opacity), 0.0)
     center = focal * u + width / 2, focal * v + height / 2
     return center, (yy / determinant, -xy / determinant, xx / determinant), z, opacity

@@ -21,6 +21,8 @@ from crazysim.tables import range_between, read_number
 
 N_COLORS = (1, 4, 9, 16)
 """Numbers of spherical harmonics up to degree 0, 1, 2 and 3."""
+COMPRESSED_SUFFIXES = (".spz", ".splat", ".ksplat", ".sog", ".sogs")
+"""Suffixes of files of compressed splats; ``.compressed.ply`` has the property ``packed_position``."""
 CENTRAL_PERCENTILES = (5.0, 95.0)
 """Percentiles of the coordinates between which the extent of splats is measured: a few splats are far outside."""
 
@@ -119,8 +121,16 @@ def spherical_harmonics(direction: Any, n: int) -> list[Any]:
 
 def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
     """Return the fields of ``Gaussians`` in the frame and unit of the file."""
+    compressed = ConfigError(
+        f"expected splats as an uncompressed .ply file, got {str(path)!r}, which is compressed. Convert it, for "
+        f"example with splat-transform or SuperSplat of PlayCanvas."
+    )
+    if Path(path).suffix.lower() in COMPRESSED_SUFFIXES:
+        raise compressed
     with wrap_read_errors(path, "a scene of Gaussian splats", "Use a .ply file of a program for Gaussian splatting."):
         vertex = read_ply(read_bytes(path, MAX_FILE_BYTES))["vertex"]
+    if "packed_position" in vertex:
+        raise compressed
     names = {
         "pos": ["x", "y", "z"],
         "quat": [f"rot_{k}" for k in (1, 2, 3, 0)],

@@ -92,6 +92,35 @@ def test_many_splats_are_blended_from_near_to_far(sim, draw_splats, tmp_path):
     np.testing.assert_allclose(image.color[1, 1], np.clip(color, 0, 1), atol=3e-4)  # it stops at 1e-4
 
 
+def test_a_finished_pixel_stays_finished_whatever_follows(sim, draw_splats):
+    """Invisible Gaussians shift those behind them into other blocks, and change nothing."""
+    eye = np.array([0.0, 0.0, 1.0])
+    visible = [
+        make_splat(eye + [1 + 0.1 * k, 0, 0], 1.0, opacity, (0.5, 0.5, 0.5))
+        for k, opacity in enumerate([0.9] * 3 + [0.99] + [0.2] * 50)
+    ]
+    hidden = [make_splat(eye + [0.5, 0, 0], 0.1, 1e-6, (1, 1, 1))] * 30
+    images = [
+        draw_splats(sim.data, jax.tree.map(lambda *x: jnp.concatenate(x), *visible, *hidden[:n])) for n in (0, 29, 30)
+    ]
+    for image in images[1:]:
+        np.testing.assert_allclose(image.coverage, images[0].coverage, atol=1e-5)
+        np.testing.assert_allclose(image.color, images[0].color, atol=1e-5)
+
+
+@pytest.mark.parametrize("log_scale", [(1000, 1000, 1000), (88, -3, -3), (-1000, -1000, 20), (5, -20, -20)])
+def test_law_07_splats_of_any_size_have_finite_images_and_gradients(sim, log_scale):
+    look = sim.scene.splat_fn(**SIZE, renderer="plain")
+    g = make_splat([2.0, 0.1, 1.0], 1.0, 0.9, (0.9, 0.5, 0.2)).replace(
+        log_scale=jnp.float32([log_scale]), quat=jnp.float32([[0.2, 0.4, 0.4, 0.8]])
+    )
+    image = look(sim.data, g)
+    assert np.all(np.asarray(image.coverage) <= 1)
+    slopes = jax.grad(lambda g: jnp.sum(look(sim.data, g).color))(g)
+    for x in jax.tree.leaves((image.color, image.coverage, slopes)):
+        assert np.isfinite(x).all()
+
+
 def sim_camera(sim, world, drone):
     """Return position and axes of a drone's camera, by MuJoCo."""
     sim.scene.sync_one(sim.data, world)
@@ -218,6 +247,14 @@ def test_law_09_wrong_splats_are_refused(sim, tmp_path, monkeypatch):
         write_splats(path, **changes)
         with pytest.raises(ConfigError, match=message):
             SplatScene(path)
+    compressed = tmp_path / "a.compressed.ply"
+    compressed.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+        b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(12)
+    )
+    for name in ("a.compressed.ply", "a.spz", "a.SPLAT"):
+        with pytest.raises(ConfigError, match="which is compressed"):
+            SplatScene(tmp_path / name)
     write_splats(path, n=0)
     with pytest.raises(ConfigError, match="which has none"):
         SplatScene(path)
