@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import PyTree, host_array, leaf, static
+from crazysim.pytree import PyTree, float_dtype, host_array, leaf, static
 
 SimParams = first_principles.Params | fitted.Params
 """Parameters of a dynamics model."""
@@ -61,6 +61,10 @@ class SimState(PyTree):
             torque=host_array(0.0, *shape, 3),
             rotor_vel=host_array(0.0, *shape, n_rotors),
         )
+
+
+STATE_SIZES = {"pos": 3, "quat": 4, "vel": 3, "ang_vel": 3, "force": 3, "torque": 3, "rotor_vel": 4}
+"""Numbers of each state of a drone; rotors of drones from first principles may be more."""
 
 
 class SimStateDeriv(PyTree):
@@ -253,6 +257,32 @@ def require_data(data: object) -> None:
     """Check that an argument is the data of a simulation."""
     if not isinstance(data, SimData):
         raise ConfigError(f"expected the data of a simulation, got {short_repr(data)}. Use sim.data.")
+
+
+def require_states(data: object, names: Iterable[str] = STATE_SIZES, *, batched: bool = True) -> None:
+    """Check that an argument is the data of a simulation, and shapes and types of its states.
+
+    Args:
+        data: The argument.
+        names: States to check.
+        batched: False to accept data of one world or of one drone, as functions of them receive it.
+    """
+    require_data(data)
+    states, core = data.states, data.core  # type: ignore[attr-defined]  # checked
+    batch: tuple[int, ...] = (core.n_worlds, core.n_drones)
+    n_axes = getattr(getattr(states, "pos", None), "ndim", 3) - 1
+    batch = batch if batched else batch[2 - min(max(n_axes, 0), 2) :]
+    for name in names:
+        x = getattr(states, name, None)
+        shape, dtype = getattr(x, "shape", None), getattr(x, "dtype", np.dtype(object))
+        rotor_vel = data.controls.rotor_vel if name == "rotor_vel" else None  # type: ignore[attr-defined]
+        expected = (*batch, STATE_SIZES[name] if rotor_vel is None else rotor_vel.shape[-1])
+        if shape != expected or dtype not in (np.float32, float_dtype()):
+            actual = short_repr(x) if shape is None else f"shape {shape} and type {dtype}"
+            raise ConfigError(
+                f"expected data.states.{name} as an array of shape {expected} and type float32, got {actual}. Use "
+                f"data.replace(states=data.states.replace({name}=...)) with an array like the one it replaces."
+            )
 
 
 def as_key(seed: int | Array) -> Array:

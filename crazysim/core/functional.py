@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
-from crazysim.core.data import SimData, command_shape, require_data
-from crazysim.core.settings import check_flag
+from crazysim.core.data import SimData, command_shape, require_data, require_states
+from crazysim.core.settings import check_flag, is_real
 from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError, short_repr
 
@@ -55,6 +55,7 @@ def state_control(
             setpoint and zeros otherwise. Must be None if the controller has no feedforward, such as Crazyflow's.
             (n_worlds, n_drones, 8)
     """
+    require_states(data)
     command, feedforward = check_setpoint(
         data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
     )
@@ -115,8 +116,7 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
         is_broadcastable = np.broadcast_shapes(array.shape, shape) == shape
     except ValueError:  # a list of lists of unequal lengths, or shapes that do not broadcast
         array, is_broadcastable = np.zeros(0), False
-    is_numeric = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
-    if not (is_broadcastable and is_numeric and (name == "yaw" or array.shape[-1:] == (3,))):
+    if not (is_broadcastable and is_real(array) and (name == "yaw" or array.shape[-1:] == (3,))):
         raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {short_repr(value)}")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise ConfigError(f"expected finite numbers as {name}, got {short_repr(value)}. Check its computation.")
@@ -143,7 +143,7 @@ def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = Fa
 
     Arguments and errors are as in ``state_control``.
     """
-    return stage_command(data, put_command(data, check_command(data, Control.attitude, controls, check_finite)))
+    return _stage_checked(data, Control.attitude, controls, check_finite)
 
 
 def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -151,7 +151,7 @@ def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors are as in ``state_control``.
     """
-    return stage_command(data, put_command(data, check_command(data, Control.body_rate, controls, check_finite)))
+    return _stage_checked(data, Control.body_rate, controls, check_finite)
 
 
 def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -159,7 +159,7 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 
     Arguments and errors are as in ``state_control``.
     """
-    return stage_command(data, put_command(data, check_command(data, Control.force_torque, controls, check_finite)))
+    return _stage_checked(data, Control.force_torque, controls, check_finite)
 
 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -167,7 +167,12 @@ def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors are as in ``state_control``.
     """
-    return stage_command(data, put_command(data, check_command(data, Control.rotor_vel, controls, check_finite)))
+    return _stage_checked(data, Control.rotor_vel, controls, check_finite)
+
+
+def _stage_checked(data: SimData, control: Control, controls: ArrayLike, check_finite: bool) -> SimData:
+    require_states(data)
+    return stage_command(data, put_command(data, check_command(data, control, controls, check_finite)))
 
 
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
@@ -277,7 +282,7 @@ def _as_command(
     # Host input of any type reaches the device with one dtype and placement, so nothing is traced or compiled again.
     if array.dtype == dtype:
         array = array.copy() if is_on_host else array.astype(dtype)
-    elif jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer):
+    elif is_real(array):
         with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
             array = array.astype(dtype)
     else:

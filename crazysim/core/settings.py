@@ -295,6 +295,11 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
     return read_numbers("rgba", rgba, range_between(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
 
 
+def is_real(array: Any) -> bool:
+    """Return whether an array has floating-point numbers or integers, neither bools nor complex numbers."""
+    return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+
+
 def as_mask(mask: object, *shapes: tuple[int, ...], item: str = "world") -> Array | None:
     """Return a mask as an array; None, which selects all items, is returned unchanged.
 

@@ -254,6 +254,8 @@ class Planner(NamedTuple):
         packed = drone_program.packed if drone_program is not None else ()
         rows = tuple(packed_rows(drone_program)) if drone_program is not None else ()
 
+        formats = _leaf_formats(data, programs[0].leaves if programs else ())
+
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
             leaves = replace_leaves([None] * n_leaves, inputs, values)
             outputs, flagged = run_programs(leaves, n_steps)
@@ -261,6 +263,7 @@ class Planner(NamedTuple):
 
         if programs and self.location.mesh is not None:
             advance = self._shard_over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
+        advance = _check_inputs(advance, [formats[i] for i in inputs])
         plan = Plan(
             engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_steps(advance)
         )
@@ -328,6 +331,38 @@ class Planner(NamedTuple):
             except Exception:
                 return f" in stage {stage.__name__!r}"
         return ""
+
+
+def _leaf_formats(data: SimData, program_leaves: Sequence[Leaf]) -> list[tuple[str, tuple[int, ...], Any]]:
+    """Return name, shape and type of each leaf of the data, followed by those of the leaves that passes add."""
+    paths = jax.tree_util.tree_leaves_with_path(data)
+    formats = [(f"data{jax.tree_util.keystr(path)}", x.shape, x.dtype) for path, x in paths]
+    return formats + [(leaf.name, leaf.shape, leaf.dtype) for leaf in program_leaves[len(formats) :]]
+
+
+def _device_dtype(x: Any) -> Any:
+    """Return the type that an array or a type of the host has on a device: float32 for float64, unless JAX has it."""
+    return jax.dtypes.canonicalize_dtype(getattr(x, "dtype", x), allow_extended_dtype=True)
+
+
+def _check_inputs(
+    advance: Callable[..., Any], formats: Sequence[tuple[str, tuple[int, ...], Any]]
+) -> Callable[..., Any]:
+    """Return a step that first compares the arrays that it gets with those that its kernels were written for.
+
+    A kernel reads memory as its program says, whatever the arrays are. The comparison takes place in tracing.
+    """
+
+    def checked_advance(values: list[Any], n_steps: int | Array) -> list[Any]:
+        for x, (name, shape, dtype) in zip(values, formats, strict=True):
+            if x.shape != shape or _device_dtype(x) != _device_dtype(dtype):
+                raise ConfigError(
+                    f"expected {name} of shape {shape} and type {dtype} in flat data, got {x.shape} and {x.dtype}. Use "
+                    f"the result of flatten or advance as it is."
+                )
+        return advance(values, n_steps)
+
+    return checked_advance
 
 
 def _jit_steps(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.data import MAX_STEPS, SimData, require_data
+from crazysim.core.data import MAX_STEPS, SimData, require_data, require_states
 from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, find_location
@@ -208,6 +208,15 @@ class Step:
         plan = self._plan(data, leaves, treedef, zeros, n_steps, separate)
         return FlatData(self._all_leaves(plan, leaves), plan)
 
+    def require_own(self, flat: object) -> None:
+        """Check that flat data is the result of ``flatten`` or ``advance`` of this step."""
+        if not isinstance(flat, FlatData) or flat.plan not in self._plans.values():
+            raise ConfigError(
+                f"expected flat data of this step, got "
+                f"{'that of another' if isinstance(flat, FlatData) else short_repr(flat)}. Use the result of flatten "
+                f"or advance of the same environment or step."
+            )
+
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
         """Return the data some steps later, still flattened."""
         plan = flat.plan
@@ -292,11 +301,22 @@ class Step:
         separate: SeparateLeaves = None,
     ) -> Plan:
         """Return the plan for data of this structure, from the cache if possible."""
-        zeros = self._zeros_cache(data, leaves, treedef) if zeros is None else zeros
-        other_location = self._find_other_location(data.states.pos)
-        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)
+        try:
+            zeros = self._zeros_cache(data, leaves, treedef) if zeros is None else zeros
+            other_location = self._find_other_location(data.states.pos)
+            key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)
+        except AttributeError:
+            require_states(data)
+            paths = jax.tree_util.tree_leaves_with_path(data)
+            for path, x in [(path, x) for path, x in paths if not hasattr(x, "dtype")]:
+                raise ConfigError(
+                    f"expected an array as data{jax.tree_util.keystr(path)}, got {short_repr(x)}. Use jnp.full_like of "
+                    f"the array that it replaces."
+                ) from None
+            raise
         plan = self._plans.get(key)
         if plan is None:
+            require_states(data)
             check_axes(data, data.core.n_worlds, data.core.n_drones)
             for stage in self.stages:
                 Axes(data).writable_scopes(stage)  # raises ConfigError for a population that does not exist

@@ -32,6 +32,7 @@ from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import leaf_indices
+from crazysim.sim.configuration import describe_data
 from crazysim.sim.sim import Sim
 
 
@@ -133,6 +134,7 @@ class Env(ABC):
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
             state = self._add_step_results(self._reset_episodes(state_of_data(data)))
+        self._known_structures.add(jax.tree.structure(state))
         if not is_traced([state.full_data.states.pos]):
             state = EnvState(put_on_device(state.full_data, self.sim.device)) if self.sim.mesh is None else state
             require_finite_start(self.task, state)
@@ -180,15 +182,15 @@ class Env(ABC):
             state: The state of all worlds.
             action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
         """
-        self._check_reset_mode(state)
+        self._check_state(state)
         with use_device_of(state.full_data.core.steps):
-            action = validate_action(action, state, self.actions)
+            action = validate_action(action, self._action_format, self.actions)
             data = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps, ())
             return EnvState(data).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
         """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
-        self._check_reset_mode(state)
+        self._check_state(state)
         record = leaf_indices(state.full_data).plugins[ENV_RECORD_NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS])
         return self.step_fn.flatten(state.full_data, (), self.n_substeps, frozenset(outputs))
@@ -198,19 +200,37 @@ class Env(ABC):
 
         Args:
             flat: Result of ``flatten`` or ``advance``.
-            action: Action of every drone, with the dtype of the state's action; not checked. (n_worlds, n_drones, k)
+            action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
         """
-        flat = flat.replace([flat.plan.leaf_indices.plugins[ENV_RECORD_NAME].next_action], [action])
-        return self.step_fn.advance(flat, self.n_substeps)
+        self.step_fn.require_own(flat)
+        i = flat.plan.leaf_indices.plugins[ENV_RECORD_NAME].next_action
+        action = validate_action(action, self._action_format, self.actions)
+        return self.step_fn.advance(flat.replace([i], [action]), self.n_substeps)
 
-    def _check_reset_mode(self, state: EnvState) -> None:
-        """Check that a state has the structure that steps of this environment return."""
-        expected = self.reset_policy is not None and self.reset_policy.keeps_final_obs
-        if expected != ("final_obs" in state.record.drone_info):
+    def _check_state(self, state: EnvState) -> None:
+        """Check that a state has the structure of the states of this environment."""
+        if not isinstance(state, EnvState):
+            raise ConfigError(f"expected a state of this environment, got {short_repr(state)}. Use env.reset(key).")
+        structure = jax.tree.structure(state)
+        if structure in self._known_structures:
+            return
+        expected = jax.eval_shape(self.reset, jax.random.key(0))
+        if structure not in self._known_structures:
             raise ConfigError(
-                f"expected a state of this environment, {'with' if expected else 'without'} info['final_obs'], got a "
-                f"state of another mode of automatic resets. Use the reset of this environment."
+                f"expected a state of this environment, {_describe_state(expected)}, got one of "
+                f"{_describe_state(state)}. Use the reset of this environment."
             )
+
+    @functools.cached_property
+    def _action_format(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of the actions of all worlds."""
+        shape = self.sim.n_worlds, self.sim.n_drones, self.actions.size
+        return jax.ShapeDtypeStruct(shape, self.sim.default_data.states.pos.dtype)
+
+    @functools.cached_property
+    def _known_structures(self) -> set[Any]:
+        """Structures of the states that ``reset`` has returned."""
+        return set()
 
     def _reset_episodes(self, state: EnvState) -> EnvState:
         """Return the state with new episodes in all worlds."""
@@ -391,6 +411,12 @@ class DroneEnv(Env):
         if mesh is not None:
             return shard(data, mesh)
         return data if is_traced([key]) else put_on_device(data, self.sim.device)
+
+
+def _describe_state(state: EnvState) -> str:
+    """Return what distinguishes the states of environments, for a message."""
+    names = {"observations": state.obs, "info": state.info, "memory": state.memory}
+    return ", ".join([describe_data(state.data), *(f"{key} {', '.join(names[key]) or 'none'}" for key in names)])
 
 
 def _set_keys(core: SimCore, key: Array) -> SimCore:

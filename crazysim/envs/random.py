@@ -34,7 +34,7 @@ def as_seed(seed: object) -> int | None:
 
 def check_key(key: object) -> None:
     """Check that an argument is a typed random key, or an array of typed random keys."""
-    if not isinstance(key, Array) or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if not isinstance(key, Array) or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or not key.size:
         raise ConfigError(
             f"expected a random key, got {short_repr(key)}. Use jax.random.key(0), or jax.random.wrap_key_data(key) "
             f"for a key of jax.random.PRNGKey."

@@ -13,7 +13,7 @@ from jax import Array
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
-from crazysim.envs.state import EnvState, Obs, validate_action
+from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import ConfigError, short_repr
 from crazysim.jaxcompat import is_key
 from crazysim.pytree import PyTree, select_worlds
@@ -106,6 +106,11 @@ def rollout(
                 f"expected initial_memory of shape ({n_worlds}, ...) = (n_worlds, ...), got {shapes[0]}. Use "
                 f"jnp.broadcast_to(x, (n_worlds, *x.shape))."
             )
+        if _formats(memory) != _formats(initial_memory):
+            raise ConfigError(
+                f"expected a memory of the shapes and types of initial_memory, {_formats(initial_memory)}, got "
+                f"{_formats(memory)}. Use the memory that a rollout of the same policy returned."
+            )
     # Only these leaves change: those that a step writes, and the flag that the scene is in sync with the data.
     carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf})
 
@@ -113,7 +118,7 @@ def rollout(
         flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]
         state = EnvState(flat_before.data())
         action, memory, extras = _evaluate(policy, state.obs, memory, key)
-        flat_after = env.advance(flat_before, validate_action(action, state, env.actions))
+        flat_after = env.advance(flat_before, action)
         new_state = EnvState(flat_after.data())
         if env.reset_policy is not None:  # the policy forgets where a new episode begins
             must_reset = env.reset_policy.must_reset(state.done, new_state)
@@ -136,12 +141,14 @@ def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array,
             f"expected a policy that returns (action, memory, extras), got {short_repr(results)}. A policy without "
             f"memory returns (action, memory, ()) with the memory that it receives."
         )
-    formats, new_formats = (
-        jax.tree.map(lambda x: (jnp.shape(x), jnp.asarray(x).dtype), tree) for tree in (memory, results[1])
-    )
-    if formats != new_formats:
+    if _formats(memory) != _formats(results[1]):
         raise ConfigError(
-            f"expected a policy that returns a memory of the shapes and types that it receives, {formats}, got "
-            f"{new_formats}. Pass initial_memory= of the shapes that it returns."
+            f"expected a policy that returns a memory of the shapes and types that it receives, {_formats(memory)}, "
+            f"got {_formats(results[1])}. Pass initial_memory= of the shapes that it returns."
         )
     return results[0], results[1], results[2]
+
+
+def _formats(tree: Any) -> Any:
+    """Return shape and type of every array of a tree."""
+    return jax.tree.map(lambda x: (jnp.shape(x), jnp.asarray(x).dtype), tree)

@@ -11,6 +11,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
+from crazysim.core.settings import is_real
+from crazysim.eager import is_traced
 from crazysim.envs.actions import Actions
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, leaf
@@ -209,27 +211,54 @@ def flatten(obs: Obs) -> Array:
 
 
 def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return actions for all worlds as a float32 host array, after checking shape and values. (n_worlds, ...)"""
+    """Return actions for all worlds as a float32 host array, after checking shape, type and values. (n_worlds, ...)"""
+    if isinstance(actions, Array) and not isinstance(actions, jax.core.Tracer):
+        actions = np.asarray(actions)
+    return np.asarray(read_action(actions, shape), np.float32)
+
+
+def validate_action(action: ArrayLike, expected: jax.ShapeDtypeStruct, actions: Actions) -> Array:
+    """Return an action of the expected dtype, after checking its shape and its type. (n_worlds, n_drones, k)
+
+    Args:
+        action: Action of every drone.
+        expected: Shape and dtype of actions of all worlds.
+        actions: Meaning of an action, for messages.
+    """
+    action = read_action(action, expected.shape, actions)
+    return (
+        action if isinstance(action, Array) and action.dtype == expected.dtype else jnp.asarray(action, expected.dtype)
+    )
+
+
+def read_action(action: Any, shape: tuple[int, ...], actions: Actions | None = None) -> Any:
+    """Return an action as an array after checking shape and type, and on the host that its numbers are finite.
+
+    Args:
+        action: The action.
+        shape: Shape that it must have.
+        actions: Meaning of an action, for messages; None if the shape says enough.
+    """
     try:
-        actions = np.asarray(actions, np.float32)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"expected actions as an array of numbers {shape}, got {short_repr(actions)}") from error
-    if actions.shape != shape:
-        raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
-    if not np.all(np.isfinite(actions)):
-        worlds = np.unique(np.nonzero(~np.isfinite(actions))[0])[:8]
-        raise ConfigError(f"expected finite actions, got NaN or infinity in world(s) {worlds.tolist()}")
-    return actions
-
-
-def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
-    """Return an action with the dtype of the state's action, after checking its shape. (n_worlds, n_drones, k)"""
-    if jnp.shape(action) != state.action.shape:
-        raise ValueError(
-            f"expected an action of shape {state.action.shape} = (n_worlds, n_drones, {actions.size}), got "
-            f"{jnp.shape(action)}. Actions of this environment: {actions}"
+        array = action if isinstance(action, Array) else (jnp if is_traced([action]) else np).asarray(action)
+    except (TypeError, ValueError):  # a list of lists of unequal lengths
+        array = np.asarray(None)
+    if not is_real(array):
+        raise ConfigError(
+            f"expected actions as an array of numbers {shape}, got {short_repr(action)} of type {array.dtype}. Use "
+            f"float32."
         )
-    return jnp.asarray(action, state.action.dtype)
+    if array.shape != shape:
+        axes = "" if actions is None else f" = (n_worlds, n_drones, {actions.size})"
+        remedy = "" if actions is None else f". Actions of this environment: {actions}"
+        raise ValueError(f"expected actions of shape {shape}{axes}, got {array.shape}{remedy}")
+    if isinstance(array, np.ndarray) and not np.isfinite(array).all():
+        worlds = np.unique(np.nonzero(~np.isfinite(array))[0])[:8]
+        raise ConfigError(
+            f"expected finite actions, got NaN or infinity in world(s) {worlds.tolist()}. Check the policy's weights "
+            f"and observations."
+        )
+    return array
 
 
 def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
@@ -244,6 +273,8 @@ def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
     goals = pos if isinstance(pos, Array) else read_numbers("pos", pos)
     goals = goals[:, None] if goals.ndim == 2 else goals
     has_batch_shape = all(n in (1, expected) for n, expected in zip(goals.shape, template.shape[:2], strict=False))
+    if not is_real(goals):
+        raise ConfigError(f"expected goals as real numbers, got type {goals.dtype}. Use float32.")
     if goals.shape[-1:] != (3,) or not (goals.ndim == 1 or (goals.ndim == 3 and has_batch_shape)):
         raise ConfigError(
             f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {template.shape}, got "

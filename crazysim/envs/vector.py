@@ -18,7 +18,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
-from crazysim.envs.state import EnvState, check_actions
+from crazysim.envs.state import EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError, short_repr
@@ -142,10 +142,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if self._outputs is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         shape = self.action_space.shape or ()
-        if not isinstance(actions, jax.Array):
-            actions = check_actions(actions, shape)
-        elif actions.shape != shape:
-            raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
+        actions = read_action(actions, shape) if isinstance(actions, jax.Array) else check_actions(actions, shape)
         self._outputs, terminated, truncated = self._stepper(actions)
         obs, reward, info = self._outputs
         if self.render_mode == "human":

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.core.branches import table_rows
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, require_states
 from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
@@ -118,6 +118,7 @@ def build_contact_fn(
     groups = [list(group) for _, group in groupby(bodies, _group_key)]
 
     def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
+        require_states(data, ("pos", "quat"), batched=False)
         require_poses(model, names, mocap)
         data = with_moved_objects(data, moving_plugins(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.core.data import SimData, require_data
+from crazysim.core.data import SimData, require_states
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
@@ -259,7 +259,7 @@ def build_depth_fn(
     model_without_mocap = model.without_mocap_bodies()
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
-        require_data(data)
+        require_states(data, ("pos", "quat"), batched=False)
         if data.states.pos.ndim == 1:
             raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]

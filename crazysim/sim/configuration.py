@@ -194,6 +194,15 @@ def _describe_leaf(leaf: Any) -> str:
     return f"an array of shape {leaf.shape} and type {leaf.dtype}" if has_type else short_repr(leaf)
 
 
+def describe_data(data: SimData) -> str:
+    """Return the settings and records of data for a message."""
+    core, controls = data.core, data.controls
+    records = ", ".join(f"{name} ({type(record).__name__})" for name, record in data.plugins.items())
+    is_fitted = controls.rotor_vel is None
+    settings = _describe_settings(core.n_worlds, core.n_drones, core.freq, controls.mode, is_fitted)
+    return f"{settings}, records {records or 'none'}"
+
+
 def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, is_fitted: bool) -> str:
     """Return the settings of data for a message."""
     dynamics = "fitted" if is_fitted else "first-principles"

@@ -330,7 +330,7 @@ def test_delayed_actions_arrive_after_their_steps(env):
 def test_a_wrong_action_is_refused_around_every_wrapper(env):
     for wrapped in (env, ActionDelay(env, 2)):
         state = wrapped.reset(jax.random.key(0))
-        with pytest.raises(ValueError, match=r"expected an action of shape \(4, 1, 4\) = .*, got \(4, 4\)"):
+        with pytest.raises(ValueError, match=r"expected actions of shape \(4, 1, 4\) = .*, got \(4, 4\)"):
             wrapped.step(state, jnp.zeros((4, 4)))
 
 

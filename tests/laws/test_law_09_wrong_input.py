@@ -259,7 +259,7 @@ def test_contacts_of_a_body_that_does_not_exist_name_those_that_do(sim, body):
     [
         (lambda d: d.replace(params=d.params.replace(mass=jnp.ones((3, 1)))), ("data.params.mass", "(3, 1)")),
         (lambda d: d.replace(params=d.params.replace(J=jnp.ones(3))), ("data.params.J", "(3,)")),
-        (lambda d: d.replace(states=d.states.replace(vel=jnp.zeros(3))), ("data.states.vel", "(3,)", "(3, 1)")),
+        (lambda d: d.replace(states=d.states.replace(vel=jnp.zeros(3))), ("data.states.vel", "(3,)", "(3, 1, 3)")),
         (lambda d: d.replace(core=d.core.replace(steps=jnp.zeros(3, jnp.int32))), ("data.core.steps", "(3,)")),
     ],
 )

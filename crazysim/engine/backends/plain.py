@@ -11,14 +11,14 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.data import SimData, require_data
+from crazysim.core.data import SimData, require_data, require_states
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import PHASES, Axes, Phase, Stage
 from crazysim.core.stages import nonfinite_worlds
 from crazysim.engine.backends import Run
 from crazysim.errors import ConfigError
-from crazysim.pytree import leaf_flags, replace_leaves
+from crazysim.pytree import check_axes, leaf_flags, replace_leaves
 
 
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
@@ -114,6 +114,9 @@ class Reset:
 
     def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
         """Return the data after a reset, without a compiled call."""
+        for x in (data, default_data):
+            require_states(x)
+            check_axes(x, x.core.n_worlds, x.core.n_drones)
         for name, fn in self._stages:
             with jax.named_scope(name):
                 data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
