@@ -46,6 +46,13 @@ SYSTEM_USERS = (0, 65534)
 """Ids of users that may own parent folders: root, and the user that containers show instead of an unmapped root."""
 
 
+def as_path(path: str | Path) -> Path:
+    """Return a path, after checking that it is a text or a path."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise ConfigError(f"expected the path of a file or folder, got {path!r}. Use a text, such as 'out/hover'.")
+    return Path(path)
+
+
 def is_file(path: str | Path) -> bool:
     """Return True if a file of that path exists, and False for text that cannot be a path."""
     try:
@@ -230,7 +237,7 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     Raises:
         ConfigError: If the folder does not exist, or the file cannot be written, for example on a full disk.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.parent.is_dir():
         raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
     if path.exists() and not path.is_file():
@@ -288,7 +295,7 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     Raises:
         ConfigError: If its name has another ending, the folder does not exist, or it cannot be written.
     """
-    if suffixes and Path(path).suffix.lower() not in suffixes:
+    if suffixes and as_path(path).suffix.lower() not in suffixes:
         raise ConfigError(
             f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}. Use another name."
         )

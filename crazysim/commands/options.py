@@ -84,9 +84,10 @@ def load_policy_and_env(
     Raises:
         ConfigError: If the run is damaged, or if the task has other observations.
     """
-    from crazysim.train.training import check_observations, load_policy
+    from crazysim.train.interface import check_policy
+    from crazysim.train.training import load_policy
 
-    policy, config, meta = load_policy(folder, task)
+    policy, config, _ = load_policy(folder, task)
     env = config.with_device(device).make_env(n_worlds)
-    check_observations(env, folder, config.title, meta)
+    check_policy(policy, env)
     return policy, config, env

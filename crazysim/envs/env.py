@@ -83,6 +83,12 @@ class Env(ABC):
         """Return the formats of observations that are images, by name; see ``Hooks.describe_images``."""
         return {name: entries for wrapper in self.wrappers for name, entries in wrapper.describe_images().items()}
 
+    @functools.cached_property
+    def observation_sizes(self) -> dict[str, int]:
+        """Sizes of the observations by name, in alphabetical order."""
+        shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
+        return {name: shapes[name].shape[-1] for name in sorted(shapes)}
+
     @property
     def reset_policy(self) -> ResetPolicy | None:
         """Rule by which new episodes begin within a step; None if steps begin no episodes."""

@@ -18,7 +18,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax import Array
 
@@ -34,12 +33,17 @@ from crazysim.pytree import PyTree, static
 from crazysim.train.convolution import find_images
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.interface import Interface, check_callable, describe_env, sizes_of
 from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
 from crazysim.train.optimizer import build_optimizer
 from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values, take_seed
 
 TEACHER_PREFIX = "teacher "
 """Prefix of the names of the teacher's observations."""
+NAN_TEACHER = (
+    "expected a teacher whose actions are numbers, got NaN in the states of the rollouts. Check teacher(obs) with "
+    "observations of the environment, or use another teacher."
+)
 
 
 @dataclass(frozen=True)
@@ -180,9 +184,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
     k_student, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
     state = env.reset(k_env)
     obs, teacher_obs = split_obs(state.obs)
-    teacher = _load_teacher(config.teacher, env, teacher_obs) if teacher is None else teacher
-    if isinstance(teacher, Policy) and teacher.has_memory:
-        raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
+    teacher = _load_teacher_run(config.teacher)[0] if teacher is None else teacher
+    _check_teacher(teacher, env, teacher_obs, config.teacher)
 
     sizes, convolution = {name: x.shape[-1] for name, x in obs.items()}, config.convolution
     images = find_images(sizes, env.image_formats()) if convolution else ()
@@ -203,7 +206,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``difference`` is the root mean square of the difference between the actions of student and teacher in
-    the states of the rollout; ``finite`` is True if weights, optimiser state, statistics and losses are finite.
+    the states of the rollout; ``finite`` is True if weights, optimiser state, statistics and losses are finite, and
+    ``taught`` if the teacher's actions are.
     """
     key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
     agents, swept_values, config = learner.agents.replace(key=key), stack_swept_values(configs), configs[0]
@@ -237,6 +241,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         "error": error.mean(axis=0),
         "difference": jnp.sqrt(difference.mean(axis=0)),
         "finite": finite,
+        "taught": jnp.isfinite(labels).all(axis=(0, 2, 3, 4)),
     }
     return Learner(agents, learner.teacher, state, learner.iteration + 1), metrics
 
@@ -264,8 +269,9 @@ def imitate(
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
 
     Raises:
-        ConfigError: If a hyperparameter is unknown or invalid.
-        DivergedError: If weights or losses become non-finite.
+        ConfigError: If a hyperparameter is unknown or invalid, or if a trained teacher has other observations, another
+            command level or another rate.
+        DivergedError: If weights or losses become non-finite, or the teacher's actions are NaN.
     """
     if not isinstance(config, (Mapping, type(None))):
         raise ConfigError(f"expected config as a dict of values by name, got {config!r}")
@@ -273,17 +279,23 @@ def imitate(
     if unknown := [name for name in config or {} if name not in names]:
         raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(unknown)}; use {', '.join(names)}")
     hyperparameters = Config(**config or {})
+    check_callable(teacher, env)
+    interface = Interface.read(describe_env(env))
     env = AutoReset(TeacherObservation(env, env.task.observe if observe is None else observe))
     learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher))(jax.random.key(seed)[None])
     metrics: dict[str, Array] = {}
+    taught: Any = True
     for i in range(hyperparameters.iterations):
         learner, metrics = iterate(learner, env, (hyperparameters,))
+        taught &= metrics["taught"].all()
         if on_iteration is not None:
             numbers = jax.device_get(metrics)
-            on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if name != "finite"})
+            on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if x.dtype != bool})
+    if not taught:
+        raise DivergedError(NAN_TEACHER)
     if not metrics["finite"].all():
         raise DivergedError("expected finite weights and losses, got NaN or infinity. Use a smaller learning_rate.")
-    return take_seed(learner.as_policy(), 0)
+    return take_seed(learner.as_policy(), 0).replace(interface=interface)
 
 
 def split_obs(obs: Obs) -> tuple[Obs, Obs]:
@@ -304,24 +316,26 @@ def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
     return load_policy(folder)
 
 
-def _load_teacher(folder: str, env: Env, teacher_obs: Obs) -> Policy:
-    """Return the policy of a run, after checking that its observations and actions match the environment."""
-    policy, _, meta = _load_teacher_run(folder)
-    sizes = {name: x.shape[-1] for name, x in teacher_obs.items()}
-    if sizes != meta["observations"]:
+def _check_teacher(teacher: Any, env: Env, teacher_obs: Obs, folder: str) -> None:
+    """Check that a teacher acts on its observations, and with the meaning of the student's actions."""
+    if isinstance(teacher, Policy) and teacher.has_memory:
+        raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
+    interface = getattr(teacher, "interface", None)
+    if isinstance(interface, Interface):
+        description = describe_env(env, sizes_of(teacher_obs)) | {"task": None, "task_code": None, "images": {}}
+        student = Interface.read(description)
+        if interface.level == student.level and not interface.has_ranges_of(student):
+            raise ConfigError(
+                f"expected a teacher whose actions have the meaning of the student's, {env.actions}, got "
+                f"{folder or 'a policy'} with centre and scale {interface.ranges}. Use the same drone for both."
+            )
+        interface.require(student, f"a student of the teacher {folder}".rstrip())
+    action, shape = jax.eval_shape(teacher, teacher_obs), (env.sim.n_worlds, env.sim.n_drones, env.actions.size)
+    if getattr(action, "shape", None) != shape:
         raise ConfigError(
-            f"expected a teacher that observes {sizes}, got {folder}, which observes {meta['observations']}. Train it "
-            f"again with this version."
+            f"expected actions of the teacher of shape {shape} = (n_worlds, n_drones, {shape[-1]}), got {action}. "
+            f"Use a function from the observations of all worlds to actions."
         )
-    actions, spec = env.actions, meta["actions"]
-    has_same_layout = actions.control.value == spec["level"] and actions.centre.shape == np.shape(spec["centre"])
-    if not (has_same_layout and np.allclose([actions.centre, actions.scale], [spec["centre"], spec["scale"]])):
-        raise ConfigError(
-            f"expected a teacher whose actions have the meaning of the student's, {actions}, got {folder} with "
-            f"{spec['level']} commands of centre {spec['centre']} and scale "
-            f"{spec['scale']}. Use the same control and drone for both."
-        )
-    return policy
 
 
 def _update_agent(

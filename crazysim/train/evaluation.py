@@ -17,6 +17,7 @@ from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
+from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policies, Policy
 
 EVALUATION_SEED = 0x5EED
@@ -144,7 +145,11 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         or at the end of the episode if the task defines ``succeeded``; NaN if there is none;
         ``reward``: mean return of an episode;
         ``reward NAME``: contribution of each term to the mean return.
+
+    Raises:
+        ConfigError: If a trained policy has other observations, another command level, rate or task.
     """
+    check_policy(policy, env)
     return evaluate_blocks(env, as_tree(policy), key)[0]
 
 

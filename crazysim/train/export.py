@@ -26,9 +26,10 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import ConfigError, not_installed
-from crazysim.storage import write_file
+from crazysim.errors import ConfigError, not_installed, short_repr
+from crazysim.storage import as_path, write_file
 from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
+from crazysim.train.interface import Interface, describe_env, sizes_text
 from crazysim.train.networks import Encoder, Gru, Policy
 
 OBSERVATION_DESCRIPTIONS = {
@@ -97,22 +98,12 @@ class PolicyNumbers(NamedTuple):
 
 def describe(env: Env) -> dict[str, Any]:
     """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
-    shapes = jax.eval_shape(env.reset, jax.random.key(0)).obs
     if env.actions.centre.ndim > 1:
         raise ConfigError(
             "expected an environment whose drones have the same actions, got drones of several airframes. Describe "
             "one with a single airframe for each of them."
         )
-    return {
-        "crazysim": crazysim.__version__,
-        "observations": {name: shapes[name].shape[-1] for name in sorted(shapes)},
-        "images": env.image_formats(),
-        "actions": {
-            "level": env.actions.control.value,
-            "centre": env.actions.centre.tolist(),
-            "scale": env.actions.scale.tolist(),
-        },
-    }
+    return describe_env(env)
 
 
 def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
@@ -198,10 +189,11 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     )
     actions = meta["actions"]
     properties = {"observations": meta["observations"], "units": _action_units(actions)} | actions
-    properties |= {name: meta[name] for name in ("settings", "images") if name in meta}
+    stored = ("settings", "images", "task", "freq", "task_code")
+    properties |= {name: meta[name] for name in stored if meta.get(name) is not None}
     helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in properties.items()})
     onnx.checker.check_model(model)
-    path = Path(path)
+    path = as_path(path)
     write_file(path, model.SerializeToString())
     return path
 
@@ -293,13 +285,18 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     state = f"{name}_state *state, " if n_memory else ""
     lines.append(f"static inline void {name}({state}const float observation[{n_obs}], float action[{n_actions}])")
     lines += ["{", *(f"    {line}" for line in _body_lines(name, numbers)), "}", "", f"#endif /* {guard} */", ""]
-    path = Path(path)
+    path = as_path(path)
     write_file(path, "\n".join(lines))
     return path
 
 
 def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     """Return the numbers of a policy after a check of their sizes and values."""
+    if not isinstance(policy, Policy):
+        raise ConfigError(f"expected a trained policy, got {short_repr(policy)}. Use the first result of load_policy.")
+    described = Interface.read(meta)
+    if policy.interface is not None:
+        policy.interface.require(described, "a description")
     if not policy.network.is_built_in:
         raise ConfigError(
             "expected a policy with the built-in network, got one with a custom network. Export it with its "
@@ -310,12 +307,11 @@ def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     body, convolutions = host_policy.body, ()
     if isinstance(body, Encoder):
         body, convolutions = body.memory, body.convolutions
-    n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
+    n_obs, n_actions = sum(described.sizes.values()), len(described.ranges)
     if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
         raise ConfigError(
-            f"expected a policy from {n_obs} observations "
-            f"({', '.join(f'{k} {n}' for k, n in meta['observations'].items())}) to {n_actions} actions, got one from "
-            f"{len(mean)} to {len(layers[-1][1])}; describe the environment that it was trained in"
+            f"expected a policy from {sizes_text(described.sizes)} to {n_actions} actions, got one from {len(mean)} to "
+            f"{len(layers[-1][1])}. Describe the environment that it was trained in."
         )
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)):
         raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
@@ -334,9 +330,11 @@ def _action_units(actions: Mapping[str, Any]) -> list[str]:
 
 def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that describe inputs and outputs."""
+    if meta.get("freq") is not None:
+        yield f"Policy of the task {meta['task']}, {meta['freq']} actions per second."
     yield "Observation, concatenated:"
     offset = 0
-    for name, size in meta["observations"].items():
+    for name, size in Interface.read(meta).observations:
         description = f": {OBSERVATION_DESCRIPTIONS[name]}" if name in OBSERVATION_DESCRIPTIONS else ""
         if name in meta.get("images", {}):
             description = ": image, row by row: " + json.dumps(meta["images"][name])

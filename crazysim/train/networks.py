@@ -24,6 +24,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.train.convolution import KERNEL_SIZE, Image, convolve, scale_depth
+from crazysim.train.interface import Interface, sizes_of, sizes_text
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
@@ -343,6 +344,8 @@ class Policy(PyTree):
     """Weights of the network."""
     network: Network = static(default=MEMORYLESS_NETWORK)
     """Network from normalised observations to features."""
+    interface: Interface | None = static(default=None)
+    """Observations and commands of the training; other observations are refused. None if they are unknown."""
 
     @property
     def has_memory(self) -> bool:
@@ -353,7 +356,7 @@ class Policy(PyTree):
         """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)
 
         Raises:
-            ConfigError: If the policy has a memory.
+            ConfigError: If the policy has a memory, or was trained with observations of other names or sizes.
         """
         if self.has_memory:
             raise ConfigError(
@@ -369,6 +372,11 @@ class Policy(PyTree):
             obs: Observations by name. (..., k) each
             memory: Memory before the step, with the leading axes of ``obs``; ``()`` for a policy without memory.
         """
+        sizes, n_obs = sizes_of(obs), self.stats.mean.shape[-1]
+        if self.interface is not None:
+            self.interface.require_observations(sizes)
+        elif sum(sizes.values()) != n_obs:
+            raise ConfigError(f"expected observations of {n_obs} numbers for this policy, got {sizes_text(sizes)}.")
         output, memory = forward(
             self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory
         )
@@ -384,6 +392,11 @@ class Policies(PyTree):
 
     policies: Policy
     """The policies, stacked. (n_seeds, ...) each"""
+
+    @property
+    def interface(self) -> Interface | None:
+        """Observations and commands of all policies."""
+        return self.policies.interface
 
     def __call__(self, obs: dict[str, Array]) -> Array:
         """Return the action, between -1 and 1, for observations. (n_worlds, n_drones, n_obs) -> (..., n_actions)"""

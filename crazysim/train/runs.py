@@ -12,6 +12,7 @@ import jax
 
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError, short_repr
+from crazysim.storage import as_path
 from crazysim.train.config import TrainConfig
 from crazysim.train.convolution import find_images
 from crazysim.train.hosts import is_first_host
@@ -84,7 +85,7 @@ def run(
     """
     _check_settings(settings, RUN_SETTINGS)
     config = TrainConfig.create(task, **settings)
-    folder = Path("out") / config.title if folder is None else Path(folder)
+    folder = Path("out") / config.title if folder is None else as_path(folder)
     train_settings = (evaluation_worlds, log, progress, checkpoint_every)
     if _train_teacher(config, folder, resume, *train_settings):
         config, resume = _with_teacher(config, folder), False
@@ -157,7 +158,7 @@ def run_many(
     variants = make_variants(seeds, sweep or {}, settings.get("config") or {})
     first_seed = next(iter(variants.values()))[0]
     config = TrainConfig.create(task, **settings, seed=first_seed)
-    folder = Path("out") / config.title if folder is None else Path(folder)
+    folder = Path("out") / config.title if folder is None else as_path(folder)
     train_settings = (evaluation_worlds, log, progress, checkpoint_every)
     has_teacher = _train_teacher(config, folder, resume, *train_settings)
     resume = resume and not has_teacher

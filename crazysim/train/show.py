@@ -22,6 +22,7 @@ from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points, draw_text
 from crazysim.storage import wrap_read_errors, write_figure
 from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
+from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
 
@@ -127,6 +128,7 @@ def plot_episode(
     Raises:
         ImportError: If matplotlib is not installed.
     """
+    check_policy(policy, env)
     key = jax.random.key(EVALUATION_SEED) if key is None else key
     flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
     terms, is_over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
@@ -245,6 +247,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         ImportError: If imageio-ffmpeg is not installed.
         RenderError: If this machine cannot render.
     """
+    check_policy(policy, env)
     sim, freq = env.sim, env.base.freq
     frame_steps = max(freq // 25, 1)
 

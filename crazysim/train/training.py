@@ -32,10 +32,10 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
-from crazysim.errors import ConfigError, DivergedError
+from crazysim.errors import ConfigError, DivergedError, warn
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
-from crazysim.storage import make_folder, open_replacement, write_file
+from crazysim.storage import as_path, make_folder, open_replacement, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
@@ -45,6 +45,7 @@ from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
 from crazysim.train.hosts import broadcast_decision, is_first_host, must_stop, require_same_settings
 from crazysim.train.hyperparameters import SWEEPABLE
+from crazysim.train.interface import Interface
 from crazysim.train.networks import Network, Policies, Policy, choose_network, init_weights
 from crazysim.train.seeds import take_seed
 
@@ -136,7 +137,7 @@ def train_many(
         DivergedError: If weights or losses of all trainings become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     path = folder / CHECKPOINT_FILE
     start_time = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
@@ -205,8 +206,9 @@ def train_many(
     @keep_programs()
     def compile_evaluation() -> tuple[dict[str, Any], str]:
         zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy_shapes)
-        evaluate_policies(zeros, None)
-        return describe(base_env), base_env.sim.explain().splitlines()[0]
+        description = describe(base_env)
+        evaluate_policies(zeros.replace(interface=Interface.read(description)), None)
+        return description, base_env.sim.explain().splitlines()[0]
 
     @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
@@ -220,8 +222,9 @@ def train_many(
         evaluation_future = executor.submit(compile_evaluation)
         (learner, kept_policies), (description, engine) = init_future.result(), evaluation_future.result()
         iterate, compile_s = iteration_future.result()
+    interface = Interface.read(description)
     for training, policy in zip(trainings, kept_policies, strict=True):
-        training.kept_policy = policy
+        training.kept_policy = policy.replace(interface=interface)
     n_done = saved_iteration = int(learner.iteration)
     save_time = time.perf_counter()
     steps_per_iteration = config.n_worlds * base_env.sim.n_drones * n_steps
@@ -256,7 +259,7 @@ def train_many(
 
     def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
         """Evaluate the policies, update the kept policies, write all files, and return the last point of each curve."""
-        iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy())
+        iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy()).replace(interface=interface)
         mark_diverged(metrics, iteration)
         is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
         results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
@@ -285,13 +288,19 @@ def train_many(
             if n_trainings > 1:
                 log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
         if all(training.divergence_iteration is not None for training in trainings):
+            is_taught = np.all(metrics.get("taught", True))
+            remedy = (
+                "Use a smaller learning_rate or max_grad_norm"
+                if is_taught
+                else "The teacher's actions are NaN: use another"
+            )
             names = [f" ({training.name})" * (n_trainings > 1) for training in trainings]
             diverged = [f"{x.divergence_iteration}{name}" for x, name in zip(trainings, names, strict=True)]
             kept = [f"{kept_point(x.curve)['iteration']}{name}" for x, name in zip(trainings, names, strict=True)]
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {', '.join(diverged)} of "
                 f"{config.title} by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY_FILE} of "
-                f"iteration {', '.join(kept)}. Use a smaller learning_rate or max_grad_norm, with another --out."
+                f"iteration {', '.join(kept)}. {remedy}, with another --out."
             )
 
     evaluation_period = find_recipe(config.task, config.algorithm).evaluate_every
@@ -442,7 +451,7 @@ def _host_metrics(metrics: dict[str, Array], points: list[dict[str, Any]] | None
 
     Metrics are floats, or arrays with one number for each training if there are several.
     """
-    numbers = {name: x for name, x in jax.device_get(metrics).items() if name != "finite"}
+    numbers = {name: x for name, x in jax.device_get(metrics).items() if x.dtype != bool}
     for name in points[0] if points else ():
         if name != "iteration":
             numbers[f"evaluation {name}"] = np.array([float(point[name]) for point in points])
@@ -499,11 +508,12 @@ def load_policy(
     Raises:
         ConfigError: If the folder holds no policy that this version can read, or its policy has another network.
     """
-    if Path(folder).is_file():
-        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {Path(folder).parent}.")
-    path = Path(folder) / POLICY_FILE
-    if not path.exists() and (Path(folder) / TABLE_FILE).exists():
-        names = [row["name"] for row in json.loads((Path(folder) / TABLE_FILE).read_text())]
+    folder = as_path(folder)
+    if folder.is_file():
+        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {folder.parent}.")
+    path = folder / POLICY_FILE
+    if not path.exists() and (folder / TABLE_FILE).exists():
+        names = [row["name"] for row in json.loads((folder / TABLE_FILE).read_text())]
         raise ConfigError(
             f"expected the folder of one training, got {str(folder)!r} with several. Use one of its folders: "
             f"{', '.join(names)}."
@@ -513,7 +523,8 @@ def load_policy(
         config = TrainConfig(**meta["settings"])
         if task is not None:
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
-        n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
+        interface = Interface.read(meta)
+        n_obs, n_actions = sum(interface.sizes.values()), len(interface.ranges)
         convolution = config.config["convolution"] if config.algorithm != "apg" else ()
         images = find_images(meta["observations"], meta["images"]) if convolution else ()
     if config.own_network != (network is not None):
@@ -529,36 +540,15 @@ def load_policy(
         weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
         return Policy(RunningStats.create(n_obs, used_network.pixels), weights.layers, weights.body, used_network)
 
-    return checkpoint.restore(path, arrays, jax.eval_shape(make_policy)), config, meta
+    if interface.freq is None:
+        warn(f"{path} is of an older version: the rate and the code of its task cannot be compared with an environment")
+    interface = interface if task is None else dataclasses.replace(interface, task=None)  # the caller names the task
+    policy = checkpoint.restore(path, arrays, jax.eval_shape(make_policy)).replace(interface=interface)
+    return policy, config, meta
 
 
 def _iterations_text(n: int) -> str:
     return "1 iteration" if n == 1 else f"{n} iterations"
-
-
-def check_observations(env: Env, folder: str | Path, title: str, meta: dict[str, Any]) -> None:
-    """Check that an environment has the observations of the policy of a run.
-
-    Args:
-        env: The environment.
-        folder: Folder of the run, for the message.
-        title: Title of the task of the environment, for the message.
-        meta: Description of the policy, from ``load_policy``.
-
-    Raises:
-        ConfigError: If their names or sizes differ.
-    """
-    sizes, expected = describe(env)["observations"], meta["observations"]
-    if sizes != expected:
-        raise ConfigError(
-            f"expected a task with the observations of the policy in {folder}, {_sizes_text(expected)}, got those of "
-            f"{title}, {_sizes_text(sizes)}. Use the task of the training, or train a policy of this task."
-        )
-
-
-def _sizes_text(sizes: dict[str, int]) -> str:
-    n = sum(sizes.values())
-    return f"{n} number{'s' * (n != 1)} ({', '.join(f'{name} {n}' for name, n in sizes.items())})"
 
 
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
@@ -581,7 +571,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
     Raises:
         ConfigError: If there is no intact checkpoint.
     """
-    path = Path(folder) / CHECKPOINT_FILE
+    path = as_path(folder) / CHECKPOINT_FILE
     meta = checkpoint.read(path)[1]
     with checkpoint.wrap_checkpoint_errors(path):
         return {name: TrainConfig(**run["settings"]) for name, run in meta["runs"].items()}

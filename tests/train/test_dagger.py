@@ -10,6 +10,7 @@ from crazysim import ConfigError, MotionCapture
 from crazysim.__main__ import main
 from crazysim.envs import Observe, make
 from crazysim.envs.state import flatten
+from crazysim.errors import DivergedError
 from crazysim.train import config as configs
 from crazysim.train import dagger, imitate, run, run_many
 from crazysim.train.config import Recipe, TrainConfig
@@ -37,6 +38,20 @@ def test_a_student_learns_the_actions_from_its_own_observations():
     assert student.stats.mean.shape == (15,)
     obs = jax.jit(env.reset)(jax.random.key(7)).obs
     assert student(obs).shape == (64, 1, 4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_teacher_of_nan_is_named(value):
+    """The learning rate is not to blame. Infinite actions are limited, like those of any policy."""
+
+    def teacher(obs):
+        return jnp.where(obs["vel"][..., :1] > -10.0, value, 0.0) * jnp.ones(4)
+
+    if np.isnan(value):
+        with pytest.raises(DivergedError, match=r"expected a teacher whose actions are numbers, got NaN"):
+            imitate(make("hover", 4), teacher, SMALL | {"iterations": 2})
+    else:
+        assert imitate(make("hover", 4), teacher, SMALL | {"iterations": 2}).interface.level == "attitude"
 
 
 def test_the_fraction_of_the_teachers_actions_decays():
@@ -165,8 +180,19 @@ def test_teachers_that_do_not_fit_are_errors(teacher, tmp_path):
         run("hover", str(tmp_path / "nothing"))
     with pytest.raises(ConfigError, match="a teacher whose task has the same record as 'track'"):
         run("track", str(teacher))
-    with pytest.raises(ConfigError, match="actions have the meaning of the student's"):
+    with pytest.raises(ConfigError, match="got body_rate commands in place of attitude commands"):
         run("hover", str(teacher), control="body_rate")
+    with pytest.raises(ConfigError, match="actions have the meaning of the student's"):
+        run("hover", str(teacher), drone="cf2x_L250")
+    with pytest.raises(ConfigError, match="got 100 Hz in place of 50 Hz"):
+        run("hover", str(teacher), freq=100)
+    with pytest.raises(ConfigError, match=r"got no ang_vel 3, .*no vel 3"):
+        imitate(make("hover", 4), load_policy(teacher)[0], observe=lambda data: {"pos": data.states.pos})
+    with pytest.raises(ConfigError, match=r"actions of the teacher of shape \(4, 1, 4\)"):
+        imitate(make("hover", 4), lambda obs: obs["pos"])
+    for wrong in (None, 5, "out/hover"):
+        with pytest.raises(ConfigError, match="expected a policy, got"):
+            imitate(make("hover"), wrong)
     with pytest.raises(ConfigError, match="expected hyperparameters of dagger, got rate"):
         imitate(make("hover"), steer, {"rate": 1.0})
     with pytest.raises(ConfigError, match="expected teacher as a text, got 3"):

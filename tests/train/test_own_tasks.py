@@ -111,7 +111,7 @@ def test_code_that_only_a_run_names_is_not_executed(file, tmp_path, monkeypatch,
     forget_tasks(monkeypatch)
     (tmp_path / "my_tasks.py").write_text("raise SystemExit('executed')")
     policy, config, _ = load_policy(tmp_path / "run")
-    assert policy({"x": np.zeros(policy.stats.mean.shape)}).shape == (4,)
+    assert policy({name: np.zeros(n) for name, n in policy.interface.sizes.items()}).shape == (4,)
     for _ in range(2):
         with pytest.raises(
             ConfigError, match=r"expected a task that you have named .*my_tasks\.py:High.*--task FILE\.py:High"

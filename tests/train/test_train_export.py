@@ -245,7 +245,7 @@ def test_every_command_level_is_described(tmp_path, policy, meta):
 def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, write):
     path = tmp_path / "policy"
     more = meta | {"observations": meta["observations"] | {"wind": 3}}
-    with pytest.raises(ConfigError, match=r"from 24 observations .*wind 3.* got one from 21 to 4"):
+    with pytest.raises(ConfigError, match=r"from 24 numbers .*wind 3.* got one from 21 to 4"):
         write(policy, path, more)
     broken = [(w, b.at[0].set(jnp.nan)) for w, b in policy.layers]
     with pytest.raises(ConfigError, match="expected finite weights, got NaN or infinity"):

@@ -13,6 +13,7 @@ from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.swarm import DroneState, Swarm
+from crazysim.train.interface import Interface
 
 
 class Link(Protocol):
@@ -84,8 +85,10 @@ def fly_policy(
         level: Command level.
 
     Raises:
-        ConfigError: If the link refuses a command.
+        ConfigError: If the link refuses a command, or a ``TrainedPolicy`` was trained with another level or rate.
     """
+    if isinstance(policy, TrainedPolicy):
+        policy.require_commands(Control(level).value, freq)
     states = []
     try:
         for _ in range(round(seconds * freq)):
@@ -117,14 +120,25 @@ class TrainedPolicy:
             meta: Description of the policy's inputs and outputs (``crazysim.train.export.describe``).
             goal: Position to fly to, m. (3,)
         """
-        self.policy, self.goal = policy, np.asarray(goal, float)
+        self.policy, self.goal, self.interface = policy, np.asarray(goal, float), Interface.read(meta)
+        if getattr(policy, "interface", None) is not None:
+            policy.interface.require(self.interface, "a description")  # type: ignore[attr-defined]
         self.reset()
-        self._names = list(meta["observations"])
+        self._names = list(self.interface.sizes)
         self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
         unknown_names = sorted(set(self._names) - set(self._compute_observations(_rest_state())))
         if unknown_names:
             raise ConfigError(
                 f"expected observations of a drone's state, got {', '.join(unknown_names)}. Use a policy without them."
+            )
+
+    def require_commands(self, level: str, freq: float) -> None:
+        """Check that a flight has the command level and the rate of the training, if they are known."""
+        if (level, freq) != (self.interface.level, self.interface.freq or freq):
+            raise ConfigError(
+                f"expected {self.interface.level} commands at {self.interface.freq or freq} Hz, as in the policy's "
+                f"training, got {level} commands at {freq} Hz. Use fly_policy(..., freq=meta['freq'], "
+                f"level=meta['actions']['level'])."
             )
 
     def reset(self) -> None:

@@ -25,6 +25,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.loop import Live
 from crazysim.storage import wrap_read_errors
 from crazysim.train.evaluation import act, initial_memory
+from crazysim.train.interface import check_policy
 
 ARRIVAL_DISTANCE = 0.15
 """Distance from a listed goal at which a drone continues to the next one, m."""
@@ -58,6 +59,7 @@ class PolicyPilot:
             ConfigError: If ``points`` are given for a task without goals that can be set, or one of them lies outside
                 of the task's arena.
         """
+        check_policy(policy, env)
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
         if self._points is not None and not len(self._points):
@@ -84,6 +86,11 @@ class PolicyPilot:
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
+        if live.control_freq != self.env.base.freq:
+            raise ConfigError(
+                f"expected a loop at the rate of the environment, {self.env.base.freq} Hz, got {live.control_freq} Hz. "
+                f"Use Live(env.sim, env.base.freq)."
+            )
         live.add(self, name="policy")
         live.on_click, live.goals = self.click, self.goals
 

@@ -1,0 +1,176 @@
+"""Observations and commands of a policy: its files keep them, and whatever flies, exports or imitates it compares."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import crazysim
+from crazysim.envs.env import Env
+from crazysim.errors import ConfigError, short_repr, warn
+from crazysim.train.task_code import task_digest
+
+REMEDY = (
+    "Use the environment of the training, config.make_env(n) with the config of load_policy, or train a policy for "
+    "this one."
+)
+
+
+@dataclass(frozen=True)
+class Interface:
+    """Observations and commands of a policy. What an older file does not say is None, and is not compared."""
+
+    observations: tuple[tuple[str, int], ...]
+    """Name and size of each observation, in the order of the inputs: alphabetical."""
+    images: tuple[tuple[str, int, int], ...]
+    """Name, height and width of the observations that are images."""
+    level: str
+    """Command level."""
+    ranges: tuple[tuple[float, float], ...]
+    """Command at a zero action, and its change per unit of action, of each component of the action."""
+    freq: int | None = None
+    """Actions per second, Hz."""
+    task: str | None = None
+    """Name of the task."""
+    task_code: str | None = None
+    """Hash of the code of the task; None if its source is unknown."""
+
+    @staticmethod
+    def read(meta: Mapping[str, Any]) -> Interface:
+        """Return the interface in a description, from ``describe`` or from the files of a run."""
+        try:
+            actions, images = meta["actions"], meta.get("images", {})
+            centre, scale = (np.asarray(actions[name], float).ravel().tolist() for name in ("centre", "scale"))
+            return Interface(
+                tuple(sorted((str(name), int(size)) for name, size in meta["observations"].items())),
+                tuple(sorted((name, x["height"], x["width"]) for name, x in images.items())),
+                str(actions["level"]),
+                tuple(zip(centre, scale, strict=True)),
+                *(meta.get(name) for name in ("freq", "task", "task_code")),
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"expected the description of a policy, got {short_repr(meta)}. Use the third result of load_policy, "
+                f"or describe(env)."
+            ) from error
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the observations by name."""
+        return dict(self.observations)
+
+    def require(self, other: Interface, source: str) -> None:
+        """Check that another interface is the same, and warn of what may have changed under the same names.
+
+        Args:
+            other: The other interface.
+            source: Whose interface it is, for the message.
+        """
+        differences = _size_differences(self.sizes, other.sizes)
+        differences += [
+            f"another shape of image {x[0]}" for x in other.images if x[0] in self.sizes if x not in self.images
+        ]
+        for mine, theirs, text in (
+            (self.level, other.level, "{} commands"),
+            (self.freq, other.freq, "{} Hz"),
+            (self.task, other.task, "task {!r}"),
+        ):
+            if None not in (mine, theirs) and mine != theirs:
+                differences.append(f"{text.format(theirs)} in place of {text.format(mine)}")
+        if differences:
+            raise ConfigError(
+                f"expected {source} with the interface of the policy, got {', '.join(differences)}. {REMEDY}"
+            )
+        if None not in (self.task_code, other.task_code) and self.task_code != other.task_code:
+            warn(
+                f"the code of task {self.task!r} differs from that of the policy's training: observations may have "
+                f"other units or contents under the same names"
+            )
+        if not self.has_ranges_of(other):
+            warn(f"actions of {source} have other ranges than in the policy's training, as of another drone")
+
+    def has_ranges_of(self, other: Interface) -> bool:
+        """Return True if actions are the same commands, to rounding."""
+        return len(self.ranges) == len(other.ranges) and np.allclose(self.ranges, other.ranges)
+
+    def require_observations(self, sizes: Mapping[str, int]) -> None:
+        """Check the names and sizes of observations."""
+        if differences := _size_differences(self.sizes, sizes):
+            raise ConfigError(
+                f"expected the observations of the policy, {sizes_text(self.sizes)}, got {', '.join(differences)}. "
+                f"{REMEDY}"
+            )
+
+
+def describe_env(env: Env, sizes: Mapping[str, int] | None = None) -> dict[str, Any]:
+    """Return the description of the interface of an environment, which JSON can represent.
+
+    Args:
+        env: The environment.
+        sizes: Sizes of the observations; None for those of the environment.
+    """
+    return {
+        "crazysim": crazysim.__version__,
+        "task": env.task.name or type(env.task).__name__,
+        "task_code": task_digest(type(env.task)),
+        "freq": env.base.freq,
+        "observations": env.observation_sizes if sizes is None else dict(sizes),
+        "images": env.image_formats(),
+        "actions": {
+            "level": env.actions.control.value,
+            "centre": env.actions.centre.tolist(),
+            "scale": env.actions.scale.tolist(),
+        },
+    }
+
+
+def check_policy(policy: Any, env: Env) -> None:
+    """Check that a policy is a function, and that the interface of a trained one is that of an environment.
+
+    A policy of a task also flies a task whose class is derived from it.
+    """
+    check_callable(policy, env)
+    interface = getattr(policy, "interface", None)
+    if isinstance(interface, Interface):
+        other = Interface.read(describe_env(env))
+        if interface.task in [vars(base).get("name") for base in type(env.task).__mro__]:
+            other = dataclasses.replace(other, task=interface.task)
+        interface.require(other, "an environment")
+
+
+def check_callable(policy: Any, env: Env) -> None:
+    """Check the types of a policy and an environment."""
+    if not isinstance(env, Env):
+        raise ConfigError(f"expected an environment, got {short_repr(env)}. Use crazysim.envs.make('hover', n_worlds).")
+    if not callable(policy):
+        raise ConfigError(
+            f"expected a policy, got {short_repr(policy)}. Use the first result of load_policy, or a function from "
+            f"observations to actions."
+        )
+
+
+def sizes_of(obs: Any) -> dict[str, int]:
+    """Return the sizes of observations by name, after checking that they are arrays by name."""
+    try:
+        return {name: np.shape(x)[-1] for name, x in obs.items()}
+    except (AttributeError, IndexError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"expected observations as a dict of arrays (..., k) by name, got {short_repr(obs)}. Use state.obs."
+        ) from error
+
+
+def sizes_text(sizes: Mapping[str, int]) -> str:
+    """Return the sizes of observations as text."""
+    n = sum(sizes.values())
+    return f"{n} number{'s' * (n != 1)} ({', '.join(f'{name} {n}' for name, n in sizes.items())})"
+
+
+def _size_differences(expected: Mapping[str, int], sizes: Mapping[str, int]) -> list[str]:
+    missing = [f"no {name} {n}" for name, n in expected.items() if name not in sizes]
+    extra = [f"{name} {n} in addition" for name, n in sizes.items() if name not in expected]
+    resized = [f"{name} {n} in place of {expected[name]}" for name, n in sizes.items() if expected.get(name, n) != n]
+    return missing + extra + resized
