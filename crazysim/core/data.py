@@ -253,6 +253,11 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
     return n_worlds, n_drones, command_size(control, n_rotors)
 
 
+def object_names(data: SimData) -> tuple[str, ...]:
+    """Return the names of the movable objects in data."""
+    return () if data.objects is None else data.objects.names
+
+
 def require_data(data: object) -> None:
     """Check that an argument is the data of a simulation."""
     if not isinstance(data, SimData):

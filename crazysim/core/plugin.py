@@ -237,6 +237,13 @@ class Plugin:
         """Return the record that resets restore; by default the result of ``record``."""
         return self.record(sim)
 
+    def carry_over(self, record: Any, old_record: Any) -> Any:
+        """Return the record after ``sim.replace`` or an edit of the scene, with states of the previous record.
+
+        Override it for states whose shape has changed. All other states are in ``record`` already.
+        """
+        return record
+
     def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
         """Return a record for all worlds, with values for the fields that are not passed.
 
@@ -268,7 +275,10 @@ class Plugin:
         return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:
-        """Check the simulation with all of its plugins, before its first step; plugins may be added in any order."""
+        """Check the simulation with all of its plugins, before its first step; plugins may be added in any order.
+
+        A plugin on which the check depends cannot be removed.
+        """
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import jax
@@ -115,6 +115,7 @@ class Step:
         *,
         device: jax.Device | None = None,
         strict: bool = False,
+        check_data: Callable[[SimData], None] | None = None,
     ):
         """Create the step of the stages that the pipeline has now.
 
@@ -125,6 +126,7 @@ class Step:
             mesh: Devices that the worlds are distributed over; None without a mesh.
             device: Device that the step runs on; None for any device of the platform.
             strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
+            check_data: Function that raises an error for data that the stages are not for; None for no check.
 
         Raises:
             ConfigError: If there is no engine of that name, or it cannot run here.
@@ -134,6 +136,7 @@ class Step:
         if engine == "fused" and (reason := fused.unavailable_reason(platform)):
             raise ConfigError(f"engine 'fused' cannot run here: {reason}. Use engine='lanes', or 'auto'.")
         self.engine, self.platform, self.mesh, self.strict = engine, platform, mesh, strict
+        self._check_data = check_data
         devices = tuple(mesh.devices.flat) if mesh is not None else None if device is None else (device,)
         self.location = Location(platform, devices, mesh, WORLD_AXIS)
         self.stages = as_stages(pipeline)
@@ -160,7 +163,10 @@ class Step:
         devices = self.location.devices
         device = devices[0] if self.mesh is None and devices is not None else None
         pipeline: Pipeline = {stage.__name__: stage for stage in stages}
-        return Step(pipeline, self.engine, self.platform, self.mesh, device=device, strict=self.strict)
+        return Step(
+            pipeline, self.engine, self.platform, self.mesh, device=device, strict=self.strict,
+            check_data=self._check_data,
+        )  # fmt: skip
 
     def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
         """Return the data some steps later.
@@ -314,6 +320,8 @@ class Step:
                     f"the array that it replaces."
                 ) from None
             raise
+        if self._check_data is not None:
+            self._check_data(data)
         plan = self._plans.get(key)
         if plan is None:
             require_states(data)

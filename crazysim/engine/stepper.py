@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
@@ -128,10 +129,13 @@ class Stepper:
         """
         return put_on_device(data, self.device) if self.mesh is None else shard(data, self.mesh)
 
-    def build(self, pipeline: Pipeline) -> Step:
-        """Make the step of a pipeline, use it from now on, and return it."""
+    def build(self, pipeline: Pipeline, check_data: Callable[[SimData], None] | None = None) -> Step:
+        """Make the step of a pipeline, use it from now on, and return it; ``check_data`` is as for ``Step``."""
         self._data = self.data  # it may be flattened for the previous step
-        self.step = Step(pipeline, self.engine, self.device.platform, self.mesh, device=self.device, strict=self.strict)
+        self.step = Step(
+            pipeline, self.engine, self.device.platform, self.mesh, device=self.device, strict=self.strict,
+            check_data=check_data,
+        )  # fmt: skip
         return self.step
 
     def advance(self, n_steps: int) -> None:

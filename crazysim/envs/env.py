@@ -365,6 +365,7 @@ class DroneEnv(Env):
         self.episode_reset = EpisodeReset(sim)
         """Resets of data at the start of an episode."""
         self._plugins, self._default_arrays = tuple(sim.plugins.values()), _default_arrays(sim)
+        sim.scene.environment = task.name
 
     @property
     def base(self) -> DroneEnv:

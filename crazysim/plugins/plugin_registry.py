@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.cache import keep_programs
-from crazysim.core.data import SimData
+from crazysim.core.data import Objects, SimData, object_names
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
@@ -32,14 +32,23 @@ _SETTING_SCOPES = ("parameter", "shared")
 """Scopes of leaves that contain settings. Leaves of all other scopes contain states."""
 
 
-class _InstalledPlugin(NamedTuple):
+@dataclasses.dataclass
+class _InstalledPlugin:
     """A plugin with the stages that it put into the step pipeline."""
 
     plugin: Plugin
-    stages: dict[str, Callable[..., Any]]
+    stages: dict[str, Callable[..., Any]] = dataclasses.field(default_factory=dict)
     """The stages by name."""
-    replaced: dict[str, tuple[str, Callable[..., Any]]]
+    replaced: dict[str, tuple[str, Callable[..., Any]]] = dataclasses.field(default_factory=dict)
     """Name and function of the stage that was replaced, by the name of the stage that replaced it."""
+    before: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Name of the stage before which a stage was inserted, by the name of the inserted stage."""
+    reads_in_record: bool = False
+    """True if the record depends on the scene."""
+    reads_in_stages: bool = False
+    """True if the stages depend on the scene."""
+    version: tuple[int, int] = (0, 0)
+    """``PluginRegistry.version`` for which the plugin last read the scene."""
 
 
 class PluginRegistry(Mapping[str, Plugin]):
@@ -51,6 +60,11 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
         self._is_checked = True
+        self._is_changing = False
+        self._n_changes = 0
+        self._last_revision = 0  # of the scene at the last refresh
+        self.is_stale = False
+        """True if scene or plugins have changed since ``refresh``."""
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin."""
@@ -87,10 +101,9 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_unused_names(plugin, self._sim.names)
         self._require_unique_terms(plugin, self.values())
         with self._restore_on_error():
-            record, default = plugin.record(self._sim), plugin.default_record(self._sim)
-            pipeline, installed = _add_stages(
-                dict(self._sim.step_pipeline), plugin, _stage_placements(plugin, self._sim)
-            )
+            record, default, reads_in_record = self._make_records(plugin)
+            pipeline, installed = self._make_stages(dict(self._sim.step_pipeline), plugin)
+            installed.reads_in_record = reads_in_record
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
             resets = dict(self._sim.reset_pipeline)
             if _is_in_reset_pipeline(plugin):
@@ -98,20 +111,169 @@ class PluginRegistry(Mapping[str, Plugin]):
             self._put_records(name, record, default)
             self._installed[name] = installed
             self._build(pipeline, resets)
+            installed.version = self.version
         return plugin
 
     def remove(self, plugin: Plugin | str) -> None:
         """Remove a plugin; see ``Sim.remove``."""
         name = plugin.name if isinstance(plugin, Plugin) else plugin
-        removed_plugin = self[name]
-        pipeline = _remove_stages(dict(self._sim.step_pipeline), self._installed[name])
-        pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
-        resets = dict(self._sim.reset_pipeline)
-        if _is_in_reset_pipeline(removed_plugin):
-            resets.pop(name, None)
-        self._put_records(name, None, None)
-        del self._installed[name]
-        self._build(pipeline, resets)
+        removed_plugin, sim = self[name], self._sim
+        others = [other for other in self.values() if other.name != name and self._unmet_need(other) is None]
+        with self._restore_on_error():
+            pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
+            pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
+            resets = dict(sim.reset_pipeline)
+            if _is_in_reset_pipeline(removed_plugin):
+                resets.pop(name, None)
+            if removed_plugin.moves_objects:
+                self._leave_objects(name)
+            self._put_records(name, None, None)
+            del self._installed[name]
+            for other in others:
+                if error := self._unmet_need(other):
+                    raise ConfigError(
+                        f"expected no plugin that needs {name!r}, got {type(other).__name__} {other.name!r}: {error} "
+                        f"Use sim.remove({other.name!r}) first."
+                    ) from error
+            self._build(pipeline, resets)
+            self._move_objects.pop(name, None)
+
+    def _unmet_need(self, plugin: Plugin) -> ConfigError | None:
+        """Return the error of a plugin that needs another one."""
+        try:
+            plugin.check_plugins(self._sim)
+        except ConfigError as error:
+            return error
+        return None
+
+    def _leave_objects(self, name: str) -> None:
+        """Put the objects of a plugin where it has moved them, as ordinary objects."""
+        sim, default = self._sim, self._sim.default_data
+        if default.objects is not None and not sim.data.objects.recorded:  # type: ignore[union-attr]
+            sim.default_data = default.replace(objects=self._moved_objects(name, default))
+            sim.data = sim.data.replace(objects=self._moved_objects(name, sim.data))
+
+    # The scene --------------------------------------------------------------------------------------------------------
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Numbers of the changes of the scene and of the plugins so far."""
+        return self._sim.scene.revision, self._n_changes
+
+    def mark_changed(self) -> None:
+        """Let plugins that read the scene read it again at the next use of the simulation."""
+        self._n_changes += 1
+        self.is_stale = True
+
+    def refresh(self) -> None:
+        """Make records and stages that depend on the scene again, if it or the plugins have changed since.
+
+        States, and numbers that were set in a record, stay as they are, as do edits of the pipeline.
+        """
+        if self._is_changing or not self.is_stale:
+            return
+        sim = self._sim
+        with self._restore_on_error():
+            pipeline = sim.step_pipeline
+            stages = dict(pipeline)
+            changed = [x for x in self._installed.values() if self._reads_scene(x) and x.version != self.version]
+            for installed in changed:
+                stages = self._read_scene(installed, stages)
+            # Functions of plugins, too, may read the scene while the step is traced.
+            if changed or (self._installed and self._last_revision != sim.scene.revision):
+                sim.step_pipeline = stages
+                sim.build_step_fn()
+                pipeline.clear()  # a user may hold the dict to edit it
+                pipeline.update(stages)
+                sim.step_pipeline = pipeline
+            for installed in self._installed.values():
+                installed.version = self.version
+            self._last_revision = sim.scene.revision
+        self.is_stale = False
+
+    @staticmethod
+    def _reads_scene(installed: _InstalledPlugin) -> bool:
+        return installed.reads_in_record or installed.reads_in_stages
+
+    def _read_scene(self, old: _InstalledPlugin, pipeline: Pipeline) -> Pipeline:
+        """Return the pipeline with new stages of a plugin, whose record is made again, too."""
+        sim, plugin, name = self._sim, old.plugin, old.plugin.name
+        if old.reads_in_record:
+            record, default, _ = self._make_records(plugin)
+            present = sim.data.plugins.get(name), sim.default_data.plugins.get(name)
+            self._put_records(
+                name, *[_carry_over(plugin, *xs, ()) for xs in zip((record, default), present, strict=True)]
+            )
+        edited = {stage: pipeline.get(stage) for stage, fn in old.stages.items() if pipeline.get(stage) is not fn}
+        for other in self._installed.values():
+            if any(old.stages[k] is fn for k in edited for _, fn in other.replaced.values()):
+                raise ConfigError(
+                    f"expected no edit of the scene after {other.plugin.name!r} has replaced a stage of {name!r}, "
+                    f"which reads the scene. Use sim.scene.add before sim.add({type(other.plugin).__name__}(...))."
+                )
+        sim.step_pipeline = _remove_stages({k: fn for k, fn in pipeline.items() if k not in edited}, old)
+        new_pipeline, new = self._make_stages(dict(sim.step_pipeline), plugin)
+        new.reads_in_record = old.reads_in_record
+        new.replaced |= {k: x for k, x in old.replaced.items() if k in edited}
+        self._installed[name] = new
+        present_stages = {k: fn for k, fn in (new_pipeline | edited).items() if fn is not None}
+        return _in_order(present_stages, list(pipeline), old, new)
+
+    def adapt_records(self, data: SimData, reference: SimData) -> SimData:
+        """Return data with records for the present scene, where they are for an earlier one.
+
+        Args:
+            data: The data.
+            reference: Data of the present scene.
+        """
+        for name, installed in self._installed.items() if not self._is_changing else ():
+            record, present = data.plugins.get(name), reference.plugins.get(name)
+            if installed.reads_in_record and record is not None and _signature(record) != _signature(present):
+                data = _with_record(data, name, _carry_over(installed.plugin, present, record, ()))
+        return data
+
+    def scene_check(self, reference: SimData) -> Callable[[SimData], None] | None:
+        """Return a function that raises an error for data of another scene; None if no plugin reads the scene.
+
+        Args:
+            reference: Data of the present scene.
+        """
+        if not any(map(self._reads_scene, self._installed.values())):
+            return None
+        scene, revision, names = self._sim.scene, self._sim.scene.revision, object_names(reference)
+        layouts = {
+            name: _layout(reference.plugins[name])
+            for name, installed in self._installed.items()
+            if installed.reads_in_record and name in reference.plugins
+        }
+
+        def check(data: SimData) -> None:
+            is_same = scene.revision == revision and object_names(data) == names
+            if is_same and all(_layout(data.plugins.get(name)) == layout for name, layout in layouts.items()):
+                return
+            raise ConfigError(
+                "expected the scene for which the step was built, which its plugins have read, got one that was edited "
+                "since, or data of another one. Use sim.step_fn and sim.data after sim.scene.add, or make the "
+                "environment then."
+            )
+
+        return check
+
+    def _make_records(self, plugin: Plugin) -> tuple[PyTree | None, PyTree | None, bool]:
+        """Return record and default record of a plugin, and whether they depend on the scene."""
+        n_reads = self._sim.scene.n_reads
+        record, default = plugin.record(self._sim), plugin.default_record(self._sim)
+        return record, default, self._sim.scene.n_reads != n_reads
+
+    def _make_stages(self, pipeline: Pipeline, plugin: Plugin) -> tuple[Pipeline, _InstalledPlugin]:
+        """Return the pipeline with the stages of a plugin, and the plugin with its changes to the pipeline."""
+        n_reads = self._sim.scene.n_reads
+        placements = _stage_placements(plugin, self._sim)
+        pipeline, installed = _add_stages(pipeline, plugin, placements)
+        installed.reads_in_stages = self._sim.scene.n_reads != n_reads
+        return pipeline, installed
+
+    # Changes ----------------------------------------------------------------------------------------------------------
 
     def replace(self, plugin: P) -> P:
         """Replace the settings of a plugin; see ``Sim.replace``."""
@@ -130,39 +292,45 @@ class PluginRegistry(Mapping[str, Plugin]):
         sim, name = self._sim, plugin.name
         self._require_unused_names(plugin, [other for other in sim.names if other not in self.members_of(old_plugin)])
         self._require_unique_terms(plugin, [other for other in self.values() if other is not old_plugin])
-        old_record, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
+        old_record, (record, default, reads_in_record) = sim.data.plugins.get(name), self._make_records(plugin)
         if _have_same_code(old_plugin, plugin) and jax.tree.structure(old_record) == jax.tree.structure(record):
-            self._put_records(name, _carry_over_states(record, old_record), default)
-            self._installed[name] = self._installed[name]._replace(plugin=plugin)
+            self._put_records(name, _carry_over(plugin, record, old_record), default)
+            self._installed[name] = dataclasses.replace(self._installed[name], plugin=plugin)
             self._is_checked = False
             return plugin
         # The plugin's stages must be created for a pipeline without the plugin.
         sim.step_pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
-        pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _stage_placements(plugin, sim))
+        pipeline, installed = self._make_stages(dict(sim.step_pipeline), plugin)
+        installed.reads_in_record = reads_in_record
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
         if _is_in_reset_pipeline(plugin) and (name in resets or not _is_in_reset_pipeline(old_plugin)):
             resets[name] = Stage(plugin.reset_episode, plugin.scope)
         elif _is_in_reset_pipeline(old_plugin):
             resets.pop(name, None)
-        self._put_records(name, _carry_over_states(record, old_record), default)
+        self._put_records(name, _carry_over(plugin, record, old_record), default)
         self._installed[name] = installed
         self._build(pipeline, resets)
+        installed.version = self.version
         return plugin
 
     @contextlib.contextmanager
     def _restore_on_error(self) -> Iterator[None]:
         """Restore the simulation and its scene if an error ends the block."""
-        sim, installed = self._sim, dict(self._installed)
-        data, default, steps, resets = sim.data, sim.default_data, sim.step_pipeline, sim.reset_pipeline
-        with sim.scene.restore_on_error():
+        sim, installed, was_changing = self._sim, dict(self._installed), self._is_changing
+        self._is_changing = True  # plugins read the scene again after the change
+        try:
+            data, default, steps, resets = sim.data, sim.default_data, sim.step_pipeline, sim.reset_pipeline
             try:
-                yield
+                with sim.scene.restore_on_error():
+                    yield
             except BaseException:
                 self._installed = installed
                 sim.step_pipeline, sim.reset_pipeline = steps, resets
                 sim.data, sim.default_data = data, default
                 raise
+        finally:
+            self._is_changing = was_changing
 
     @staticmethod
     def members_of(plugin: Plugin) -> tuple[str, ...]:
@@ -238,10 +406,14 @@ class PluginRegistry(Mapping[str, Plugin]):
             return data
         for name, plugin in self.items():
             if plugin.moves_objects:
-                if self._move_objects.get(name, (None, None))[0] is not plugin:
-                    self._move_objects[name] = plugin, jax.jit(vmap_worlds(plugin.move_objects))
-                data = data.replace(objects=self._move_objects[name][1](data))
+                data = data.replace(objects=self._moved_objects(name, data))
         return data
+
+    def _moved_objects(self, name: str, data: SimData) -> Objects:
+        plugin = self[name]
+        if self._move_objects.get(name, (None, None))[0] is not plugin:
+            self._move_objects[name] = plugin, jax.jit(vmap_worlds(plugin.move_objects))
+        return self._move_objects[name][1](data)
 
     def draw(self, world: int) -> None:
         """Draw the overlays of all plugins into the next image of a world."""
@@ -269,6 +441,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def _build(self, pipeline: Pipeline, resets: Pipeline) -> None:
         """Set the pipelines of step and reset, and build the step function."""
         self._is_checked = False
+        self.mark_changed()
         if resets != self._sim.reset_pipeline:
             self._sim.reset_pipeline = resets
         self._sim.step_pipeline = pipeline
@@ -307,7 +480,7 @@ def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple
             f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
             f"[StagePlacement(stage, before='increment_steps')]."
         )
-    installed = _InstalledPlugin(plugin, {}, {})
+    installed = _InstalledPlugin(plugin)
     for placement in placements:
         pipeline = _add_stage(pipeline, placement, placement.name or plugin.name, installed)
     return pipeline, installed
@@ -320,6 +493,7 @@ def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, install
         raise ConfigError(f"the step pipeline already has a stage {name!r}. Use sim.add(..., name=...).")
     installed.stages[name] = placement.stage
     if replaced is None:
+        installed.before[name] = placement.before
         insert_fn_before(pipeline, placement.before, placement.stage, name)
         return pipeline
     installed.replaced[name] = (replaced, pipeline[replaced])
@@ -378,7 +552,51 @@ def _are_equal(a: Any, b: Any) -> bool:
         return False
 
 
-def _carry_over_states(record: PyTree | None, old_record: PyTree | None) -> PyTree | None:
+def _in_order(pipeline: Pipeline, names: list[str], old: _InstalledPlugin, new: _InstalledPlugin) -> Pipeline:
+    """Return a pipeline with the stages of a plugin in the order of an earlier one.
+
+    Stages that the plugin did not have are beside its stages that are inserted before the same stage.
+
+    Args:
+        pipeline: The pipeline.
+        names: Names of the earlier pipeline, in order.
+        old: The plugin in the earlier pipeline.
+        new: The plugin in the pipeline.
+    """
+    moved = {name for name in new.stages if (name in new.replaced) != (name in old.replaced)}
+    order, previous = [name for name in names if name in pipeline and name not in moved], None
+    for name in pipeline:
+        if name not in order:
+            anchor = new.before.get(name, "")
+            beside = [x for x in new.stages if (x == name or x in order) and new.before.get(x) == anchor]
+            k = beside.index(name) if beside else 0
+            index = 0 if previous is None else order.index(previous) + 1
+            if len(beside) > 1:
+                index = order.index(beside[k - 1]) + 1 if k else order.index(beside[1])
+            order.insert(index, name)
+        previous = name
+    return {name: pipeline[name] for name in order}
+
+
+def _carry_over(
+    plugin: Plugin, record: PyTree | None, old_record: PyTree | None, setting_scopes: Sequence[str] = _SETTING_SCOPES
+) -> PyTree | None:
+    """Return a record with the states of the previous record, as far as possible.
+
+    Args:
+        plugin: The plugin.
+        record: The new record.
+        old_record: The previous record.
+        setting_scopes: Scopes of leaves that are not states; empty to carry over settings, too.
+    """
+    carried_record = _carry_over_states(record, old_record, setting_scopes)
+    is_same_kind = carried_record is not None and type(carried_record) is type(old_record)
+    return plugin.carry_over(carried_record, old_record) if is_same_kind else carried_record
+
+
+def _carry_over_states(
+    record: PyTree | None, old_record: PyTree | None, setting_scopes: Sequence[str]
+) -> PyTree | None:
     """Return a record with the states of the previous record, wherever structure, shape and type agree."""
     if record is None or type(record) is not type(old_record):
         return record
@@ -386,8 +604,8 @@ def _carry_over_states(record: PyTree | None, old_record: PyTree | None) -> PyTr
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
         new, old = getattr(record, f.name), getattr(old_record, f.name)
         if isinstance(new, PyTree):
-            states[f.name] = _carry_over_states(new, old)
-        elif not f.metadata.get("static") and f.metadata.get("scope") not in _SETTING_SCOPES:
+            states[f.name] = _carry_over_states(new, old, setting_scopes)
+        elif not f.metadata.get("static") and f.metadata.get("scope") not in setting_scopes:
             states[f.name] = old if _signature(old) == _signature(new) else new
     return record.replace(**states)
 
@@ -395,6 +613,11 @@ def _carry_over_states(record: PyTree | None, old_record: PyTree | None) -> PyTr
 def _signature(tree: object) -> tuple[object, list[tuple[object, ...]]]:
     """Return the structure of a tree, and the shapes and types of its leaves."""
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
+
+
+def _layout(record: PyTree | None) -> tuple[object, list[tuple[int, ...]]]:
+    """Return the structure of a record, and the shapes of its leaves without their first axis."""
+    return jax.tree.structure(record), [jnp.shape(x)[1:] for x in jax.tree.leaves(record)]
 
 
 def _no_observations(_data: SimData, **_: Any) -> dict[str, Array]:

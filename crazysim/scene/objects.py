@@ -246,7 +246,7 @@ class SceneObjects:
         return bool(added)
 
     def build_record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
-        """Return the record of the movable objects: poses of an earlier record, then initial poses of newer objects.
+        """Return the record of the movable objects: poses of an earlier record, and initial poses of other objects.
 
         Args:
             previous: Earlier record, or None.
@@ -254,16 +254,17 @@ class SceneObjects:
         """
         if not self._initial_poses:
             return None
+        names = self.movable
         pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in zip(*self._initial_poses, strict=True))
-        poses = pos, quat, np.zeros_like(pos)
+        poses = [pos, quat, np.zeros_like(pos)]
         if previous is not None:
-            n, previous_poses = len(previous.names), (previous.pos, previous.quat, previous.vel)
-            poses = tuple(
-                np.concatenate([x, initial[..., n:, :]], axis=-2)
-                for x, initial in zip(previous_poses, poses, strict=True)
-            )
+            old_rows = {name: k for k, name in enumerate(previous.names)}
+            rows = [k for k, name in enumerate(names) if name in old_rows]
+            kept_rows = [old_rows[names[k]] for k in rows]
+            for new, old in zip(poses, (previous.pos, previous.quat, previous.vel), strict=True):
+                new[..., rows, :] = np.asarray(old)[..., kept_rows, :]
         pos, quat, vel = (device_array(x) for x in poses)
-        return Objects(pos, quat, vel, device_array(mocap_ids, np.int32), self.movable)
+        return Objects(pos, quat, vel, device_array(mocap_ids, np.int32), names)
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:

@@ -59,6 +59,10 @@ class Scene:
     revision: int
     """Number of edits of the spec so far. The compiled model, and the objects and mocap ids in the data, each have the
     revision at which they were made; they are updated when it differs from this number."""
+    n_reads: int
+    """Number of reads of the compiled scene so far, which tells whether a plugin has read it."""
+    environment: str | None
+    """Name of the task of an environment that was made of the simulation, after which no objects can be added."""
 
     def __init__(
         self,
@@ -97,7 +101,8 @@ class Scene:
         self.plugins = plugins
         self.ray_kernels = ray_kernels
         self.splats = None
-        self.revision = self._compiled_revision = 0
+        self.revision = self._compiled_revision = self.n_reads = 0
+        self.environment = None
         self._compile()
 
     def add(
@@ -113,7 +118,9 @@ class Scene:
     ) -> Handle:
         """Add objects to the scene, and return the handle that moves and selects them.
 
-        The scene is compiled at its next use, once for all objects that were added since the last compilation.
+        The scene is compiled at its next use, once for all objects that were added since the last compilation. Plugins
+        that read the scene, such as range finders, see the objects, whether they were added before or after them. They
+        read the scene again at the next use of the simulation, whose step is then compiled again.
 
         Args:
             source: ``"gate"``, ``"box"``, ``"pole"``, ``"cylinder"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or
@@ -126,6 +133,12 @@ class Scene:
                 ``pos`` in all worlds.
             **options: Settings of a primitive: lengths, m, and ``rgba``; see ``crazysim.scene.primitives``.
         """
+        if self.environment is not None:
+            raise ConfigError(
+                f"expected objects before an environment is made, got {short_repr(source)} after one of the task "
+                f"{self.environment!r}, which would not see it. Use sim.scene.add before DroneEnv(sim, ...), in "
+                f"Task.install, or in a new simulation."
+            )
         with self.restore_on_error():
             handle = self.added_objects.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
@@ -204,7 +217,8 @@ class Scene:
         self._compiled_revision = self.revision
 
     def compile_if_edited(self) -> None:
-        """Compile the spec if it has been edited since the last compilation."""
+        """Compile the spec if it has been edited since the last compilation; called at every read of the model."""
+        self.n_reads += 1
         if self._is_edited:
             self._compile()
             self._compiled_revision = self.revision

@@ -19,7 +19,7 @@ from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
 from crazysim.core.airframes import AirframeSource, drone_names, find_common_airframe
-from crazysim.core.data import SimData, as_key
+from crazysim.core.data import SimData, as_key, object_names
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import BuiltPipeline, Pipeline
 from crazysim.core.plugin import Plugin, check_plugin_list
@@ -178,7 +178,7 @@ class Sim:
         self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        self._built_step = BuiltPipeline("step_pipeline", stages, self._stepper.build)
+        self._built_step = BuiltPipeline("step_pipeline", stages, self._build_step)
         self._built_reset = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
         for plugin in first_plugins:
             self.add(plugin)
@@ -262,8 +262,9 @@ class Sim:
     @data.setter
     @locked
     def data(self, data: SimData) -> None:
+        self._adopt_scene()
         self.configuration.check(data, self._default_data)
-        self._stepper.assign(data)
+        self._stepper.assign(self._adapt_to_scene(data))
 
     @property
     def default_data(self) -> SimData:
@@ -273,17 +274,34 @@ class Sim:
 
     @default_data.setter
     def default_data(self, data: SimData) -> None:
+        self._adopt_scene()
         self.configuration.check(data, self._default_data)
-        self._default_data = self._stepper.put_on_device(data)
+        self._default_data = self._stepper.put_on_device(self._adapt_to_scene(data))
 
     def _adopt_scene(self) -> None:
-        """Update the objects and mocap ids in the data after an edit of the scene, without compiling the scene."""
-        if self._adopted_revision == self._scene.revision:
+        """After an edit of the scene, update objects and mocap ids in the data, and the plugins that read the scene.
+
+        Only these plugins compile the scene.
+        """
+        if self._adopted_revision == self._scene.revision and not self.plugins.is_stale:
             return
         with self.lock, jax.ensure_compile_time_eval():  # keeps arrays from becoming tracers inside a user's trace
-            self._adopted_revision = self._scene.revision
-            self.data = self._update_objects(self._stepper.data)
-            self._default_data = self._stepper.put_on_device(self._update_objects(self._default_data))
+            if self._adopted_revision != self._scene.revision:
+                self._adopted_revision = self._scene.revision
+                self._stepper.assign(self._update_objects(self._stepper.data))
+                self._default_data = self._stepper.put_on_device(self._update_objects(self._default_data))
+                self.plugins.is_stale = True
+            self.plugins.refresh()
+
+    def _adapt_to_scene(self, data: SimData) -> SimData:
+        """Return data that may be from before an edit of the scene with the present objects and records."""
+        if object_names(data) != object_names(self._default_data):
+            data = self._update_objects(data)
+        return self.plugins.adapt_records(data, self._default_data)
+
+    def _build_step(self, pipeline: Pipeline) -> Step:
+        """Build a step that refuses data of another scene if one of its plugins has read the scene."""
+        return self._stepper.build(pipeline, self.plugins.scene_check(self._default_data))
 
     def _update_objects(self, data: SimData) -> SimData:
         ids = device_array(self._scene.drone_mocap_ids, np.int32)
@@ -319,6 +337,7 @@ class Sim:
         self.data = shard(self.data, mesh)
         self.default_data = shard(default, mesh)
         self._scene.shard(mesh)
+        self.plugins.mark_changed()  # images need other kernels
         self._queries = SceneQueries(self._scene)
         self.build_step_fn()
         return self.data
@@ -349,8 +368,10 @@ class Sim:
     def remove(self, plugin: Plugin | str) -> None:
         """Remove a plugin, with its record and its stages; stages that it had replaced return.
 
+        Objects that it moved, such as loads, stay in the scene where they are.
+
         Raises:
-            ConfigError: If one of its stages has been replaced since.
+            ConfigError: If one of its stages has been replaced since, or another plugin needs it; nothing is removed.
         """
         self.plugins.remove(plugin)
 
@@ -426,6 +447,7 @@ class Sim:
     @property
     def step_pipeline(self) -> Pipeline:
         """Stages of a step by name, in their order. An edit takes effect at the next step, which compiles again."""
+        self._adopt_scene()
         return self._built_step.stages
 
     @step_pipeline.setter
@@ -445,6 +467,7 @@ class Sim:
     @locked
     def step_fn(self) -> Step:
         """The step of the pipeline as it is now, ``step(data, n_steps=1) -> data``, pure."""
+        self._adopt_scene()
         self.plugins.check()
         return self._built_step.fn()
 
@@ -452,16 +475,22 @@ class Sim:
     @locked
     def reset_fn(self) -> Reset:
         """The reset of the pipeline as it is now, ``reset(data, default_data, mask=None) -> data``, pure."""
+        self._adopt_scene()
         return self._built_reset.fn()
 
     @locked
     def build_step_fn(self) -> Step:
-        """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure."""
+        """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure.
+
+        If plugins read the scene, the step is for the present scene, and refuses data after an edit of the scene.
+        """
+        self._adopt_scene()
         return self._built_step.build()
 
     @locked
     def build_reset_fn(self) -> Reset:
         """Return a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
+        self._adopt_scene()
         return self._built_reset.build()
 
     # Stepping ---------------------------------------------------------------------------------------------------------

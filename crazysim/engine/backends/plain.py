@@ -102,11 +102,19 @@ class Reset:
         """
         require_data(data)
         require_data(default_data)
-        if (data.core.n_worlds, data.core.n_drones, data.controls.mode) != (
-            default_data.core.n_worlds, default_data.core.n_drones, default_data.controls.mode,
-        ):  # fmt: skip
+        shared_records = data.plugins.keys() & default_data.plugins.keys()
+        layout, default_layout = (
+            (
+                x.core.n_worlds, x.core.n_drones, x.controls.mode, jax.tree.structure(x.objects),
+                [(jax.tree.structure(x.plugins[name]), [*map(jnp.shape, jax.tree.leaves(x.plugins[name]))])
+                 for name in sorted(shared_records)],
+            )
+            for x in (data, default_data)
+        )  # fmt: skip
+        if layout != default_layout:
             raise ConfigError(
-                "expected data and default_data of one simulation, got those of two. Use its default_data."
+                "expected data and default_data of one simulation, got those of two, or of two scenes. Use its "
+                "default_data, read after sim.scene.add."
             )
         mask = as_mask(mask, data.core.steps.shape[:1])
         with keep_programs(enabled=not self._cache_size()):

@@ -95,8 +95,7 @@ class FreeBodies(Population):
     """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
-    """Handles, or names of objects that the bodies touch; None for all objects in the scene when the plugin is added,
-    () for the ground alone."""
+    """Handles, or names of objects that the bodies touch; None for all in the scene, () for the ground alone."""
     drones: bool = True
     """True for contact with drones."""
     softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)

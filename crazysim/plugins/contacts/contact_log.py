@@ -40,11 +40,11 @@ class ContactLogData(PyTree):
 class ContactLog(Plugin):
     """Log of contacts, checked at the end of every step within the compiled step.
 
-    A reset of a world clears its log. Objects that are added to the scene later are not checked.
+    A reset of a world clears its log.
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all bodies in the scene when the plugin is added, () for none."""
+    """Handles, or names of bodies; None for all bodies in the scene, () for none."""
     floor: bool = True
     """True to check the floor. Drones that start on the floor touch it at once."""
     drones: bool = True
@@ -63,6 +63,15 @@ class ContactLog(Plugin):
             first_step=device_array(np.full(shape, -1), np.int32),
             object_names=names,
         )
+
+    def carry_over(self, record: ContactLogData, old_record: ContactLogData) -> ContactLogData:
+        """Return the record with the log of objects that are in the scene already."""
+        old_names = old_record.object_names
+        columns = [k for k, name in enumerate(record.object_names) if name in old_names]
+        old_columns = [old_names.index(record.object_names[k]) for k in columns]
+        objects = np.array(record.objects)
+        objects[..., columns] = np.asarray(old_record.objects)[..., old_columns]
+        return record.replace(objects=device_array(objects, bool))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return a stage of one drone, and a stage of one world for loads and other objects that plugins move.

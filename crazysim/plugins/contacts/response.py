@@ -56,15 +56,13 @@ class ContactResponse(Plugin):
     """Response of floor and objects to contacts with drones and loads; replaces the stage ``clip_floor_pos``.
 
     Drones do not push each other (see ``DroneCollisions``), and objects do not move. Drones can ride on members of
-    populations, such as cars, that are in the scene when the plugin is added. The centre of a drone that stands on the
-    floor is half the height of its collision box above the floor. Objects stop the loads and empty hooks that are in
-    the scene when the plugin is added. The flat floor stops them even without this plugin. Loads and hooks that are
-    among ``objects`` exchange impulses with drones and with each other.
+    populations, such as cars. The centre of a drone that stands on the floor is half the height of its collision box
+    above the floor. Objects stop loads and empty hooks. The flat floor stops them even without this plugin. Loads and
+    hooks that are among ``objects`` exchange impulses with drones and with each other.
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all bodies in the scene when the plugin is added, () for the floor
-    alone."""
+    """Handles, or names of bodies; None for all bodies in the scene, () for the floor alone."""
     friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
     """Coulomb's coefficient."""
     restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))

@@ -39,7 +39,7 @@ class Terrain(Plugin):
     """A height field on which drones and loads land; replaces the stage ``clip_floor_pos``.
 
     It is part of the scene: images, range finders and depth cameras include it, and it is the floor in contact reports
-    and for a ``ContactResponse`` that is added later.
+    and for a ``ContactResponse``, which must be added after it.
     """
 
     heights: ArrayLike | str | Path = parameter()
@@ -103,7 +103,7 @@ class Terrain(Plugin):
             )
         if any(isinstance(plugin, ContactResponse) for plugin in sim.scene.plugins()):
             raise ConfigError(
-                "expected terrain before contact response, which finds the surfaces of the scene when it is added, "
+                "expected terrain before contact response, which replaces the stage that stops drones at the floor, "
                 "got a ContactResponse. Use sim.remove, then add Terrain and ContactResponse in this order."
             )
         return heights, size[:2], pos

@@ -113,6 +113,9 @@ class Estimator(Plugin):
         mounting = self.imu.read(data).quat
         return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
 
+    def check_plugins(self, sim: Simulation) -> None:
+        self.check_sensors(sim)
+
     def check_sensors(self, sim: Simulation) -> None:
         """Check that there is one ``IMU``, that all kinds are supported, and that the simulation has all sensors."""
         names = ", ".join(kind.__name__ for kind in self.kinds)

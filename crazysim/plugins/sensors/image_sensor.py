@@ -263,13 +263,12 @@ class ImageSensor(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         period, latency = sampling_period(self, sim), self._latency_steps(sim.data)
+        take_images = self.image_fn(sim)
 
         def update_record(data: SimData) -> SimData:
             """Take and deliver images; skip both if they are due in no world."""
 
             def update(data: SimData) -> SimData:
-                # The function is made here so that objects are visible that were added after the sensor.
-                take_images = self.image_fn(sim)
                 return self.write(data, self.update(take_images, data, self.read(data), period))
 
             steps = data.core.steps

@@ -106,9 +106,12 @@ class BatteryVoltage(NoisySensor):
         return {"voltage": 1}
 
     def record(self, sim: Simulation) -> PyTree:
+        self.check_plugins(sim)
+        return super().record(sim)
+
+    def check_plugins(self, sim: Simulation) -> None:
         if not isinstance(sim.data.plugins.get(self.battery), BatteryData):
             raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
-        return super().record(sim)
 
     def ideal(self, data: SimData) -> Array:
         """Return the voltage under load, V. (1,)"""
@@ -135,6 +138,10 @@ class MultiRanger(NoisySensor):
         return {"distance": self.n_rays}
 
     def record(self, sim: Simulation) -> PyTree:
+        self.check_plugins(sim)
+        return super().record(sim)
+
+    def check_plugins(self, sim: Simulation) -> None:
         range_finder = sim.data.plugins.get(self.range_finder)
         if not isinstance(range_finder, RangeFinderData):
             raise ConfigError(
@@ -144,7 +151,6 @@ class MultiRanger(NoisySensor):
             raise ConfigError(
                 f"expected n_rays = {range_finder.direction.shape[0]} as the range finder has, got {self.n_rays}"
             )
-        return super().record(sim)
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, m. (n_rays,)"""

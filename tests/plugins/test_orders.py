@@ -1,0 +1,285 @@
+"""Searches over orders: of objects, plugins that read the scene, and plugins that need each other.
+
+Whatever the order of calls, the flight is that of a simulation that was built in the order of a textbook, or the call
+that cannot be followed is an error at once.
+"""
+
+import gc
+import weakref
+
+import jax
+import numpy as np
+import pytest
+from cases import trees_equal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazysim import (
+    IMU,
+    Battery,
+    Camera,
+    ConfigError,
+    ContactLog,
+    ContactResponse,
+    Downwash,
+    Kalman,
+    Latency,
+    Lidar,
+    MotionCapture,
+    Randomize,
+    RangeFinder,
+    RotorJet,
+    Sim,
+    SlungLoad,
+    Terrain,
+    Wind,
+    make,
+)
+from crazysim.core.pipeline import insert_fn_after, remove_fn, replace_fn
+from crazysim.envs import DroneEnv
+from crazysim.plugins.sensors import BatteryVoltage, MultiRanger
+from crazysim.scene import build
+
+EXAMPLES = settings().max_examples // 6
+
+
+def new_sim(**kwargs):
+    """Return a simulation of two drones, one beside the other, that fly ahead."""
+    sim = Sim(n_drones=2, control="attitude", engine="plain", **kwargs)
+    return place(sim)
+
+
+def place(sim):
+    """Return a simulation whose drones fly ahead."""
+    states = sim.data.states
+    pos, vel = np.array([[[0, 0, 0.4], [0, 0.5, 0.4]]], np.float32), np.array([[[1.5, 0, -0.3]] * 2], np.float32)
+    sim.data = sim.data.replace(states=states.replace(pos=pos, vel=vel))
+    sim.build_default_data()
+    return sim
+
+
+def remove_object(sim, name):
+    """Remove an object that cannot be moved."""
+    sim.spec.delete(sim.spec.body(f"{name}:0"))
+    sim.build_mjx()
+
+
+def wall_ahead(sim):
+    """Add a wall half a metre ahead of the drones."""
+    return sim.scene.add("wall", pos=[0.55, 0, 0], length=4.0, height=3.0, thickness=0.1)
+
+
+def test_a_plugin_of_the_constructor_sees_objects_that_are_added_later():
+    sim = Sim(plugins=[RangeFinder([(1, 0, 0)]), Lidar((0.0,), (0.0,), pos=(0, 0, 0))])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.full((1, 1, 3), (0, 0, 1), np.float32)))
+    wall = wall_ahead(sim)
+    sim.step()
+    np.testing.assert_allclose(sim.data.plugins["range_finder"].distance, 0.5, atol=1e-4)
+    np.testing.assert_allclose(sim.data.plugins["lidar"].images["distance"].squeeze(), 0.5, atol=1e-4)
+    sim.data = wall.set_pose(sim.data, [1.55, 0, 0])
+    sim.scene.add("pole", pos=[0.25, 0, 0], radius=0.05, height=3.0, mocap=False)
+    sim.step()
+    np.testing.assert_allclose(sim.data.plugins["range_finder"].distance, 0.2, atol=1e-4)
+    np.testing.assert_allclose(sim.data.plugins["lidar"].images["distance"].squeeze(), 0.2, atol=1e-4)
+    remove_object(sim, "pole")
+    sim.step()
+    np.testing.assert_allclose(sim.data.plugins["range_finder"].distance, 1.5, atol=1e-4)
+    np.testing.assert_allclose(sim.data.plugins["lidar"].images["distance"].squeeze(), 1.5, atol=1e-4)
+
+
+def test_law_06_ten_objects_compile_scene_and_step_once(monkeypatch):
+    sim, compiled = Sim(plugins=[RangeFinder()]), []
+    compile_spec = build.compile_spec
+    monkeypatch.setattr(build, "compile_spec", lambda spec: (compiled.append(1), compile_spec(spec))[1])
+    steps = {id(sim.step_fn): sim.step_fn}
+    for k in range(10):
+        sim.scene.add("box", f"box-{k}", pos=[k, 0, 0])
+    for _ in range(3):
+        sim.step()
+        steps[id(sim.step_fn)] = sim.step_fn
+    assert len(compiled) == 1
+    assert len(steps) == 2
+    assert sim.step_fn._cache_size() == 1
+
+
+def test_states_settings_and_edits_of_the_pipeline_survive_an_object():
+    """Charge, log, a number set in a record, and stages that a user has inserted, replaced and removed."""
+
+    def count(data):
+        return data
+
+    def other_camera(data):
+        return data
+
+    sim = Sim(plugins=[Battery(), ContactLog(), ContactResponse(), RangeFinder(), Camera(2, 2), Lidar((0.0,), (0.0,))])
+    sim.step(20)
+    sim.data = sim.data.replace(
+        plugins=sim.data.plugins
+        | {"contact_response": sim.data.plugins["contact_response"].replace(friction=np.full(1, 0.1, np.float32))}
+    )
+    pipeline = sim.step_pipeline
+    insert_fn_after(pipeline, "range_finder", count, "count")
+    replace_fn(pipeline, other_camera, "camera")
+    remove_fn(pipeline, "lidar")
+    before, names = sim.data.plugins, list(pipeline)
+    assert bool(np.all(before["contacts"].floor))
+    wall_ahead(sim)
+    after = sim.data.plugins
+    assert sim.step_pipeline is pipeline
+    assert list(pipeline) == names
+    assert (pipeline["count"], pipeline["camera"]) == (count, other_camera)
+    assert after["contacts"].object_names == ("wall:0",)
+    for name in ("battery", "contact_response", "range_finder"):
+        assert trees_equal(after[name], before[name])
+    np.testing.assert_array_equal(after["contacts"].first_step, before["contacts"].first_step)
+    sim.step()
+    sim.data = sim.data.replace(
+        plugins=after | {"contacts": after["contacts"].replace(objects=np.ones((1, 1, 1), bool))}
+    )
+    sim.scene.add("box", pos=[0, 3, 0])
+    assert sim.data.plugins["contacts"].object_names == ("wall:0", "box:0")
+    np.testing.assert_array_equal(sim.data.plugins["contacts"].objects, [[[True, False]]])
+
+
+def test_data_from_before_an_object_are_completed_when_they_are_assigned():
+    sim = Sim(plugins=[ContactLog()])
+    data = sim.data
+    wall_ahead(sim)
+    sim.step()
+    sim.data = data
+    assert sim.data.objects.names == ("wall:0",)
+    assert sim.data.plugins["contacts"].objects.shape == (1, 1, 1)
+    sim.step()
+
+
+@pytest.mark.parametrize("mocap", [True, False])
+def test_law_09_steps_and_data_of_an_earlier_scene_are_refused(mocap):
+    sim = Sim(plugins=[RangeFinder(), ContactLog()])
+    step, data, default = sim.build_step_fn(), sim.data, sim.default_data
+    sim.scene.add("box", pos=[0, 3, 0], mocap=mocap)
+    with pytest.raises(ConfigError, match=r"Use sim.step_fn and sim.data after sim.scene.add"):
+        step(data)
+    with pytest.raises(ConfigError, match=r"Use sim.step_fn and sim.data after sim.scene.add"):
+        jax.jit(step)(sim.data)
+    with pytest.raises(ConfigError, match=r"Use sim.step_fn and sim.data after sim.scene.add"):
+        sim.step_fn(data)
+    with pytest.raises(ConfigError, match=r"expected data and default_data of one simulation"):
+        sim.reset_fn(sim.data, default)
+    jax.eval_shape(sim.step_fn, sim.data)
+
+
+def test_law_09_an_environment_refuses_objects_that_are_added_later():
+    env = make("hover", 1)
+    with pytest.raises(ConfigError, match=r"Use sim.scene.add before DroneEnv\(sim, ...\)"):
+        env.sim.scene.add("wall")
+    with pytest.raises(ConfigError, match=r"Use sim.scene.add before DroneEnv\(sim, ...\)"):
+        env.sim.add(SlungLoad(0.01))
+    env.reset(jax.random.key(0))
+    sim = Sim(control="attitude")
+    env.task.install(sim)
+    sim.scene.add("wall", pos=[3, 0, 0])
+    assert DroneEnv(sim, env.task).reset(jax.random.key(0)).data.objects.names == ("wall:0",)
+
+
+def kalman():
+    """Return a filter with its sensors."""
+    return Kalman([IMU(), MotionCapture()])
+
+
+@pytest.mark.parametrize("needed, plugin", [
+    (Battery(), BatteryVoltage()),
+    (RangeFinder(), MultiRanger()),
+    (IMU(), Kalman([IMU(), MotionCapture()])),
+    (Battery(), Randomize(charge=(0.5, 1.0))),
+    (Latency(np.zeros((1, 1), int), max_delay=2), Randomize(delay=(0, 2))),
+])  # fmt: skip
+def test_law_09_a_plugin_that_another_one_needs_cannot_be_removed(needed, plugin):
+    sim = Sim(control="attitude")
+    for p in (MotionCapture(), needed, plugin):
+        sim.add(p)
+    stages, data = dict(sim.step_pipeline), sim.data
+    with pytest.raises(ConfigError, match=rf"Use sim.remove\({plugin.name!r}\) first"):
+        sim.remove(needed.name)
+    assert dict(sim.step_pipeline) == stages
+    assert trees_equal(sim.data, data)
+    jax.eval_shape(sim.step_fn, sim.data)
+    sim.remove(plugin.name)
+    sim.remove(needed.name)
+    assert list(sim.plugins) == ["motion_capture"]
+
+
+def test_a_removed_load_is_forgotten_and_stays_where_it_was():
+    sim = Sim(plugins=[SlungLoad(0.01, length=0.3)])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.full((1, 1, 3), (1, 2, 1), np.float32)))
+    load = sim.data.plugins["load"]
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"load": load.replace(pos=load.pos + 1.0)})
+    plugin = weakref.ref(sim.plugins["load"])
+    sim.contact_report()
+    pos = np.asarray(sim.data.plugins["load"].pos[:, 0])
+    sim.remove("load")
+    sim.step()
+    np.testing.assert_array_equal(sim.data.objects.pos[:, 0, sim.data.objects.names.index("load:0")], pos)
+    gc.collect()
+    assert plugin() is None
+
+
+PLUGINS = {
+    "battery": Battery,
+    "battery_voltage": BatteryVoltage,
+    "wind": lambda: Wind((1.0, 0, 0)),
+    "imu": IMU,
+    "motion_capture": MotionCapture,
+    "estimator": kalman,
+    "latency": lambda: Latency(np.zeros((1, 2), int), max_delay=3),
+    "randomize": lambda: Randomize(charge=(0.5, 1.0), delay=(0, 3), mass=(0.9, 1.1)),
+    "range_finder": RangeFinder,
+    "multi_ranger": MultiRanger,
+    "contact_response": lambda: ContactResponse(iterations=2),
+    "contacts": ContactLog,
+    "load": lambda: SlungLoad(0.005, length=0.1, size=0.02),
+    "rotor_jet": RotorJet,
+    "terrain": lambda: Terrain(np.zeros((3, 3)), (2.0, 2.0)),
+    "downwash": Downwash,
+}
+
+
+def try_orders(sim, names):
+    """Add each plugin that is not there and remove each one that is; after an error nothing has changed."""
+    for name in names:
+        stages, data, default = dict(sim.step_pipeline), sim.data, sim.default_data
+        present = dict(sim.plugins)
+        try:
+            sim.remove(name) if name in present else sim.add(PLUGINS[name]())
+        except ConfigError:
+            assert dict(sim.plugins) == present
+            assert list(sim.step_pipeline) == list(stages)
+            assert trees_equal(sim.data, data)
+            assert trees_equal(sim.default_data, default)
+
+
+def rebuilt(sim):
+    """Return a new simulation with the plugins of another one, added in their present order."""
+    expected = new_sim()
+    for name in sim.plugins:
+        expected.add(PLUGINS[name]())
+    return expected
+
+
+@settings(max_examples=5 * EXAMPLES)
+@given(names=st.lists(st.sampled_from(list(PLUGINS)), max_size=12))
+@pytest.mark.long("traces the steps of drawn plugins")
+def test_plugins_added_and_removed_in_any_order_give_the_same_simulation(names):
+    sim = new_sim()
+    try_orders(sim, names)
+    expected = rebuilt(sim)
+    assert list(sim.step_pipeline) == list(expected.step_pipeline)
+    assert list(sim.reset_pipeline) == list(expected.reset_pipeline)
+    records, expected_records = sim.data.plugins, expected.data.plugins
+    assert list(records) == list(expected_records)
+    for name in set(records) - {"contacts"}:  # bodies of removed loads stay in the scene, and in the log
+        assert trees_equal(records[name], expected_records[name])
+    try:
+        sim.plugins.check()
+    except ConfigError:
+        return  # Randomize without a battery, say, which may still be added
+    jax.eval_shape(sim.step_fn, sim.data)
