@@ -22,7 +22,7 @@ from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
-from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays, cast_rays_in_worlds
+from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays, cast_rays_in_worlds, raise_to_floor
 
 MAX_RAYS = 1 << 22
 """Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
@@ -33,6 +33,9 @@ MAX_RAYS_OF_KERNEL = 1 << 28
 TILE_SIDE = 4
 """Height and width of tiles, pixels. Rays are ordered tile by tile, so that neighbouring lanes of a kernel meet similar
 geoms."""
+
+HIDDEN_TOLERANCE = 1e-3
+"""Part of the distance by which a surface must be nearer to hide another: more than rounding, less than objects."""
 
 Along = Literal["axis", "ray"]
 """Direction of distances: along the axis of the camera, or along the ray."""
@@ -52,6 +55,8 @@ class DroneCamera:
     """Position on each drone, body frame, m. (n_drones, 3)"""
     rpy: np.ndarray
     """Roll, pitch and yaw of the frame of the camera in the body frame, rad. (3,)"""
+    baseline: float = 0.0
+    """Distance to the second imager of a stereo camera, on the right, m; 0 without one."""
 
     @property
     def rot(self) -> np.ndarray:
@@ -195,6 +200,7 @@ def build_depth_fn(
     along: Along,
     plugins: ListPlugins,
     kernels: RayKernels,
+    baseline: float = 0.0,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits``; see ``Scene.depth_fn``.
 
@@ -209,6 +215,7 @@ def build_depth_fn(
         along: Direction of distances; see ``Along``.
         plugins: Function that returns the plugins of the simulation.
         kernels: Kernels that cast the rays if possible.
+        baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
     """
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
@@ -227,15 +234,34 @@ def build_depth_fn(
     ignored_drones = directions[..., 3].reshape(-1).astype(int)
 
     def cast_in_worlds(data: SimData, kernels: RayKernels) -> Hits:
-        poses = [camera_pose(camera, data) for camera in cameras]
+        poses = []
+        for camera in cameras:
+            pos, rot = camera_pose(camera, data)
+            poses.append((pos if camera.carrier == "world" else raise_to_floor(model, pos), rot))
         if data.states.pos.ndim == 2:
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
                 [_rotate_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
             )
-            return untile_results(cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones))
+            hits = cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones)
+            return untile_results(find_hidden(data, kernels, poses, hits))
         camera_poses = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        return untile_results(cast_rays_in_worlds(model_without_mocap, data, camera_poses, directions, drones, kernels))
+        hits = cast_rays_in_worlds(model_without_mocap, data, camera_poses, directions, drones, kernels)
+        return untile_results(find_hidden(data, kernels, poses, hits))
+
+    def find_hidden(data: SimData, kernels: RayKernels, poses: Sequence[tuple[Array, Array]], hits: Hits) -> Hits:
+        """Return the hits with ``is_hidden``, from a second ray to each point."""
+        if not baseline:
+            return hits
+        origins = [(pos + baseline * rot[..., 0])[..., None, :] for pos, rot in poses]
+        shape = (*hits.point.shape[:-2], height * width, 3)
+        origin = jnp.concatenate([jnp.broadcast_to(x, shape) for x in origins], axis=-2)
+        origin, point = jax.lax.stop_gradient((origin, hits.point))
+        distance = rotation.safe_norm(point - origin)
+        direction = rotation.safe_normalize(point - origin, jnp.asarray([1.0, 0.0, 0.0], point.dtype))
+        second = cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones, kernels=kernels)
+        is_nearer = second.distance < (1 - HIDDEN_TOLERANCE) * distance[..., 0]
+        return hits.replace(is_hidden=is_nearer & jnp.isfinite(hits.distance))
 
     def untile_results(hits: Hits) -> Hits:
         """Return hits in the order of the tiles as images, with distances along the axis or along the rays."""
@@ -253,6 +279,7 @@ def build_depth_fn(
             normal=untile(hits.normal, 1),
             point=untile(hits.point, 1),
             body_index=untile(hits.body_index, 0),
+            is_hidden=None if hits.is_hidden is None else untile(hits.is_hidden, 0),
         )
 
     # Poses of mocap bodies become part of the data before the rays are cast.

@@ -21,6 +21,7 @@ from crazysim.engine.errors import report_unsupported
 from crazysim.engine.index_map import map_indices
 from crazysim.errors import UnsupportedError
 from crazysim.geometry import Shape, ray_distance
+from crazysim.geometry.heightfield import field_gap
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
 from crazysim.pytree import PyTree, static
@@ -49,6 +50,12 @@ MAX_LOOP_RAYS = 64
 """Largest number of rays in a loop within a step; an index computed at run time selects among at most 64 entries."""
 
 
+MAX_DEPTH_BELOW_FLOOR = 0.1
+"""Depth below the floor from which sensors are moved up, m: drones land at -1 mm, and may carry sensors below that."""
+FLOOR_CLEARANCE = 1e-5
+"""Height above the floor to which these sensors are moved, m, so that rounding does not put them below it again."""
+
+
 class Hits(PyTree):
     """First surfaces that rays meet."""
 
@@ -62,6 +69,25 @@ class Hits(PyTree):
     """Index of the body in ``names``; -1 where the ray meets nothing. (...)"""
     names: tuple[str, ...] = static()
     """Names of floor, objects and drones, in the order of ``body_index``."""
+    is_hidden: Array | None = None
+    """True where the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
+
+
+def raise_to_floor(model: CollisionModel, pos: Array) -> Array:
+    """Return positions of sensors, moved up to the floor where they are a little below it. (..., 3)
+
+    From below, a plane is invisible, and a height field is seen from within.
+    """
+    for geom in model.floor:
+        rot = np.eye(3) if geom.rot is None else np.array(geom.rot)
+        local_pos = _constant_product(rot.T, pos - jnp.asarray(geom.pos, pos.dtype))
+        if geom.shape.kind == "hfield":
+            gap, normal = field_gap(geom.shape, local_pos)
+        else:
+            gap, normal = local_pos[..., 2], jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], pos.dtype), pos.shape)
+        rise = jnp.where((gap < 0) & (gap > -MAX_DEPTH_BELOW_FLOOR), FLOOR_CLEARANCE - gap, 0.0)
+        pos = pos + rise[..., None] * _constant_product(rot, normal)
+    return pos
 
 
 def body_names(model: CollisionModel, n_drones: int) -> tuple[str, ...]:

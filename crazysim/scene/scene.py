@@ -367,8 +367,9 @@ class Scene:
         else:
             rays = [depth.pixel_directions(c.fovy, width, height) for c in cameras]
         return depth.build_depth_fn(
-            self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels
-        )
+            self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
+            camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
+        )  # fmt: skip
 
     def splat_fn(
         self,

@@ -74,12 +74,16 @@ class Camera(ImageSensor):
     def far_ratio(self) -> np.ndarray:
         return 1 / self.rays[..., 0]
 
-    def measure(self, distance: Array, key: Array) -> Array:
+    @property
+    def baseline(self) -> float:
+        return self.noise.baseline if self.noise is not None and self.noise.has_holes else 0.0
+
+    def measure(self, distance: Array, is_hidden: Array | None, key: Array) -> Array:
         if self.noise is None:
             return distance
         cosine = jnp.asarray(self.rays[..., 0], distance.dtype)
         depth = distance * cosine
-        measured_depth = self.noise.apply(depth, self.focal, key)
+        measured_depth = self.noise.apply(depth, is_hidden, key)
         return jnp.where(depth < self.far * (1 - 1e-6), measured_depth, self.far) / cosine
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -37,8 +36,8 @@ class StereoNoise:
 
     A disparity of ``d = f b / z`` pixels is matched with an error of ``disparity_noise`` pixels, so that the depth has
     the standard deviation ``z^2 / (f b) * disparity_noise`` (Intel, *Tuning depth cameras for best performance*).
-    Points that nearer objects hide from the second imager, which is on the right, have no depth: a pixel is a hole if a
-    pixel on its right appears at the same position, or further left, in the second image.
+    Points that nearer objects hide from the second imager, which is on the right, have no depth: a second ray to each
+    point finds them.
     """
 
     focal: float = setting(default=D435_WIDTH / 2 / np.tan(np.radians(D435_HFOV / 2)), positive=True)
@@ -58,12 +57,12 @@ class StereoNoise:
         """Check the settings."""
         check_settings(self)
 
-    def apply(self, depth: Array, image_focal: float, key: Array) -> Array:
+    def apply(self, depth: Array, is_hidden: Array | None, key: Array) -> Array:
         """Return depths as they are measured, m, 0 in holes. (height, width)
 
         Args:
             depth: True depths, m, finite. (height, width)
-            image_focal: Focal length of the image ``depth``, pixels.
+            is_hidden: True where the second imager does not see the point; None for nowhere. (height, width)
             key: Random key.
         """
         deviation = depth**2 * (self.disparity_noise / (self.focal * self.baseline))
@@ -72,17 +71,9 @@ class StereoNoise:
             quantise(measured_depth, jnp.asarray(self.resolution, depth.dtype)) if self.resolution else measured_depth
         )
         is_hole = depth < self.min_depth
-        if self.has_holes:
-            is_hole |= self.is_occluded(depth, image_focal)
+        if self.has_holes and is_hidden is not None:
+            is_hole |= is_hidden
         return jnp.where(is_hole, 0.0, measured_depth)
-
-    def is_occluded(self, depth: Array, image_focal: float) -> Array:
-        """Return True for pixels that the second imager does not see; see ``apply``. (height, width)"""
-        disparity = image_focal * self.baseline / jnp.maximum(depth, 1e-3)
-        column = jnp.arange(depth.shape[1], dtype=depth.dtype) - disparity
-        # The leftmost position among the pixels on the right of each pixel.
-        leftmost = jax.lax.cummin(column, axis=1, reverse=True)
-        return jnp.pad(leftmost[:, 1:] <= column[:, :-1], ((0, 0), (0, 1)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,8 +42,8 @@ class ImageData(PyTree):
     """The last delivered images of a camera or lidar, and the images in transit."""
 
     images: dict[str, Array] = leaf("drone", None)
-    """Last image of each output. (n_worlds, n_drones, height, width), for normals (n_worlds, n_drones, height, width,
-    3)"""
+    """Last image of each output; nothing within ``far`` before the first image. (n_worlds, n_drones, height, width),
+    for normals (n_worlds, n_drones, height, width, 3)"""
     taken_step: Array = leaf("world")
     """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
     transit: dict[str, Array] = leaf("drone", None)
@@ -106,14 +106,20 @@ class ImageSensor(Plugin):
         """True if ``measure`` must be called."""
         return False
 
-    def measure(self, distance: Array, key: Array) -> Array:
+    @property
+    def baseline(self) -> float:
+        """Distance to a second imager, on the right, m, whose view ``measure`` needs; 0 for none."""
+        return 0.0
+
+    def measure(self, distance: Array, is_hidden: Array | None, key: Array) -> Array:
         """Return the distances of one drone as the sensor measures them, m. (height, width)
 
         Args:
             distance: True distances, m, at most ``far * far_ratio``. (height, width)
+            is_hidden: True where the second imager does not see the surface; None without one. (height, width)
             key: Random key of the drone at this step.
         """
-        del key
+        del is_hidden, key
         return distance
 
     @property
@@ -178,7 +184,9 @@ class ImageSensor(Plugin):
             distance = hits.distance
             if self.has_errors:
                 keys = drone_keys(data, self.name)
-                distance = jax.vmap(jax.vmap(self.measure))(jnp.minimum(distance, far * self.far_ratio), keys)
+                distance = jax.vmap(jax.vmap(self.measure))(
+                    jnp.minimum(distance, far * self.far_ratio), hits.is_hidden, keys
+                )
             images = {}
             for name in self.outputs:
                 if name == "depth":
@@ -283,14 +291,14 @@ class ImageSensor(Plugin):
         return {name: image.reshape(-1) for name, image in self.read(data).images.items()}
 
     def age(self, data: SimData) -> Array:
-        """Return the time since the last images were taken, s; zero before the first ones. (n_worlds, 1)"""
+        """Return the time since the last images were taken, s; infinite before the first ones. (n_worlds, 1)"""
         taken_step = self.read(data).taken_step
-        return jnp.where(taken_step >= 0, (data.core.steps - 1 - taken_step) / data.core.freq, 0.0)
+        return jnp.where(taken_step >= 0, (data.core.steps - 1 - taken_step) / data.core.freq, jnp.inf)
 
     def _drone_camera(self, sim: Simulation) -> DroneCamera:
         fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
-        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64))
+        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline)
 
     def _latency_steps(self, data: SimData) -> int:
         return math.floor(float(self.latency) * data.core.freq + 0.5)

@@ -107,7 +107,8 @@ class Lidar(ImageSensor):
     def has_errors(self) -> bool:
         return any((self.noise, self.relative_noise, self.resolution, self.dropout, self.min_range))
 
-    def measure(self, distance: Array, key: Array) -> Array:
+    def measure(self, distance: Array, is_hidden: Array | None, key: Array) -> Array:
+        del is_hidden
         deviation = self.noise + self.relative_noise * distance
         measured_distance = distance + deviation * normal(key, distance.shape, distance.dtype)
         if self.resolution:

@@ -21,7 +21,7 @@ from crazysim.plugins.sensors.sensor import sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
-from crazysim.scene.ray_casting import MAX_UNROLLED_GEOMS, RayKernels, cast_rays
+from crazysim.scene.ray_casting import MAX_UNROLLED_GEOMS, RayKernels, cast_rays, raise_to_floor
 
 MULTI_RANGER_DIRECTIONS = {
     "front": (1, 0, 0),
@@ -38,7 +38,8 @@ class RangeFinderData(PyTree):
     """Measurements of the range finders, and their rays."""
 
     distance: Array = leaf("drone", 1)
-    """Distance along each ray, m; ``max_range`` where nothing is nearer. (n_worlds, n_drones, n_rays)"""
+    """Distance along each ray, m; ``max_range`` where nothing is nearer, and before the first measurement. (n_worlds,
+    n_drones, n_rays)"""
     direction: Array = leaf("shared", 2)
     """Unit directions of the rays, body frame. (n_rays, 3)"""
     max_range: Array = leaf("shared", 0)
@@ -143,7 +144,7 @@ class RangeFinder(Plugin):
         pos, quat = (states.pos[None], states.quat[None]) if is_single_drone else (states.pos, states.quat)
         direction = rotation.rotate(quat[..., None, :], record.direction)
         n_drones, n_rays = direction.shape[-3:-1]
-        origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
+        origin = jnp.broadcast_to(raise_to_floor(model, pos)[..., None, :], direction.shape)
         ignored_drones = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
         origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
         hits = cast_rays(

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, ConfigError, Lidar, Sim, rotation
+from crazysim import Camera, ConfigError, Lidar, RangeFinder, Sim, Terrain, rotation
 
 SIZE = {"width": 9, "height": 6}
 
@@ -80,6 +80,40 @@ def test_outputs_agree_with_rays_of_c_mujoco_in_the_frame_of_the_camera(flight):
     assert camera.rays[0, 0, 1] > 0 > camera.rays[0, -1, 1]
     assert camera.rays[0, 0, 2] > 0 > camera.rays[-1, 0, 2]
     assert np.degrees(2 * np.arctan2(camera.rays[0, 4, 2] * 6 / 5, camera.rays[0, 4, 0])) == pytest.approx(60)
+
+
+@pytest.mark.parametrize("ground", ["floor", "terrain"])
+def test_sensors_of_landed_drones_see_the_ground(ground):
+    """Drones land 1 mm below the floor, and a rolled one has its camera deeper: rays begin at the ground."""
+    sim = Sim(2, control="attitude")
+    if ground == "terrain":
+        sim.add(Terrain(np.full((5, 5), 0.4), (8.0, 8.0)))
+    height = {"floor": -0.001, "terrain": 0.399}[ground]
+    roll = np.sqrt(0.5)
+    quat = jnp.float32([[[0, 0, 0, 1]], [[roll, 0, 0, roll]]])
+    states = sim.data.states.replace(pos=jnp.full((2, 1, 3), jnp.float32([0, 0, height])), quat=quat)
+    sim.data = sim.data.replace(states=states)
+    for pos in ((0, 0, 0), (0, -0.05, -0.02)):
+        camera = Camera(4, 4, pos=pos, outputs=("depth", "segmentation"))
+        images = jax.device_get(jax.jit(camera.image_fn(sim))(sim.data))
+        assert (images["segmentation"][0, 0] == [[-1]] * 2 + [[0]] * 2).all()
+        assert images["depth"][0, 0, 2:].max() < 1e-3
+        assert (images["segmentation"][1, 0] == [-1, -1, 0, 0]).all()  # rolled to the right
+    ranges = sim.add(RangeFinder([[0, 0, -1], [1, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    sim.step()
+    distance = np.asarray(ranges.read(sim.data).distance)[:, 0]
+    np.testing.assert_allclose(distance[0], [0, 4, 4, 4], atol=2e-3)
+    assert distance[1, 3] < 2e-3
+
+
+def test_before_the_first_image_the_age_is_infinite():
+    sim = Sim(2, control="attitude")
+    camera = sim.add(Camera(2, 2))
+    assert (np.asarray(camera.age(sim.data)) == np.inf).all()
+    sim.step()
+    assert (np.asarray(camera.age(sim.data)) == 0).all()
+    sim.reset(np.array([False, True]))
+    np.testing.assert_array_equal(np.asarray(camera.age(sim.data))[:, 0], [0, np.inf])
 
 
 def test_law_09_wrong_cameras_are_errors():

@@ -1,12 +1,14 @@
 """Errors of cameras and lidars: noise and holes against their formulas, lenses against OpenCV's, patterns of lidars."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, ConfigError, Lidar, Sim
+from crazysim import Camera, ConfigError, Lidar, Sim, rotation
 from crazysim.plugins.sensors import Distortion, StereoNoise
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.006, "k3": 0.01}
@@ -56,16 +58,58 @@ def test_depth_has_a_resolution_and_a_smallest_value(wall_images):
 
 def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_them():
     """A near strip in front of a far wall hides f b (1 / near - 1 / far) pixels on its left, and none on its right."""
+    sim = Sim(control="attitude")
+    sim.scene.add("wall", pos=[5.05, 0, -20], length=80, height=80, mocap=False)
+    sim.scene.add("box", pos=[1.05, 0.0, 5], size=[0.1, 0.1, 20], mocap=False)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.float32([[[0, 0, 5]]])))
+    settings = {"baseline": 0.1, "disparity_noise": 0.0, "resolution": 0.0, "min_depth": 0.0}
+    for has_holes in (True, False):
+        camera = Camera(201, 3, fovy=2.0, pos=(0, 0, 0), noise=StereoNoise(**settings, has_holes=has_holes))
+        depth = np.asarray(jax.jit(camera.image_fn(sim))(sim.data)["depth"])[0, 0, 1]
+        is_near = np.flatnonzero(np.abs(depth - 1) < 0.01)
+        hidden = camera.focal * 0.1 * (1 / 1.0 - 1 / 5.0) if has_holes else 0
+        holes = np.flatnonzero(depth == 0)
+        assert len(holes) == pytest.approx(min(hidden, is_near[0]), abs=1)
+        assert (holes < is_near[0]).all()
+
+
+@pytest.mark.parametrize("width", [20, 60, 120])
+def test_holes_are_the_pixels_that_rays_of_c_mujoco_from_the_second_imager_do_not_reach(width):
+    sim = Sim(2, control="attitude")
+    rng = np.random.default_rng(0)
+    sim.scene.add("wall", pos=[3.5, 0, 0], length=20, height=20, mocap=False)
+    for k in range(16):
+        kind, size = [("sphere", {"radius": 0.15}), ("box", {"size": [0.2, 0.1, 0.4]})][k % 2]
+        pos = [rng.uniform(0.7, 3), *rng.uniform(-1, 1, 2) + [0, 1]]
+        sim.scene.add(kind, f"object_{k}", pos=pos, **size, mocap=bool(k % 3))
+    quat = np.array([0.1, 0.05, 0.1, 1]) / np.linalg.norm([0.1, 0.05, 0.1, 1])
+    states = sim.data.states.replace(
+        pos=jnp.float32([[[0, 0, 1]], [[-0.2, 0.1, 0.9]]]), quat=jnp.broadcast_to(jnp.float32(quat), (2, 1, 4))
+    )
+    sim.data = sim.data.replace(states=states)
     noise = StereoNoise(baseline=0.1, disparity_noise=0.0, resolution=0.0, min_depth=0.0)
-    depth = np.full((2, 60), 5.0, np.float32)
-    depth[:, 30:40] = 1.0
-    measured = np.asarray(noise.apply(jnp.asarray(depth), 100.0, jax.random.key(0)))
-    hidden = 100 * 0.1 * (1 / 1.0 - 1 / 5.0)
-    assert hidden == 8
-    expected = depth.copy()
-    expected[:, 30 - 8 : 30] = 0
-    np.testing.assert_array_equal(measured, expected)
-    assert (np.asarray(StereoNoise(has_holes=False).apply(jnp.asarray(depth), 100.0, jax.random.key(0))) > 0).all()
+    camera = Camera(width, width // 4, fovy=35.0, pos=(0.03, 0, 0.01), noise=noise, outputs=("distance",))
+    true = dataclasses.replace(camera, noise=None)
+    take_images = jax.jit(lambda data: [c.image_fn(sim)(data)["distance"] for c in (camera, true)])
+    measured, distance = (np.asarray(x)[1, 0] for x in take_images(sim.data))
+    sim.scene.sync_one(sim.data, 1)
+    rot = np.asarray(rotation.matrix(jnp.asarray(quat)))
+    left = np.array([-0.2, 0.1, 0.9]) + rot @ [0.03, 0, 0.01]
+    right = left - 0.1 * rot[:, 1]
+    own = sim.mj_model.body("drone:0").id
+    n_holes = n_wrong = n_seen = 0
+    for row, column in np.ndindex(distance.shape):
+        if distance[row, column] >= camera.far:
+            continue
+        to_point = left + distance[row, column] * rot @ camera.rays[row, column] - right
+        length, n_seen = np.linalg.norm(to_point), n_seen + 1
+        hit = mujoco.mj_ray(
+            sim.mj_model, sim.mj_data, right, to_point / length, None, 1, own, np.zeros(1, np.int32), None
+        )
+        is_hidden = 0 <= hit < 0.999 * length
+        n_holes, n_wrong = n_holes + is_hidden, n_wrong + (is_hidden != (measured[row, column] == 0))
+    assert n_holes > 0.005 * n_seen
+    assert n_wrong <= 1e-3 * n_seen  # points at an edge, where rounding decides
 
 
 def test_a_lidar_has_noise_and_lost_returns(wall_images):
