@@ -12,8 +12,9 @@ replaced if a release removed it, and whether the replacement is implemented:
   while NumPy has a view of it. The compiled step replaces them, and ``jit_donating`` donates nothing. Implemented here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
   of XLA's foreign function interface that launches them. Implemented in ``engine/backends/ffi_handlers.py``.
-- **Custom primitives** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
-  ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. Not implemented.
+- **Custom primitives** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``, ``barrier``):
+  ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``, and a
+  ``jax.lax.optimization_barrier`` for each array, which takes longer to trace. Not implemented.
 - **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): no replacement. A stage
   with a primitive that has changed is run unfused.
 - **Threefry's primitive** (``threefry2x32_p``): its rounds as operations on integers. Implemented in
@@ -73,6 +74,7 @@ __all__ = [
     "Parameters",
     "add_vmap_rule",
     "as_function",
+    "barrier",
     "batched_primitive",
     "bind",
     "bits_generator",
@@ -333,6 +335,37 @@ def make_vmap_rule(fn: Callable[..., Any]) -> Callable[..., Any]:
         return jax.vmap(functools.partial(fn, **params), tuple([0 if b else None for b in is_batched]))(*args)
 
     return rule
+
+
+def barrier(values: Sequence[Any]) -> list[jax.Array]:
+    """Compute values only once: ``jax.lax.optimization_barrier``, with derivatives that all versions of JAX reverse.
+
+    JAX 0.12 cannot reverse its own barrier if only some of the tangents depend on what is differentiated.
+    """
+    return _barrier_p.bind(*values)
+
+
+def _barrier_jvp(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    moved = iter(barrier([t for t in tangents if not isinstance(t, ad.Zero)]))
+    return barrier(primals), [t if isinstance(t, ad.Zero) else next(moved) for t in tangents]
+
+
+def _barrier_transpose(cotangents: Sequence[Any], *args: Any) -> list[Any]:
+    moved = iter(barrier([ct for ct in cotangents if not isinstance(ct, ad.Zero)]))
+    results = [ct if isinstance(ct, ad.Zero) else next(moved) for ct in cotangents]
+    return [ct if ad.is_undefined_primal(x) else None for ct, x in zip(results, args, strict=True)]
+
+
+_barrier_p = Primitive("crazysim_barrier")
+_barrier_p.multiple_results = True
+_barrier_p.def_impl(lambda *args: jax.lax.optimization_barrier(list(args)))
+_barrier_p.def_abstract_eval(lambda *avals: list(avals))
+mlir.register_lowering(
+    _barrier_p, mlir.lower_fun(lambda *args: jax.lax.optimization_barrier(list(args)), multiple_results=True)
+)
+ad.primitive_jvps[_barrier_p] = _barrier_jvp
+ad.primitive_transposes[_barrier_p] = _barrier_transpose
+batching.primitive_batchers[_barrier_p] = lambda args, dims: (barrier(args), dims)
 
 
 @functools.lru_cache(maxsize=64)

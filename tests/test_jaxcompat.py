@@ -288,6 +288,33 @@ def test_tangents_that_are_zero_by_construction_are_recognised():
     assert jaxcompat.is_symbolic_zero(None)
 
 
+def test_a_barrier_is_reversed_if_only_some_tangents_depend_on_the_input():
+    """The tangents of a loop are constants or depend on the input; JAX 0.12 cannot reverse its own barrier then."""
+
+    @jax.custom_jvp
+    def constant(x):
+        return 2.0 * x
+
+    constant.defjvp(lambda primals, tangents: (constant(primals[0]), jnp.zeros_like(primals[0])))
+
+    def body(x, _):
+        a, b, _, _ = jaxcompat.barrier([constant(x), jnp.sin(x), jax.random.key(0), jnp.arange(3)])
+        return a * b, None
+
+    def loss(x):
+        return jnp.sum(jax.lax.scan(jax.checkpoint(body), x, length=2)[0])
+
+    x = jnp.array([0.5, 1.0, 1.5])
+    y = 2 * x * jnp.sin(x)
+    expected = 2 * y * jnp.cos(y) * 2 * x * jnp.cos(x)
+    for gradient in (jax.grad(loss), jax.jit(jax.grad(loss)), jax.jacfwd(loss)):
+        np.testing.assert_allclose(gradient(x), expected, rtol=1e-6)
+    batched = jax.vmap(jax.grad(loss))(jnp.stack([x, x]))
+    np.testing.assert_allclose(batched, np.stack([expected] * 2), rtol=1e-6)
+    curvature = jax.hessian(lambda x: jnp.sum(jaxcompat.barrier([x**2, x**3])[1]))(x)
+    np.testing.assert_allclose(curvature, np.diag(6 * x), rtol=1e-6)
+
+
 # Compilation ---------------------------------------------------------------------------------------------------------
 
 

@@ -335,6 +335,33 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
     assert_gradients_equal(slope, sum(np.sum(gradient * x) for gradient, x in zip(expected, inputs, strict=True)))
 
 
+@pytest.mark.parametrize("engine", ["plain", "lanes"])
+def test_values_without_a_derivative_may_cross_barriers_in_a_loop(engine):
+    """The stage is longer than the interval of barriers, and values that it does not differentiate cross them."""
+
+    def swing(data):
+        x, frozen = data.states.vel, jax.lax.stop_gradient(data.states.pos)
+        x = jax.lax.fori_loop(0, 20, lambda _, x: x + 0.1 * jnp.sin(x * frozen), x) + frozen * x[..., ::-1]
+        for _ in range(8):
+            x, frozen = x + 0.1 * jnp.sin(x * frozen), frozen + jax.lax.stop_gradient(x)
+        return data.replace(states=data.states.replace(vel=x + frozen, pos=frozen))
+
+    sim = shared_sim(n_worlds=2, n_drones=1)
+    step, n_steps = Step({"swing": stage("drone")(swing)}, engine), 3
+    vel = 0.3 + 0.1 * np.arange(6, dtype=np.float32).reshape(2, 1, 3)
+
+    def energy(advance, vel):
+        return jnp.sum(advance(sim.data.replace(states=sim.data.states.replace(vel=vel))).states.vel ** 2)
+
+    def repeat(data):
+        for _ in range(n_steps):
+            data = swing(data)
+        return data
+
+    gradient = jax.grad(lambda vel: energy(lambda data: step(data, n_steps), vel))(vel)
+    np.testing.assert_allclose(gradient, jax.jacfwd(functools.partial(energy, repeat))(vel), rtol=1e-4)
+
+
 @pytest.mark.parametrize("n", [1, 15, 16, 18, 25])
 def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
     """Numbers of steps below and above ``MIN_CHECKPOINTED_STEPS``, square numbers and others."""

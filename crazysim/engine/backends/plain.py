@@ -44,7 +44,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
                 new_leaves = jax.tree.leaves(data_after)
                 # Without the barrier, XLA's CPU backend recomputes these values for each result of a later stage.
                 leaves = replace_leaves(
-                    leaves, written_leaves, jax.lax.optimization_barrier([new_leaves[i] for i in written_leaves])
+                    leaves, written_leaves, jaxcompat.barrier([new_leaves[i] for i in written_leaves])
                 )
         return leaves
 

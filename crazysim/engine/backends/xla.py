@@ -63,7 +63,7 @@ def _add_barrier(env: Env, block: Block, position: int, last_uses: dict[Value, i
     """Put a barrier on all values that are used later. Without it XLA's CPU backend recomputes them for each result."""
     results = [x for op in block.operations[:position] for x in op.results]
     live = [x for x in results if last_uses.get(x, -1) > position and not x.size and np.ndim(env[x])]
-    env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
+    env.update(zip(live, jaxcompat.barrier([env[x] for x in live]), strict=True))
 
 
 def _apply_operation(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
