@@ -78,6 +78,18 @@ class ConfigError(ValueError):
     """Settings that are invalid, incomplete or contradict each other."""
 
 
+def require_type(value: object, kind: type, remedy: str) -> None:
+    """Check that a value is an instance of a class."""
+    if not isinstance(value, kind):
+        raise ConfigError(f"expected {kind.__name__}, got {short_repr(value)}. {remedy}")
+
+
+def require_callable(name: str, value: object) -> None:
+    """Check that an argument is a function, or None."""
+    if value is not None and not callable(value):
+        raise ConfigError(f"expected {name} as a function or None, got {short_repr(value)}. Use a function.")
+
+
 class UnknownNameError(ConfigError, KeyError):
     """A name that does not exist, such as one of an airframe, a controller, a mode, a body, a camera or a stage."""
 

@@ -10,9 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import Env
@@ -22,7 +19,7 @@ from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.train import apg, dagger, ppo
 from crazysim.train.devices import Devices, device_options, evaluation_device
-from crazysim.train.hyperparameters import SWEEPABLE
+from crazysim.train.hyperparameters import SWEEPABLE, check_seed
 from crazysim.train.networks import Network, choose_network
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
@@ -140,7 +137,7 @@ def find_recipe(task: str, algorithm: str | None = None) -> Recipe:
         algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for the algorithm of the task's recipe.
     """
     recipe = RECIPES.get(task, DEFAULT_RECIPES["ppo"])
-    return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
+    return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(str(algorithm), Recipe(algorithm))
 
 
 ALTERABLE_HYPERPARAMETERS = ("iterations", *SWEEPABLE)
@@ -173,10 +170,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.algorithm not in ALGORITHMS:
+        if not isinstance(self.algorithm, str) or self.algorithm not in ALGORITHMS:
             raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)):
-            raise ConfigError(f"expected an integer as seed, got {self.seed!r}. Use for example 0.")
+        check_seed(self.seed)
         names = [f.name for f in dataclasses.fields(ALGORITHMS[self.algorithm].Config)]
         if unknown := [name for name in self.config if name not in names]:
             raise ConfigError(
@@ -200,7 +196,6 @@ class TrainConfig:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        as_key(self.seed)  # raises an error for more than 64 bits
 
     @staticmethod
     def create(

@@ -28,11 +28,11 @@ from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
-from crazysim.errors import ConfigError, DivergedError
+from crazysim.errors import ConfigError, DivergedError, require_callable
 from crazysim.pytree import PyTree, static
 from crazysim.train.convolution import find_images
 from crazysim.train.evaluation import as_tree
-from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.hyperparameters import check_hyperparameters, check_seed
 from crazysim.train.interface import Interface, check_callable, describe_env, sizes_of
 from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
 from crazysim.train.optimizer import build_optimizer
@@ -142,7 +142,9 @@ class TeacherObservation(Wrapper):
         return self._add_teacher_obs(state)
 
     def _add_teacher_obs(self, state: EnvState) -> EnvState:
-        return state.replace(obs=state.obs | {TEACHER_PREFIX + name: x for name, x in self.observe(state.data).items()})
+        teacher_obs = self.observe(state.data)
+        sizes_of(teacher_obs)  # raises an error for anything but arrays by name
+        return state.replace(obs=state.obs | {TEACHER_PREFIX + name: x for name, x in teacher_obs.items()})
 
 
 def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
@@ -280,6 +282,9 @@ def imitate(
         raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(unknown)}; use {', '.join(names)}")
     hyperparameters = Config(**config or {})
     check_callable(teacher, env)
+    check_seed(seed)
+    require_callable("observe", observe)
+    require_callable("on_iteration", on_iteration)
     interface = Interface.read(describe_env(env))
     env = AutoReset(TeacherObservation(env, env.task.observe if observe is None else observe))
     learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher))(jax.random.key(seed)[None])

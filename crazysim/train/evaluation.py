@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
+from crazysim.envs.random import check_key
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
@@ -25,6 +26,11 @@ EVALUATION_SEED = 0x5EED
 seed."""
 TERM_PREFIX = "reward "
 """Prefix of the names of the terms of a reward, as in ``RewardTerms``."""
+
+
+def held_out_key() -> Array:
+    """Return the random key of the held-out initial states."""
+    return jax.random.key(EVALUATION_SEED)
 
 
 class _FunctionPolicy(PyTree):
@@ -150,6 +156,7 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         ConfigError: If a trained policy has other observations, another command level, rate or task.
     """
     check_policy(policy, env)
+    check_key(held_out_key() if key is None else key)
     return evaluate_blocks(env, as_tree(policy), key)[0]
 
 
@@ -162,7 +169,7 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
         key: Random key of the initial states; None for the held-out ones.
         n_blocks: Number of blocks.
     """
-    key = jax.random.key(EVALUATION_SEED) if key is None else key
+    key = held_out_key() if key is None else key
     # Computing the metrics on the host takes less time than compiling them would.
     flight = jax.device_get(fly_episodes(env, policy, key, n_blocks))
     n_worlds = env.sim.n_worlds // n_blocks

@@ -26,7 +26,7 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import ConfigError, not_installed, short_repr
+from crazysim.errors import ConfigError, not_installed, require_type
 from crazysim.storage import as_path, write_file
 from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
 from crazysim.train.interface import Interface, describe_env, sizes_text
@@ -58,6 +58,7 @@ COMMAND_COMPONENTS: dict[Control, Sequence[str]] = {
 rpm."""
 GRU_GATES = ("reset", "update", "candidate")
 """Gates of a gated recurrent unit, in the order of its weights."""
+POLICY_REMEDY = "Use the first result of load_policy."
 OPSET, IR_VERSION = 17, 8
 """Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
 
@@ -98,6 +99,7 @@ class PolicyNumbers(NamedTuple):
 
 def describe(env: Env) -> dict[str, Any]:
     """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
+    require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
     if env.actions.centre.ndim > 1:
         raise ConfigError(
             "expected an environment whose drones have the same actions, got drones of several airframes. Describe "
@@ -246,7 +248,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     Returns:
         The path.
     """
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
     numbers = _policy_numbers(policy, meta)
     n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
@@ -292,8 +294,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
 def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     """Return the numbers of a policy after a check of their sizes and values."""
-    if not isinstance(policy, Policy):
-        raise ConfigError(f"expected a trained policy, got {short_repr(policy)}. Use the first result of load_policy.")
+    require_type(policy, Policy, POLICY_REMEDY)
     described = Interface.read(meta)
     if policy.interface is not None:
         policy.interface.require(described, "a description")

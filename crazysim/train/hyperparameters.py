@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 
@@ -24,6 +25,13 @@ COUNT_NAMES = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
 """Allowed values of the hyperparameters that are a choice of words, by name."""
+
+
+def check_seed(seed: object) -> None:
+    """Check that a random seed is a whole number of at most 64 bits."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise ConfigError(f"expected an integer as seed, got {seed!r}. Use for example 0.")
+    as_key(int(seed))  # raises an error for more than 64 bits
 
 
 def check_hyperparameters(config: Any) -> None:

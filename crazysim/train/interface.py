@@ -11,7 +11,7 @@ import numpy as np
 
 import crazysim
 from crazysim.envs.env import Env
-from crazysim.errors import ConfigError, short_repr, warn
+from crazysim.errors import ConfigError, require_type, short_repr, warn
 from crazysim.train.task_code import task_digest
 
 REMEDY = (
@@ -52,7 +52,7 @@ class Interface:
                 tuple(zip(centre, scale, strict=True)),
                 *(meta.get(name) for name in ("freq", "task", "task_code")),
             )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(
                 f"expected the description of a policy, got {short_repr(meta)}. Use the third result of load_policy, "
                 f"or describe(env)."
@@ -144,8 +144,7 @@ def check_policy(policy: Any, env: Env) -> None:
 
 def check_callable(policy: Any, env: Env) -> None:
     """Check the types of a policy and an environment."""
-    if not isinstance(env, Env):
-        raise ConfigError(f"expected an environment, got {short_repr(env)}. Use crazysim.envs.make('hover', n_worlds).")
+    require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
     if not callable(policy):
         raise ConfigError(
             f"expected a policy, got {short_repr(policy)}. Use the first result of load_policy, or a function from "
@@ -159,7 +158,8 @@ def sizes_of(obs: Any) -> dict[str, int]:
         return {name: np.shape(x)[-1] for name, x in obs.items()}
     except (AttributeError, IndexError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"expected observations as a dict of arrays (..., k) by name, got {short_repr(obs)}. Use state.obs."
+            f"expected observations as a dict of arrays (..., k) by name, got {short_repr(obs)}. Use state.obs, "
+            f"for example."
         ) from error
 
 

@@ -21,7 +21,7 @@ from jax import Array
 
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.train.convolution import KERNEL_SIZE, Image, convolve, scale_depth
 from crazysim.train.interface import Interface, sizes_of, sizes_text
@@ -377,9 +377,15 @@ class Policy(PyTree):
             self.interface.require_observations(sizes)
         elif sum(sizes.values()) != n_obs:
             raise ConfigError(f"expected observations of {n_obs} numbers for this policy, got {sizes_text(sizes)}.")
-        output, memory = forward(
-            self.network, Weights(self.layers, self.body), self.stats.normalize(flatten(obs)), memory
-        )
+        vector = flatten(obs)
+        expected = self.initial_memory(*vector.shape[:-1])
+        shapes, expected_shapes = ([np.shape(x) for x in jax.tree.leaves(tree)] for tree in (memory, expected))
+        if shapes != expected_shapes or (shapes and jax.tree.structure(memory) != jax.tree.structure(expected)):
+            raise ConfigError(
+                f"expected a memory of shapes {expected_shapes}, got {short_repr(memory)}. Begin with "
+                f"policy.initial_memory{vector.shape[:-1]}, and pass on what policy.act returns."
+            )
+        output, memory = forward(self.network, Weights(self.layers, self.body), self.stats.normalize(vector), memory)
         return jnp.tanh(output), memory
 
     def initial_memory(self, *batch: int) -> Any:

@@ -16,9 +16,9 @@ import numpy as np
 from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require_type
 from crazysim.storage import as_path, write_file
-from crazysim.train.export import float_literal, to_c
+from crazysim.train.export import POLICY_REMEDY, float_literal, to_c
 from crazysim.train.interface import Interface
 from crazysim.train.networks import Policy
 
@@ -60,6 +60,8 @@ def to_out_of_tree(
         ConfigError: If the policy has a memory, commands positions, or commands rotor speeds of other than four rotors;
             if the drone's state and a goal do not give all observations; or if ``freq`` does not divide 1000.
     """
+    require_type(policy, Policy, POLICY_REMEDY)
+    require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")
     if policy.has_memory:
         raise ConfigError(
             "expected a policy without memory, got one with a memory. Use the export as C, and keep its policy_state "

@@ -14,14 +14,15 @@ from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.envs.phases import select_states
+from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points, draw_text
-from crazysim.storage import wrap_read_errors, write_figure
-from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, act, as_tree, fly_episodes, initial_memory
+from crazysim.storage import as_path, wrap_read_errors, write_figure
+from crazysim.train.evaluation import TERM_PREFIX, act, as_tree, fly_episodes, held_out_key, initial_memory
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
@@ -129,7 +130,8 @@ def plot_episode(
         ImportError: If matplotlib is not installed.
     """
     check_policy(policy, env)
-    key = jax.random.key(EVALUATION_SEED) if key is None else key
+    path, key = as_path(path), held_out_key() if key is None else key
+    check_key(key)
     flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
     terms, is_over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
     t = env.task.seconds * (1 + np.arange(len(is_over))) / len(is_over)
@@ -153,7 +155,7 @@ def plot_episode(
         + f"{(is_over[-1] & ~has_succeeded).mean():.0%} crash",
         fontsize=9,
     )
-    _save_figure(figure, Path(path))
+    _save_figure(figure, path)
     return terms
 
 
@@ -204,7 +206,7 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged.
     """
-    path = folder / CURVE_FILE
+    path = as_path(folder) / CURVE_FILE
     with wrap_read_errors(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
         curve = json.loads(path.read_bytes())
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]

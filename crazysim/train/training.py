@@ -32,7 +32,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
-from crazysim.errors import ConfigError, DivergedError, warn
+from crazysim.errors import ConfigError, DivergedError, require_callable, warn
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
 from crazysim.storage import as_path, make_folder, open_replacement, write_file
@@ -141,6 +141,7 @@ def train_many(
     path = folder / CHECKPOINT_FILE
     start_time = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
+    require_callable("on_iteration", on_iteration)
     log = log if is_first_host() else lambda _: None
     if checkpoint_every is not None:
         checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)

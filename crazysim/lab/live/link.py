@@ -13,6 +13,7 @@ from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.swarm import DroneState, Swarm
+from crazysim.tables import read_numbers
 from crazysim.train.interface import Interface
 
 
@@ -120,7 +121,8 @@ class TrainedPolicy:
             meta: Description of the policy's inputs and outputs (``crazysim.train.export.describe``).
             goal: Position to fly to, m. (3,)
         """
-        self.policy, self.goal, self.interface = policy, np.asarray(goal, float), Interface.read(meta)
+        self.policy, self.interface = policy, Interface.read(meta)
+        self.goal: NDArray = read_numbers("goal", goal, shapes=((3,),), remedy="Use [x, y, z], m")
         if getattr(policy, "interface", None) is not None:
             policy.interface.require(self.interface, "a description")  # type: ignore[attr-defined]
         self.reset()
