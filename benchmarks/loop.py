@@ -2,9 +2,10 @@
 
     python benchmarks/loop.py [--device gpu] [--worlds 1 64 1024 16384] [--controls state attitude]
 
-One JSON line for each command level and number of worlds, with the median and the shortest time of an iteration. The
-lines ``loop/jax`` show how much of this time JAX takes: one compiled addition to as many positions, read into NumPy.
-The last line is the loop of C MuJoCo with one free box: set its force, take 5 ``mj_step``, read its position.
+One JSON line for each command level and number of worlds, with the median and the shortest time of an iteration.
+``loop/contacts`` asks for the contacts instead of the positions. The lines ``loop/jax`` show how much of this time JAX
+takes: one compiled addition to as many positions, read into NumPy. The last line is the loop of C MuJoCo with one free
+box: set its force, take 5 ``mj_step``, read its position.
 """
 
 from __future__ import annotations
@@ -43,16 +44,19 @@ def main() -> None:
         def reset(sim: Sim = sim, initial_data=initial_data) -> None:
             sim.data = initial_data
 
-        def iterate(sim: Sim = sim, command=command, send_command=send_command) -> None:
-            send_command(command)
-            sim.step(N_STEPS)
-            np.asarray(sim.data.states.pos)
+        reads = {"loop": lambda sim=sim: sim.data.states.pos, "loop/contacts": lambda sim=sim: sim.contacts()}
+        for name, read in reads.items():
 
-        times = measure_times(reset, iterate, args.repeats)
-        if not is_flying(sim):
-            raise RuntimeError("the drones crashed; a crashed drone costs less to simulate")
-        realtime = N_STEPS / sim.freq * n_worlds / times["iteration_s"]
-        report(args.device, benchmark="loop", control=control, n_worlds=n_worlds, **times, realtime=realtime)
+            def iterate(sim: Sim = sim, command=command, send_command=send_command, read=read) -> None:
+                send_command(command)
+                sim.step(N_STEPS)
+                np.asarray(read())
+
+            times = measure_times(reset, iterate, args.repeats)
+            if not is_flying(sim):
+                raise RuntimeError("the drones crashed; a crashed drone costs less to simulate")
+            realtime = N_STEPS / sim.freq * n_worlds / times["iteration_s"]
+            report(args.device, benchmark=name, control=control, n_worlds=n_worlds, **times, realtime=realtime)
     for n_worlds in args.worlds:
         report(
             args.device,

@@ -53,9 +53,10 @@ def test_step_prints_a_line_with_its_machine(run):
 
 
 def test_loop_prints_the_time_of_an_iteration(run):
-    line, jax_line, box = run("loop.py", "--worlds", "4", "--controls", "state", "--repeats", "2")
+    line, contacts_line, jax_line, box = run("loop.py", "--worlds", "4", "--controls", "state", "--repeats", "2")
     assert (line["control"], line["n_worlds"]) == ("state", 4)
     assert line["realtime"] == pytest.approx(4 * 0.01 / line["iteration_s"])
+    assert contacts_line["benchmark"] == "loop/contacts"
     assert (jax_line["benchmark"], box["benchmark"]) == ("loop/jax", "loop/mj_step")
     assert 0 < box["shortest_s"] <= box["iteration_s"]
 

@@ -68,14 +68,16 @@ class HostLeaves:
 
     def replace(self, indices: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
         """Return the leaves with some replaced by ``arrays``, which must not change afterwards."""
-        arrays = [np.ascontiguousarray(x) for x in arrays]
+        arrays = [np.asarray(x, order="C") for x in arrays]
         return self.replace_items(indices, arrays, [_address(x) for x in arrays])
 
     def replace_items(self, indices: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
         """Return the leaves with some replaced by ``items`` at the given addresses."""
         leaves = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
+        leaves._jax_arrays = dict(self._jax_arrays)
         for i, x, address in zip(indices, items, addresses, strict=True):
             leaves.items[i], leaves.addresses[i] = x, address
+            leaves._jax_arrays.pop(i, None)
         return leaves
 
 

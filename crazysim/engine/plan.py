@@ -53,8 +53,7 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 
 SeparateLeaves = frozenset[int] | None
 """Leaves that stay separate arrays when the other written leaves are stored as rows of a few arrays. With an empty set
-every written leaf is stored as rows, except for random keys and ``core.mjx_synced``. With None no leaf
-is stored as rows."""
+every written leaf is stored as rows, except for random keys. With None no leaf is stored as rows."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,11 +88,6 @@ class Plan:
     """Step in NumPy for arguments that are not traced; None unless ``interpret`` runs the whole step without a mesh."""
     host_call: HostCall | None = None
     """Step without XLA, for a simulation that holds its data between calls; None if it is not possible."""
-
-    @property
-    def synced_leaf(self) -> int:
-        """Index of the leaf ``core.mjx_synced``, which is False after a step."""
-        return int(self.leaf_indices.core.mjx_synced)
 
     @property
     def program(self) -> Program | None:
@@ -175,8 +169,7 @@ class Planner(NamedTuple):
         has_one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
         select_rows = None
         if separate is not None and has_one_kernel:
-            separate_leaves = {*separate, leaf_indices(data).core.mjx_synced}
-            select_rows = lambda written_leaves: [i for i in written_leaves if i not in separate_leaves]  # noqa: E731
+            select_rows = lambda written_leaves: [i for i in written_leaves if i not in separate]  # noqa: E731
         programs = tuple([optimise(program, select_rows, pack=k == 0) for k, program in enumerate(lowered_programs)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.explanation}" for s in unfused if not isinstance(s.error, LimitError)]

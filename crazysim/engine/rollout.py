@@ -67,7 +67,7 @@ def rollout(
     zeros = step.zeros(data) if zeros is None else zeros
     staged = F.staged_leaves(leaf_indices(data))
     flat = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
-    carried = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf, *staged})
+    carried = sorted({*flat.plan.written_leaves, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         flat_before = flat.replace(carried, carry)

@@ -148,8 +148,8 @@ class Step:
         self._pack_cache = PackCache()
         self._home_sharding: Any = None
         """Last sharding that was found to be at ``location``."""
-        self._last_false_flag: Any = None
-        """Last value of ``core.mjx_synced`` that ``_make_false_flag`` made."""
+        self._false_flag: Any = None
+        """Value of ``core.mjx_synced`` in the data of the last call."""
 
     def without_stages(self, names: Collection[str]) -> Step:
         """Return a step without the stages of some names."""
@@ -180,8 +180,11 @@ class Step:
         _check_steps(n_steps)
         require_data(data)
         leaves, treedef = jax.tree.flatten(data)
-        flat_after = self.advance(self._flatten(data, leaves, treedef, zeros, n_steps), n_steps)
-        return treedef.unflatten(flat_after.leaves[: len(leaves)])
+        flat = self._flatten(data, leaves, treedef, zeros, n_steps)
+        leaves_after = self.advance(flat, n_steps).leaves[: len(leaves)]
+        flag = int(flat.plan.leaf_indices.core.mjx_synced)
+        leaves_after[flag] = self._make_false_flag(leaves_after[flag])
+        return treedef.unflatten(leaves_after)
 
     def flatten(
         self,
@@ -234,7 +237,6 @@ class Step:
             outputs = step(inputs, n_steps)
         self._called.add(call_key)
         leaves = replace_leaves(flat.leaves, plan.written_leaves, outputs)  # type: ignore[arg-type]  # a list, except for a host call
-        leaves[plan.synced_leaf] = self._make_false_flag(leaves[plan.synced_leaf])
         return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
@@ -242,10 +244,8 @@ class Step:
         plan, leaves = flat.plan, flat.leaves
         host_call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
-            leaves = host_call.make_host_leaves(leaves, leaves[plan.synced_leaf].sharding)
-        leaves_after = host_call(leaves, n_steps)
-        leaves_after.items[plan.synced_leaf] = self._make_false_flag(leaves_after.items[plan.synced_leaf])
-        return FlatData(leaves_after, plan)
+            leaves = host_call.make_host_leaves(leaves, leaves[int(plan.leaf_indices.core.nonfinite)].sharding)
+        return FlatData(host_call(leaves, n_steps), plan)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return the plan that steps this data."""
@@ -289,12 +289,12 @@ class Step:
 
     def _make_false_flag(self, old_flag: Any) -> Any:
         """Return a false flag on the devices of the previous flag: the previous flag itself if this method made it."""
-        if old_flag is self._last_false_flag:
+        if old_flag is self._false_flag:
             return old_flag
         traced = isinstance(old_flag, jax.core.Tracer)
         flag = jnp.asarray(False) if traced else jax.device_put(np.False_, getattr(old_flag, "sharding", None))
         if not isinstance(flag, jax.core.Tracer):
-            self._last_false_flag = flag
+            self._false_flag = flag
         return flag
 
     def _plan(

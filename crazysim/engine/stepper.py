@@ -17,6 +17,7 @@ from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import put_on_device, shard
+from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
@@ -49,8 +50,8 @@ class Stepper:
         """Plan of the last flattened data, and its shapes, types and devices."""
         self._step_counts: dict[int, Array] = {}
         """Arrays of numbers of steps that ``advance`` received."""
-        self._unsynced_flag: object = None
-        """Array of ``core.mjx_synced`` that is known to be false."""
+        self._is_flagged = False
+        """True if ``core.mjx_synced`` is true in the data."""
         self._max_step_count: int | None = None
         """Largest number of steps of a world since its reset, or an upper bound; None if unknown."""
         self._last_count: tuple[object, int] = (None, 0)
@@ -98,28 +99,34 @@ class Stepper:
         feedforward = None if feedforward is None else put_command(data, feedforward)
         self._data = stage_command(data, put_command(data, command), feedforward)
 
-    @property
-    def synced(self) -> bool:
-        """True if the scene matches the data: a sync has set ``core.mjx_synced`` since the data last changed.
-
-        The flag is compared by identity with an array that is known to be false, so that it never waits for the device.
-        """
+    def set_synced(self, flag: bool) -> None:
+        """Set ``core.mjx_synced``, in which users read whether the scene matches the data."""
+        if flag == self._is_flagged:
+            return
+        # A new array: a user may donate data that was read from here, which must not share arrays with other data.
         data = self._data
-        flag = data.leaves[data.plan.synced_leaf] if isinstance(data, FlatData) else self.data.core.mjx_synced
-        return flag is not self._unsynced_flag
+        if isinstance(data, FlatData):
+            i = int(data.plan.leaf_indices.core.mjx_synced)
+            on_host = isinstance(data.leaves, HostLeaves)
+            self._data = data.replace([i], [np.bool_(flag) if on_host else _flag_like(data.leaves[i], flag)])
+        else:
+            core = self.data.core
+            self._data = self.data.replace(core=core.replace(mjx_synced=_flag_like(core.mjx_synced, flag)))
+        self._is_flagged = flag
 
     def assign(self, data: SimData) -> None:
         """Replace the data by data of the caller: put it on the device, and clear ``core.mjx_synced``."""
         if self._data is None or data.core.steps is not self.data.core.steps:
             self._max_step_count = None
-        if data.core.mjx_synced is not self._unsynced_flag:
-            # A new array: a user may donate data that was read from here, which must not share arrays with other data.
+        if self._is_flagged or self._data is None or data.core.mjx_synced is not self.data.core.mjx_synced:
+            # A new array, as in ``set_synced``.
             data = data.replace(core=data.core.replace(mjx_synced=np.False_))
-        self.accept(self.put_on_device(data))
+        self.data, self._is_flagged = self.put_on_device(data), False
 
     def accept(self, data: SimData) -> None:
-        """Replace the data by data on the device with ``core.mjx_synced`` false, as compiled calls return it."""
-        self.data, self._unsynced_flag = data, data.core.mjx_synced
+        """Replace the data by data on the device, as compiled calls return it."""
+        self.data = data
+        self.set_synced(False)
 
     def put_on_device(self, data: SimData) -> SimData:
         """Return the data with every leaf on the device, or distributed over the mesh.
@@ -148,7 +155,8 @@ class Stepper:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))
             else:
                 flat_after = self.step.advance_on_host(flat, n_steps)
-        self._data, self._unsynced_flag = flat_after, flat_after.leaves[flat.plan.synced_leaf]
+        self._data = flat_after
+        self.set_synced(False)
 
     def count_steps(self, n_steps: int, times: int = 1) -> None:
         """Count steps that are about to be taken.
@@ -184,3 +192,7 @@ class Stepper:
 
 def _without_values(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding)
+
+
+def _flag_like(x: Any, flag: bool) -> Array:
+    return jnp.asarray(flag) if isinstance(x, jax.core.Tracer) else jax.device_put(np.bool_(flag), x.sharding)

@@ -246,9 +246,7 @@ class Env(ABC):
         if self.phases.takes_images:
             state = self.phases.look(state)
             state = state.replace(info={name: x for name, x in state.info.items() if name != "final_obs"})
-        core = state.full_data.core.replace(mjx_synced=jnp.asarray(False))
-        full_data = state.full_data.replace(core=core)
-        return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))
+        return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
 
     def _add_step_results(self, state: EnvState) -> EnvState:
         """Return the state at the start of the first episode, with zeros in the fields that only a step computes."""

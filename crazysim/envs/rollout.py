@@ -111,8 +111,7 @@ def rollout(
                 f"expected a memory of the shapes and types of initial_memory, {_formats(initial_memory)}, got "
                 f"{_formats(memory)}. Use the memory that a rollout of the same policy returned."
             )
-    # Only these leaves change: those that a step writes, and the flag that the scene is in sync with the data.
-    carried_indices = sorted({*flat.plan.written_leaves, flat.plan.synced_leaf})
+    carried_indices = flat.plan.written_leaves  # only these change
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
         flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]

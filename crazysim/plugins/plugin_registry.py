@@ -58,6 +58,8 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim = sim
         self._installed: dict[str, _InstalledPlugin] = {}
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
+        self._last_moved: tuple[list[Any], Any] = [], None
+        """Arrays that plugins moved objects by last, and these objects."""
         self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
         self._is_checked = True
         self._is_changing = False
@@ -402,12 +404,18 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def with_moved_objects(self, data: SimData) -> SimData:
         """Return the data with the objects of plugins at their poses, unless recorded poses are shown."""
-        if data.objects is None or data.objects.recorded:
+        movers = {name: plugin for name, plugin in self.items() if plugin.moves_objects}
+        if data.objects is None or data.objects.recorded or not movers:
             return data
-        for name, plugin in self.items():
-            if plugin.moves_objects:
+        # The same objects for the same arrays: the scene knows by identity that nothing has moved.
+        arrays = [*movers.values(), *jax.tree.leaves((data.states, data.plugins, data.objects))]
+        last_arrays, objects = self._last_moved
+        if len(arrays) != len(last_arrays) or any(a is not b for a, b in zip(arrays, last_arrays, strict=True)):
+            for name in movers:
                 data = data.replace(objects=self._moved_objects(name, data))
-        return data
+            objects = data.objects
+            self._last_moved = arrays, objects
+        return data.replace(objects=objects)
 
     def _moved_objects(self, name: str, data: SimData) -> Objects:
         plugin = self[name]

@@ -13,11 +13,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
 from crazysim.cache import announce_if_slow
-from crazysim.core.data import SimData
 from crazysim.core.sharding import put_on_device, shard_scene
 from crazysim.eager import fetch_rows
 from crazysim.scene import build, contacts, mjx
-from crazysim.scene.sync import sync_sim2mjx
+from crazysim.scene.sync import Poses, sync_poses
 
 
 class MjxScene:
@@ -37,6 +36,8 @@ class MjxScene:
         self._data: mjx.Data | None = None
         self._initial_poses: tuple[NDArray, ...] | None = None
         self._has_synced = False
+        self._synced: list[Any] | None = None
+        """Arrays of poses of the last sync; None if the scene may be another one now."""
 
     @property
     def model(self) -> mjx.Model:
@@ -62,19 +63,33 @@ class MjxScene:
 
     @data.setter
     def data(self, data: mjx.Data) -> None:
-        self._data = self._to_device(build.check_poses(data, self._mj_model, self._n_worlds))
+        self._data, self._synced = self._to_device(build.check_poses(data, self._mj_model, self._n_worlds)), None
 
     @property
     def is_allocated(self) -> bool:
         """True once ``data`` has been read or assigned."""
         return self._data is not None
 
-    def sync(self, data: SimData) -> SimData:
-        """Copy the poses in the data of all worlds into MJX, and return the data with ``core.mjx_synced`` set."""
+    def sync(self, poses: Poses) -> mjx.Data:
+        """Return the scene with these poses, which is computed unless they are the very arrays of the last sync.
+
+        Identity suffices, because the values of JAX arrays do not change; NumPy arrays and tracers are always copied.
+        The result for tracers is not kept.
+        """
+        arrays = jax.tree.leaves(poses)
+        if self._synced is not None and all(a is b for a, b in zip(arrays, self._synced, strict=True)):
+            return self.data
         is_first, self._has_synced = not self._has_synced, True
         with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if is_first else nullcontext():
-            data, self._data = sync_sim2mjx(data, self.data, self.model)
+            data = sync_poses(poses, self.data, self.model)
+        if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(data)):
+            self._data = data
+            self._synced = arrays if all(isinstance(x, jax.Array) for x in arrays) else None
         return data
+
+    def forget_sync(self) -> None:
+        """Make the next ``sync`` copy the poses, whatever they are."""
+        self._synced = None
 
     def poses(self, worlds: int | NDArray | None = None) -> tuple[Any, Any, Any]:
         """Return poses of worlds at the last sync, or the model's initial poses if nothing is allocated yet.
@@ -98,22 +113,22 @@ class MjxScene:
         pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._initial_poses)
         return pos, quat, qpos
 
-    def contacts(self, body: str | None) -> Array:
-        """Return True for every contact slot of MJX that touched at the last sync.
+    def contacts(self, poses: Poses, body: str | None) -> Array:
+        """Return True for every contact slot of MJX that touches, after a sync if it is needed.
 
         Args:
+            poses: As for ``sync``.
             body: Name of the body whose slots are returned; None for all bodies.
 
         Returns:
             (n_worlds, n_slots), bool
         """
-        if body is None:
-            return contacts.contact_flags(self.data)
-        return contacts.body_contact_flags(self.data, self._mj_model, body)
+        data = self.sync(poses)
+        return contacts.contact_flags(data) if body is None else contacts.body_contact_flags(data, self._mj_model, body)
 
     def shard(self, mesh: Mesh) -> None:
         """Distribute the worlds over devices."""
-        self._mesh, self._model, self._has_synced = mesh, None, False
+        self._mesh, self._model, self._has_synced, self._synced = mesh, None, False, None
         if self._data is not None:
             self._data = self._to_device(self._data)
 

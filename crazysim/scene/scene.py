@@ -28,7 +28,7 @@ from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
 from crazysim.scene.ray_casting import RayKernels
 from crazysim.scene.renderer import SceneRenderer
 from crazysim.scene.splats import SplatScene
-from crazysim.scene.sync import sync_one_world, with_data_poses
+from crazysim.scene.sync import poses_of, sync_one_world, with_data_poses
 
 LARGE_SWARM = 64
 """Smallest number of drones per world for which MJX checks two pairs per drone instead of all pairs."""
@@ -37,7 +37,7 @@ LARGE_SWARM = 64
 class Scene:
     """The MuJoCo scene of a simulation.
 
-    The scene is updated lazily. If contacts are requested and ``core.mjx_synced`` is not set, ``sync`` updates all
+    The scene is updated lazily. If contacts are requested and something has moved, ``sync`` updates all
     worlds. For an image, ``sync_one`` updates one world. MJX allocates nothing per world before the first ``contacts``
     or use of ``mjx_data``.
     """
@@ -444,10 +444,14 @@ class Scene:
         self.mesh, self.ray_kernels = mesh, dataclasses.replace(self.ray_kernels, mesh=mesh)
         self._mjx.shard(mesh)
 
-    def sync(self, data: SimData) -> SimData:
-        """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set."""
+    def sync(self, data: SimData) -> None:
+        """Bring ``mjx_data`` up to date in all worlds, if the poses in the data are others than at the last sync."""
         self.compile_if_edited()
-        return self._mjx.sync(data)
+        self._mjx.sync(poses_of(data))
+
+    def forget_sync(self) -> None:
+        """Make the next ``sync`` update ``mjx_data``, whatever the poses are."""
+        self._mjx.forget_sync()
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
@@ -458,16 +462,18 @@ class Scene:
 
     # Contact slots and images -----------------------------------------------------------------------------------------
 
-    def contacts(self, body: str | None = None) -> Array:
-        """Return True for every contact slot of MJX that touched at the last sync.
+    def contacts(self, data: SimData, body: str | None = None) -> Array:
+        """Return True for every contact slot of MJX that touches, after a sync if anything has moved.
 
         Args:
+            data: The simulation.
             body: Name of the body whose slots are returned; None for all bodies.
 
         Returns:
             (n_worlds, n_slots), bool
         """
-        return self._mjx.contacts(body)
+        self.compile_if_edited()
+        return self._mjx.contacts(poses_of(data), body)
 
     def render(
         self, mode: str, camera: int | str, cam_config: Mapping[str, ArrayLike] | None, width: int, height: int

@@ -19,19 +19,36 @@ COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAML
 cameras."""
 
 
-@jax.jit
+Poses = tuple[tuple[Array, Array, Array], ...]
+"""Mocap ids (n,), positions, world frame, m (n_worlds, n, 3), and attitudes, body to world, xyzw (n_worlds, n, 4), of
+all drones, and of all objects with handles, whose poses have a further axis of length 1 after n_worlds."""
+
+
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
     """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data.
 
-    Writes the poses of drones and of objects with handles (``Handle``). Then computes the poses of all bodies, cameras
-    and lights, and the contacts. Other mocap bodies keep their poses in ``mjx_data``.
-
     Args:
-        data: Simulation. Quaternions are xyzw here and wxyz in MuJoCo.
+        data: Simulation.
         mjx_data: State of the scene in every world.
         mjx_model: Compiled scene, shared by all worlds.
     """
-    for ids, pos, quat in _data_poses(data):
+    mjx_data = sync_poses(poses_of(data), mjx_data, mjx_model)
+    return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
+
+
+def poses_of(data: SimData) -> Poses:
+    """Return the poses of everything in the scene that the data moves."""
+    drones, objects = (data.core.drone_mocap_ids, data.states.pos, data.states.quat), data.objects
+    return (drones,) if objects is None else (drones, (objects.mocap_ids, objects.pos, objects.quat))
+
+
+@jax.jit
+def sync_poses(poses: Poses, mjx_data: mjx.Data, mjx_model: mjx.Model) -> mjx.Data:
+    """Write poses into the scene, then compute the poses of all bodies, cameras and lights, and the contacts.
+
+    Mocap bodies other than drones and objects with handles (``Handle``) keep their poses in ``mjx_data``.
+    """
+    for ids, pos, quat in _groups(poses):
         mjx_data = mjx_data.replace(
             mocap_pos=mjx_data.mocap_pos.at[:, ids].set(pos),
             mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
@@ -49,22 +66,13 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
         world = mjx.camlight(mjx_model, world)
         return mjx.collision(mjx_model, world)
 
-    mjx_data = jax.vmap(update_world)(mjx_data)
-    return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
+    return jax.vmap(update_world)(mjx_data)
 
 
-def _data_poses(data: SimData) -> list[tuple[Array, Array, Array]]:
-    """Return mocap ids, positions and attitudes of drones and of objects with handles."""
-    poses = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
-    if data.objects is not None:
-        poses.append((data.objects.mocap_ids, *_drop_drone_axis(data.objects.pos, data.objects.quat)))
-    return poses
-
-
-@jit_eager_calls()
-def _drop_drone_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
-    """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
-    return pos[:, 0], quat[:, 0]
+def _groups(poses: Poses) -> list[tuple[Array, Array, Array]]:
+    """Return mocap ids, positions and attitudes of drones, and of objects with handles."""
+    drones, *objects = poses
+    return [drones, *[(ids, pos[:, 0], quat[:, 0]) for ids, pos, quat in objects]]
 
 
 def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -92,7 +100,7 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
     mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
-    for ids, pos, quat in _data_poses(data):
+    for ids, pos, quat in _groups(poses_of(data)):
         mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
         mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
     return mocap_pos, mocap_quat, qpos

@@ -265,6 +265,7 @@ class Sim:
         self._adopt_scene()
         self.configuration.check(data, self._default_data)
         self._stepper.assign(self._adapt_to_scene(data))
+        self._scene.forget_sync()
 
     @property
     def default_data(self) -> SimData:
@@ -657,13 +658,15 @@ class Sim:
         data = self._data_with_moved_objects()
         if world is not None:
             self._scene.sync_one(data, world)
-        elif not self._stepper.synced:
-            self._stepper.data = self._scene.sync(data)
+        else:
+            self._scene.sync(data)
+            self._stepper.set_synced(True)
 
     def _data_with_moved_objects(self) -> SimData:
         """Return the data with the objects of plugins, such as loads, at their poses."""
         return self.plugins.with_moved_objects(self.data)
 
+    @locked
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after a sync if anything has changed.
 
@@ -678,8 +681,9 @@ class Sim:
         """
         if body is not None:
             body_id(self.mj_model, body)  # a wrong name raises before anything changes
-        self.sync()
-        return self._scene.contacts(body)
+        slots = self._scene.contacts(self._data_with_moved_objects(), body)
+        self._stepper.set_synced(True)
+        return slots
 
     def contact_report(self, objects: ObjectSelection = None, floor: bool = True, drones: bool = True) -> ContactReport:
         """Return the contacts and distances of every drone: to the floor, to objects, to other drones.

@@ -13,8 +13,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
+from crazysim import SlungLoad
 from crazysim.core import functional as F
+from crazysim.engine import Step
 from crazysim.scene import mjx_scene
+from crazysim.scene.sync import poses_of, sync_poses
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
 
@@ -53,9 +56,9 @@ def syncs(monkeypatch):
 
     def counted(*args):
         done.append(1)
-        return sync_sim2mjx(*args)
+        return sync_poses(*args)
 
-    monkeypatch.setattr(mjx_scene, "sync_sim2mjx", counted)
+    monkeypatch.setattr(mjx_scene, "sync_poses", counted)
     return done
 
 
@@ -332,6 +335,100 @@ def test_queries_read_no_flag_from_the_device(two_world_sim, syncs):
         two_world_sim._stepper.data = valid_data
 
 
+# Whose poses the scene has --------------------------------------------------------------------------------------
+
+
+def test_a_step_that_moves_nothing_leaves_the_scene_fresh(syncs):
+    """The scene compares the arrays of poses, so it needs no flag of the step."""
+    sim = Sim(n_worlds=2)
+    sim.step_pipeline = {"increment_steps": sim.step_pipeline["increment_steps"]}
+    sim.contacts()
+    sim.step()
+    sim.contacts()
+    assert len(syncs) == 1
+
+
+def test_commands_between_queries_read_poses_once_on_the_host(syncs):
+    """A staged command keeps the arrays that were read from the memory of kernels, which tell that nothing moved."""
+    sim = Sim(n_worlds=2)
+    for _ in range(2):
+        sim.attitude_control(np.zeros((2, 1, 4)))
+        sim.step(5)
+        sim.contacts()
+    syncs.clear()
+    sim.attitude_control(np.zeros((2, 1, 4)))
+    sim.contacts()
+    assert not syncs
+
+
+def test_a_scene_with_a_load_is_synced_once_for_two_queries(syncs):
+    """Plugins compute the poses of their objects at a query; the same data gives the same arrays."""
+    sim = Sim(n_worlds=2, plugins=[SlungLoad(0.01, 0.5)])
+    for _ in range(2):
+        sim.step(5)
+        sim.contacts()
+        sim.contacts()
+    assert len(syncs) == 2
+
+
+def test_numpy_arrays_are_copied_at_every_sync(two_world_sim, syncs):
+    """Their owner may change them, so that identity proves nothing."""
+    scene, ((ids, pos, quat), *others) = two_world_sim.scene._mjx, poses_of(two_world_sim.data)
+    pos = np.array(pos)
+    for height in (FREE_HEIGHT, 0.0):
+        pos[..., 2] = height
+        scene.sync(((ids, pos, quat), *others))
+        np.testing.assert_allclose(two_world_sim.mjx_data.mocap_pos[:, np.asarray(ids)[0], 2], height)
+    assert len(syncs) == 2
+
+
+def test_a_traced_query_is_right_and_leaves_no_tracer(two_world_sim, syncs):
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    scene = two_world_sim.scene
+
+    @jax.jit
+    def touches(data):
+        return scene.contacts(data, "drone:0").any(-1)
+
+    assert touches(with_heights(two_world_sim.data, 0.0, FREE_HEIGHT)).tolist() == [True, False]
+    assert not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(two_world_sim.mjx_data))
+    assert drone_touches(two_world_sim) == [False, False]
+
+
+def test_donated_poses_count_by_identity(one_world_sim, syncs):
+    """A user may donate data read from the simulation; the scene still knows whether it has seen new arrays."""
+    one_world_sim.step()
+    one_world_sim.contacts()
+    raised = jax.jit(lambda data: with_traced_height(data, FREE_HEIGHT), donate_argnums=0)(one_world_sim.data)
+    one_world_sim.data = raised
+    assert drone_touches(one_world_sim) == [False]
+    one_world_sim.data = with_heights(one_world_sim.data, 0.0)
+    assert drone_touches(one_world_sim) == [True]
+
+
+def with_traced_height(data, height):
+    return data.replace(states=data.states.replace(pos=data.states.pos.at[..., 2].set(height)))
+
+
+def test_a_flag_replaced_by_false_forces_a_sync(two_world_sim, syncs):
+    """As in Crazyflow: whoever changed the scene behind the simulation's back clears the flag."""
+    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
+    syncs.clear()
+    data = two_world_sim.data
+    two_world_sim.data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
+    two_world_sim.contacts()
+    assert len(syncs) == 1
+
+
+@pytest.mark.parametrize("engine", ["plain", "fused"])
+def test_a_pure_step_clears_the_flag(two_world_sim, engine):
+    """Functional code asks the flag of its data, which is False after every step, also inside jit."""
+    data, _ = sync_sim2mjx(two_world_sim.data, two_world_sim.mjx_data, two_world_sim.mjx_model)
+    step = Step(two_world_sim.step_pipeline, engine)
+    for fn in (step, jax.jit(step)):
+        assert not fn(data).core.mjx_synced
+
+
 # What is allocated ----------------------------------------------------------------------------------------------
 
 
@@ -488,7 +585,7 @@ class SceneMachine(RuleBasedStateMachine):
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
         done = []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(mjx_scene, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
+            patch.setattr(mjx_scene, "sync_poses", lambda *args: done.append(1) or sync_poses(*args))
             assert drone_touches(self.sim) == expected.tolist()
         assert len(done) == self.changed
         self.changed = False

@@ -64,7 +64,7 @@ def test_poses_equal_those_in_mujoco(course, rng):
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    sim.data = sim.scene.sync(sim.data)
+    sim.sync()
     model, mjx_data = sim.mj_model, jax.device_get(sim.mjx_data)
     for world in range(3):
         sim.scene.sync_one(sim.data, world)

@@ -368,9 +368,9 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
 
 CRAZYFLOW_CODE = textwrap.dedent("""
     import crazysim.scene.mjx_scene as mjx_scene
-    from crazysim.sim.sim import sync_sim2mjx as original_sync
+    from crazysim.scene.sync import sync_poses as original_sync
     syncs = []
-    mjx_scene.sync_sim2mjx = lambda *args: syncs.append(1) or original_sync(*args)
+    mjx_scene.sync_poses = lambda *args: syncs.append(1) or original_sync(*args)
 
     # The following code is from Crazyflow's documentation, with the name of the package replaced.
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim.scene.sync import sync_one_world
+from crazysim.scene.sync import sync_one_world, sync_poses
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx
 
@@ -157,10 +157,10 @@ def test_a_sync_works_in_jit_and_scan(sim, synced_data):
 def test_a_sync_compiles_once(sim):
     """A scene written with NumPy or JAX arrays, on any data, is synced by one compilation."""
     sim.contacts()
-    n_programs = sync_sim2mjx._cache_size()
+    n_programs = sync_poses._cache_size()
     mocap_pos = np.asarray(sim.mjx_data.mocap_pos)
     for poses in (mocap_pos, mocap_pos.astype(np.float64), jnp.asarray(mocap_pos)):
         sim.mjx_data = sim.mjx_data.replace(mocap_pos=poses)
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.asarray(sim.data.states.pos) + 0.0))
         sim.contacts()
-    assert sync_sim2mjx._cache_size() == n_programs
+    assert sync_poses._cache_size() == n_programs
