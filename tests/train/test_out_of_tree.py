@@ -221,6 +221,14 @@ def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):
     library, n = folder / "policy.so", 3
     arguments = ["-DCRAZYSIM", f"-I{CFirmware.include}", folder / "controller.c", "-o", library, "-lm"]
     subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *arguments], check=True)
+    inputs, motors = np.zeros(39, np.float32), np.ones((2, 4), np.float32)  # struct crazysim_input
+    inputs[[4, 8]] = 1.0
+    for i in range(2):
+        pointers = (ctypes.c_void_p(x.ctypes.data) for x in (inputs, motors[i]))
+        ctypes.CDLL(str(library)).crazysim_update(None, 0, *pointers)
+        inputs[9] = np.nan  # a velocity
+    assert motors[0].min() > 1000.0
+    assert not motors[1].any(), "rpm without a finite state"
     start = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 1.2], [-0.4, 0.1, 0.9]])[:, None]
     goal = np.array([0.1, 0.2, 1.1])
     in_c = Sim(n, control="state", controller=CFirmware(library, motors="rpm", freq=50))
