@@ -35,7 +35,9 @@ def test_public_names_exist_once():
 def test_a_star_import_needs_no_optional_package(module, monkeypatch):
     for name in ("stable_baselines3", "crazysim.envs.pettingzoo", "crazysim.envs.sb3"):
         monkeypatch.setitem(sys.modules, name, None)
-    exec(f"from {module} import *", {})
+    names = {}
+    exec(f"from {module} import *", names)
+    assert names.keys() >= set(sys.modules[module].__all__)
 
 
 ALIASES = {

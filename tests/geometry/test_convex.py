@@ -68,10 +68,15 @@ def test_law_01_one_drone_then_many(x64, rng):
     assert shape.shape == (2, 4)
 
 
+@pytest.mark.long("compiles a distance of every pair of kinds")
 def test_every_kind_has_a_distance():
-    """Every drone shape has a distance to every kind of shape that a scene may contain."""
+    """Every drone shape has a distance to every kind of shape that a scene may contain: here it is above the shape."""
     shapes = {kind: Shape(kind, (0.3,) * n) for kind, n in N_SIZES.items() if kind not in ("mesh", "hfield")}
-    for b in shapes.values():
-        for a in DRONES.values():
-            out = jax.eval_shape(lambda p, r, a=a, b=b: distance(a, b, p, r), jnp.zeros(3), jnp.zeros((3, 3)))
-            assert out.shape == ()
+    heights = {kind: {"plane": 0.0, "capsule": 0.6}.get(kind, 0.3) for kind in shapes}
+    pairs = [(a, b) for a in DRONES for b in shapes]
+    pos, rot = jnp.array([0.0, 0.0, 2.0]), jnp.eye(3)
+    above = jax.jit(lambda: [distance(DRONES[a], shapes[b], pos, rot) for a, b in pairs])()
+    lowest = {"sphere": DRONES["sphere"].size[0], "capsule": sum(DRONES["capsule"].size), "box": DRONES["box"].size[2]}
+    for (a, b), result in zip(pairs, above, strict=True):
+        assert result.shape == ()
+        np.testing.assert_allclose(result, 2.0 - heights[b] - lowest[a], atol=1e-5, err_msg=f"{a} above {b}")

@@ -52,8 +52,13 @@ def test_law_09_two_plugins_that_replace_the_same_term_are_an_error_with_both_na
 
 
 def test_plugins_that_replace_no_term_can_be_added_twice(sim):
+    before, names = dict(sim.step_pipeline), {"first", "second", "first_filter", "second_filter"}
     for name in ("first", "second"):
         sim.add(Wind((1.0, 0.0, 0.0), name=name))
         sim.add(Kalman(SENSORS, control=False, name=f"{name}_filter"))
+    assert names <= sim.data.plugins.keys()
+    assert {"first_filter", "second_filter"} <= sim.step_pipeline.keys()
     for name in ("first_filter", "second_filter", "first", "second"):
         sim.remove(name)
+    assert not names & sim.data.plugins.keys()
+    assert list(sim.step_pipeline) == list(before)

@@ -268,7 +268,8 @@ def test_a_page_of_another_site_cannot_connect(page, caplog, change, message):
 
 def test_the_page_and_other_programs_connect(page):
     for origin in (f"http://{urlsplit(page.url).netloc}", None):
-        connect(page, origin=origin).close()
+        with connect(page, origin=origin) as connection:
+            assert connection.subprotocol == "viser-v0"
 
 
 @pytest.mark.parametrize(
