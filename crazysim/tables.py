@@ -19,6 +19,8 @@ MAX_NUMBER = 1e30
 """Largest magnitude of a number, and inverse of the smallest positive one; float32 can represent both."""
 ENTRY_KEYS = ("value", "unit", "source")
 """Keys of a number that is written with its unit and source."""
+MODEL_SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".xacro")
+"""Suffixes of models of bodies, which have no rotors and are not tables."""
 MAX_BASES = 8
 """Largest number of tables in a chain of bases."""
 
@@ -262,6 +264,11 @@ def read_source(
         raise UnknownNameError(
             f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
             f"{short_repr(str(source))}, and no file of that path exists"
+        )
+    if Path(source).suffix.lower() in MODEL_SUFFIXES:
+        raise ConfigError(
+            f"expected a {kind} as a .toml file, got {str(source)!r}, a model of bodies. Write its mass, inertia and "
+            f"rotors into a .toml file, for drones with 'crazysim airframe new'. Sim(xml_path=...) loads a scene."
         )
     return Path(source).stem, f" in {source}", read_toml(source, guide)
 

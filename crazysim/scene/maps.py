@@ -23,6 +23,9 @@ MAX_COORDINATE = 1e6
 """Largest coordinate of a map, m."""
 MAX_VOXELS = 20_000_000
 """Largest number of points of a cloud, or of voxels near triangles; more would need several GB of memory."""
+MAX_UNSCALED_VOXELS = 2_000_000
+"""Largest number of voxels near triangles without ``scale``, which take about 5 s: more are mostly files in
+millimetres."""
 MAX_BOXES = 10_000
 """Largest number of boxes of a map."""
 MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
@@ -48,8 +51,14 @@ def map_spec(
             f"expected finite coordinates, got {n} of {len(points)} points that are not finite. Drop them."
         )
     points = to_world_frame(points, pos, quat, scale)
+    remedy = "Use a larger resolution=."
+    if scale is None:
+        size = " x ".join(f"{x:.3g}" for x in np.ptp(points, axis=0))
+        remedy += (
+            f" The map is {size} m large: if the file is in millimetres, pass scale=0.001, and in metres scale=1.0."
+        )
     if triangles is None:
-        _check_count("points", len(points), resolution)
+        _check_count("points", len(points), MAX_VOXELS, f"Use a part of the map. {remedy}")
         voxels = voxels_of_points(points, resolution, min_points)
         if not len(voxels):
             raise ConfigError(f"expected voxels with min_points={min_points} points, got none. Use a smaller number.")
@@ -57,13 +66,15 @@ def map_spec(
         if min_points > 1:
             raise ConfigError(f"expected min_points=1 for triangles, got {min_points}. Only clouds have noise to drop.")
         corners = points[triangles]
-        _check_count("voxels near triangles", count_candidates(corners, resolution), resolution)
+        max_voxels = MAX_UNSCALED_VOXELS if scale is None else MAX_VOXELS
+        label = f"voxels of {resolution:g} m near triangles"
+        _check_count(label, count_candidates(corners, resolution), max_voxels, remedy)
         voxels = voxels_of_triangles(corners, resolution)
     boxes = merge_voxels(voxels)
     if len(boxes) > MAX_BOXES:
         raise ConfigError(
             f"expected a map of at most {MAX_BOXES} boxes, got {len(boxes)} from {len(voxels)} voxels of {resolution} "
-            f"m. Use a larger resolution=."
+            f"m. {remedy}"
         )
     spec = mujoco.MjSpec()
     options = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": as_rgba(rgba), **DRONE_TOUCH_BITS}
@@ -125,9 +136,6 @@ def _read_source(source: MapSource) -> MapFile:
     return MapFile(points, None)
 
 
-def _check_count(label: str, n: int, resolution: float) -> None:
-    if n > MAX_VOXELS:
-        raise ConfigError(
-            f"expected a map of at most {MAX_VOXELS} {label}, got {n} with voxels of {resolution:g} m. Use a part of "
-            f"the map, or for triangles a larger resolution=."
-        )
+def _check_count(label: str, n: int, limit: int, remedy: str) -> None:
+    if n > limit:
+        raise ConfigError(f"expected a map of at most {limit} {label}, got {n}. {remedy}")

@@ -68,15 +68,25 @@ def voxels_of_triangles(corners: NDArray, resolution: float) -> NDArray[np.int64
 
 def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
     """Return True for triangles that meet the cube of edge 1 around the origin. (n, 3, 3) -> (n,)"""
-    edges = np.roll(corners, -1, axis=1) - corners
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    axes = [np.cross(np.eye(3)[i], edges[:, k]) for i in range(3) for k in range(3)]
-    meets = np.ones(len(corners), bool)
-    for axis in [*axes, normal]:
+    n = len(corners)
+    near = np.arange(len(corners))
+
+    def reject(axis: NDArray) -> None:
+        """Leave out triangles that an axis separates from the cube."""
+        nonlocal corners, near
         projections = np.einsum("nkc,nc->nk", corners, axis)
         half_width = np.abs(axis).sum(axis=1) * (0.5 + TOLERANCE) + TOLERANCE
-        meets &= (projections.min(axis=1) <= half_width) & (projections.max(axis=1) >= -half_width)
-    return meets
+        meets = (projections.min(axis=1) <= half_width) & (projections.max(axis=1) >= -half_width)
+        corners, near = corners[meets], near[meets]
+
+    # The normal first: it separates most of them, so that few are left for the other axes.
+    reject(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]))
+    for i in range(3):
+        for k in range(3):
+            reject(np.cross(np.eye(3)[i], corners[:, (k + 1) % 3] - corners[:, k]))
+    result = np.zeros(n, bool)
+    result[near] = True
+    return result
 
 
 def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -468,6 +468,14 @@ def test_law_09_a_broken_toml_file_is_named(tmp_path):
         load_airframe(path)
 
 
+@pytest.mark.parametrize("name", ["quad.urdf", "quad.XML"])
+def test_law_09_a_model_of_bodies_gets_the_way_to_a_toml_file(tmp_path, name):
+    path = tmp_path / name
+    path.write_text('<?xml version="1.0"?>\n<robot name="quad"/>', encoding="utf-8")
+    with pytest.raises(ConfigError, match="crazysim airframe new"):
+        load_airframe(path)
+
+
 def nested(depth):
     """Return a list that is nested to a depth."""
     value = []

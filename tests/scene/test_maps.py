@@ -137,8 +137,15 @@ def test_law_09_wrong_maps_are_refused(tmp_path):
             scene.add_map(source, **options)
     path = tmp_path / "mesh.obj"
     path.write_bytes(obj())
-    with pytest.raises(ConfigError, match="voxels near triangles"):
+    with pytest.raises(ConfigError, match=r"voxels of 0.0001 m near triangles"):
         scene.add_map(path, resolution=1e-4)
+    corners = 100 * np.random.default_rng(0).normal(size=(300, 3))  # a part of 0.5 m in millimetres
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {k} {k + 1} {k + 2}" for k in range(1, 299, 3)]
+    path.write_text("\n".join(lines))
+    for source in (path, corners.repeat(200, axis=0) + np.random.default_rng(1).normal(size=(60_000, 3))):
+        with pytest.raises(ConfigError, match=r"m large: if the file is in millimetres, pass scale=0\.001"):
+            scene.add_map(source)
+    path.write_bytes(obj())
     with pytest.raises(ConfigError, match="min_points=1"):
         scene.add_map(path, min_points=2)
     assert scene.object_names == ()

@@ -66,6 +66,11 @@ def _read_source(
         raise ConfigError(
             f"{path.name}: expected a log of at most {MAX_LOG_BYTES} bytes, got {size}. Cut it into flights."
         )
+    if path.suffix.lower() in (".bbl", ".bfl"):
+        raise ConfigError(
+            f"{path.name}: expected a blackbox log as .csv, got a raw log. Convert it with blackbox_decode, or "
+            f"export it from the Blackbox Explorer."
+        )
     with wrap_read_errors(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix == ".ulg":
             return path.stem, read_ulog(path, repairs)

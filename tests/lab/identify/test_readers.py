@@ -40,6 +40,14 @@ def test_damaged_micro_sd_logs_are_read_up_to_the_last_record(tmp_path):
     assert len(log.t) > N - 10
 
 
+@pytest.mark.parametrize("name", ["LOG00001.BBL", "log.bfl"])
+def test_law_09_a_raw_blackbox_log_gets_the_way_to_a_table(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n" + bytes(100))
+    with pytest.raises(ConfigError, match="Convert it with blackbox_decode"):
+        read_log(path)
+
+
 def test_pauses_of_a_stream_are_gaps(tmp_path):
     log = read_log(write_crazyflie(tmp_path / "log00", pause=range(150, 220)), COLUMNS)
     assert len(log.gaps) == 1
