@@ -54,10 +54,10 @@ def as_path(path: str | Path) -> Path:
 
 
 def is_file(path: str | Path) -> bool:
-    """Return True if a file of that path exists, and False for text that cannot be a path."""
+    """Return True if a file of that path exists, and False for what cannot be a path."""
     try:
         return Path(path).is_file()
-    except (OSError, ValueError):
+    except (OSError, TypeError, ValueError):
         return False
 
 

@@ -3,6 +3,7 @@
 import ast
 import collections
 import importlib
+import pkgutil
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from lower_bounds import UNBOUNDED_EXTRAS, lower_bounds
 
 import crazysim
 
@@ -23,6 +25,26 @@ SOURCES = sorted((ROOT / "crazysim").rglob("*.py"))
 def test_runtime_needs_exactly_five_packages():
     names = {requirement.split(">")[0].split("[")[0].strip() for requirement in PROJECT["dependencies"]}
     assert names == {"jax", "mujoco", "mujoco-mjx", "numpy", "gymnasium"}
+
+
+def test_every_requirement_has_a_lower_bound():
+    """``.ci/dist`` installs them."""
+    bounds = lower_bounds(PROJECT["optional-dependencies"].keys() - UNBOUNDED_EXTRAS)
+    assert not [name for name, bound in bounds.items() if bound is None]
+    assert {"jax", "gymnasium", "optax", "viser"} <= bounds.keys()
+
+
+def test_every_module_can_be_imported():
+    """Unless a package of an extra is missing."""
+    failed = {}
+    for module in pkgutil.walk_packages(crazysim.__path__, "crazysim."):
+        try:
+            importlib.import_module(module.name)
+        except ImportError as error:
+            is_missing = isinstance(error, ModuleNotFoundError) and not error.name.startswith("crazysim")
+            if not is_missing and "which is not installed. Run pip install" not in str(error):
+                failed[module.name] = str(error)
+    assert not failed
 
 
 def test_public_names_exist_once():

@@ -295,7 +295,7 @@ def as_key(seed: int | Array) -> Array:
     dtype = getattr(seed, "dtype", np.dtype(int) if type(seed) is int else None)
     is_key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     is_integer = dtype is not None and jnp.issubdtype(dtype, jnp.integer)
-    if np.shape(seed) != () or not (is_key or is_integer):
+    if getattr(seed, "shape", ()) != () or not (is_key or is_integer):
         raise ConfigError(f"expected an integer or one key as seed, got {seed!r}; use an integer or jax.random.key(0)")
     try:
         return seed if is_key else jax.random.key(seed)  # type: ignore[return-value]

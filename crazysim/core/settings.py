@@ -7,9 +7,7 @@ import functools
 import inspect
 import itertools
 import sys
-import types
-import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,6 +17,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from crazysim.arguments import Numbers, annotated_types, check_value
 from crazysim.control import Control, Controller
 from crazysim.control.protocol import controller_chain
 from crazysim.control.switch import Switch
@@ -34,8 +33,6 @@ MAX_FRICTION = 1000.0
 MAX_SOFTNESS = 10.0
 """Largest softness of contacts, s."""
 
-NUMERIC_TYPES = frozenset((int, float, np.ndarray))
-"""Types of fields with numbers; ``np.ndarray`` represents ``ArrayLike``."""
 SLOW_FREQ = 200
 """Rate of physics steps, Hz, that replaces a lower one in a check of ``default_rates``: the divisor of ``freq`` that
 replaces a default rate must be at least half of that default, or of ``freq`` if it is smaller. The cascades of small
@@ -57,36 +54,12 @@ def positive_integer(name: str, value: object, at_most: int | None = None) -> in
     return int(value)
 
 
-def check_flag(name: str, value: object) -> bool:
-    """Return a setting that is on or off.
-
-    Args:
-        name: Name of the setting, for messages.
-        value: The setting.
-    """
-    if not isinstance(value, (bool, np.bool_)):
-        raise ConfigError(f"expected {name} as True or False, got {short_repr(value)}")
-    return bool(value)
-
-
 def check_image_size(width: object, height: object) -> tuple[int, int]:
     """Return width and height of an image, pixels, after checking them."""
     sizes = [int(n) for n in (width, height) if isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n > 0]
     if len(sizes) < 2:
         raise ConfigError(f"expected positive integers as width and height of an image, got {width} x {height} pixels")
     return sizes[0], sizes[1]
-
-
-class Numbers:
-    """Stand-in for ``ArrayLike`` in annotations, which is a union of many types."""
-
-
-class NumbersByName:
-    """Stand-in for ``Mapping[str, float]`` among the types of a field."""
-
-
-TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
-"""Names of types for messages, where they differ from the names of the classes."""
 
 
 class Setting(NamedTuple):
@@ -165,29 +138,14 @@ def check_settings(settings: Any) -> None:
     settings_class = type(settings)
     for field in dataclasses.fields(settings):
         value, value_types = getattr(settings, field.name), allowed_types(settings_class)[field.name]
-        if (value is None and (type(None) in value_types or field.default is None)) or not value_types:
+        if value is None and field.default is None:
             continue
-        name, declared_setting = (
-            f"{field.name} of {settings_class.__name__}",
-            collect_settings(settings_class)[field.name],
-        )
-        remedy = f"help({settings_class.__name__}) describes it."
-        value_types = set(value_types) - {type(None)}
-        classes = tuple(value_types - NUMERIC_TYPES)
-        if value_types == {bool}:
-            check_flag(name, value)
-        elif value_types == {NumbersByName}:
-            if not isinstance(value, Mapping):
-                raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
-            for key, item in value.items():
-                read_numbers(f"{key!r} in {name}", item, declared_setting.range, ((),), remedy=remedy)
-        elif value_types & NUMERIC_TYPES and not isinstance(value, classes):
-            shapes = declared_setting.shapes if np.ndarray in value_types or declared_setting.is_parameter else ((),)
-            is_whole = value_types & NUMERIC_TYPES == {int} or declared_setting.dtype is not None
-            read_numbers(name, value, declared_setting.range, shapes, whole=is_whole, remedy=remedy)
-        elif not isinstance(value, classes):
-            names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in value_types))
-            raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
+        declared = collect_settings(settings_class)[field.name]
+        check_value(
+            f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
+            declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),
+            whole=declared.dtype is not None, remedy=f"help({settings_class.__name__}) describes it.",
+        )  # fmt: skip
 
 
 @functools.cache
@@ -201,33 +159,8 @@ def allowed_types(kind: type) -> dict[str, tuple[type, ...]]:
         module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
         names = module | {"ArrayLike": Numbers}
         for name, hint in inspect.get_annotations(base).items():
-            field_types[name] = _types(hint, names)
+            field_types[name] = annotated_types(hint, names)
     return {field.name: field_types.get(field.name, ()) for field in dataclasses.fields(kind)}
-
-
-def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
-    """Return the types of an annotation; an empty tuple if it contains anything but classes, functions and numbers."""
-    if isinstance(hint, str):
-        try:
-            hint = eval(hint, dict(names))
-        except Exception:  # a name that is only imported for type checkers
-            return ()
-    if hint is Numbers or hint == ArrayLike:
-        return (np.ndarray,)
-    if typing.get_origin(hint) is Mapping:
-        return (NumbersByName,) if typing.get_args(hint)[1:] == (float,) else (Mapping,)
-    if typing.get_origin(hint) is Callable:
-        return (Callable,)  # type: ignore[return-value]  # a class for ``isinstance``
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        parts = [_types(part, names) for part in typing.get_args(hint)]
-        return tuple(itertools.chain(*parts)) if all(parts) else ()
-    if typing.get_origin(hint) is Sequence and (inner := _types(typing.get_args(hint)[0], names)):
-        return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
-    if hint is None:
-        return (type(None),)
-    # Fields that are annotated as arrays are not checked: they may hold NumPy or JAX arrays of any dtype.
-    is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
-    return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
 
 
 def check_softness(freq: int, softness: ArrayLike) -> None:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.arguments import check_arguments
 from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import MEMBER_AXIS
 from crazysim.errors import ConfigError
@@ -114,6 +115,7 @@ class Stage:
         return f"<stage {self.__name__} of one {self.scope}>"
 
 
+@check_arguments
 def stage(
     scope: StageScope, when: Callable[..., Array | None] | None = None, phase: Phase = "each"
 ) -> Callable[[Callable[..., Any]], Stage]:

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.drones.airframe_checks import MAX_ROTORS
 from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import is_file
-from crazysim.tables import POSITIVE, read_number
+from crazysim.tables import POSITIVE, read_number, read_numbers
 
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
@@ -91,6 +92,7 @@ SOURCES = {
 """Templates of the descriptions of a file's sources, by the name of the source."""
 
 
+@check_arguments
 def estimate_airframe(
     mass: float,
     propeller: float,
@@ -156,7 +158,7 @@ def estimate_airframe(
     if inertia is None:
         file.add("rigid_body", "inertia", _estimate_inertia(mass, rotor_pos), "kg m^2", "inertia")
     else:
-        file.add("rigid_body", "inertia", np.asarray(inertia, float), "kg m^2", "given")
+        file.add("rigid_body", "inertia", read_numbers("inertia", inertia), "kg m^2", "given")
     file.add(
         "rotors",
         "position",

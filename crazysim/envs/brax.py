@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
@@ -45,6 +46,7 @@ class BraxEnv:
     ``BraxEnv`` with ``num_eval_envs`` worlds as ``eval_env``.
     """
 
+    @check_arguments
     def __init__(self, env: Env):
         self.env = AutoReset(env)
         self.sim = env.sim

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
@@ -33,6 +34,7 @@ class DroneParallelEnv(ParallelEnv):
     named observations, (k,) each, an action, (k,), within [-1, 1], and its own reward. Observations are NumPy arrays.
     """
 
+    @check_arguments
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
         """Wrap a functional environment.
 
@@ -88,7 +90,7 @@ class DroneParallelEnv(ParallelEnv):
 
         Args:
             seed: Seed of all random numbers; None to continue the earlier sequence, or start from the system's entropy.
-            options: Ignored; there are no options.
+            options: Ignored; there are no options, and PettingZoo's own test passes one that no environment has.
         """
         del options
         seed = as_seed(seed)

@@ -8,6 +8,7 @@ two rounds of an integer hash, ``core.random.mix_bits``, mix seed, world and epi
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -30,6 +31,12 @@ def as_seed(seed: object) -> int | None:
             f"{short_repr(seed)}. Use for example 0."
         )
     return int(seed)
+
+
+def refuse_options(options: object) -> None:
+    """Check that a reset without options gets none."""
+    if options is not None and not (isinstance(options, Mapping) and not options):
+        raise ConfigError(f"expected no options of reset, got {short_repr(options)}. Leave options out.")
 
 
 def check_key(key: object) -> None:

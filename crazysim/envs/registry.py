@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from crazysim.arguments import check_arguments
 from crazysim.control import Control
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import enum_member, positive_integer
@@ -93,6 +94,7 @@ SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
 """Options of ``make`` that are passed to ``Sim``."""
 
 
+@check_arguments
 def make(
     task: str | Task,
     n_worlds: int = 1,
@@ -173,6 +175,7 @@ def make(
     return CameraImages(env, Camera(*depth_image), {"depth": "depth"})
 
 
+@check_arguments
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
     """Register a custom task by name, for ``make``, training and Gymnasium, and return its Gymnasium id.
 

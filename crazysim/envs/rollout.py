@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.arguments import check_arguments
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
@@ -67,6 +68,7 @@ KeepFunction = Callable[[Transition], Any]
 """``keep(transition)``: the part of a transition to store, any tree of arrays."""
 
 
+@check_arguments
 def rollout(
     env: Env,
     state: EnvState,

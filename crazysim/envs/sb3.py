@@ -13,8 +13,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed
+from crazysim.envs.random import as_seed, refuse_options
 from crazysim.envs.rendering import Renderer
 from crazysim.envs.state import EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
@@ -41,6 +42,7 @@ class DroneVecEnv(VecEnv):
     after drone.
     """
 
+    @check_arguments
     def __init__(
         self,
         env: Env,
@@ -88,6 +90,8 @@ class DroneVecEnv(VecEnv):
         key_seed = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
+        for options in self._options:
+            refuse_options(options)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]

@@ -6,12 +6,12 @@ from typing import Any
 
 import gymnasium
 import jax
-import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed
+from crazysim.envs.random import as_seed, refuse_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES
 from crazysim.envs.vector import DroneVectorEnv
@@ -25,6 +25,7 @@ class DroneSingleEnv(gymnasium.Env):
     of thousands of worlds. Observations are NumPy arrays that the caller may write to; the reward is a float.
     """
 
+    @check_arguments
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
         """Wrap a functional environment that does not reset automatically.
 
@@ -48,8 +49,7 @@ class DroneSingleEnv(gymnasium.Env):
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
-        if options:
-            raise ConfigError(f"expected no options of reset, got {', '.join(options)}")
+        refuse_options(options)
         super().reset(seed=as_seed(seed))
         obs, info = self.vector.reset(seed=int(self.np_random.integers(2**31)) if seed is None else seed)
         return _squeeze_world(obs), _squeeze_world(info)
@@ -60,7 +60,9 @@ class DroneSingleEnv(gymnasium.Env):
         Args:
             action: Action in [-1, 1]. (k,), or (n_drones, k) with several drones
         """
-        obs, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
+        obs, reward, terminated, truncated, info = self.vector.step(
+            action[None] if isinstance(action, jax.Array) else [action]
+        )
         return _squeeze_world(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _squeeze_world(info)
 
     def render(self) -> NDArray | None:

@@ -12,8 +12,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.cache import announce_if_slow
-from crazysim.core.settings import as_mask, check_flag, enum_member, positive_integer
+from crazysim.core.settings import as_mask, enum_member, positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
@@ -33,6 +34,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
     NumPy arrays that the caller may write to, as Gymnasium's reward wrappers do.
     """
 
+    closed = True  # until it is complete: Gymnasium closes an environment that is deleted
+
+    @check_arguments
     def __init__(
         self,
         env: Env,
@@ -78,6 +82,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = self._box(shapes.action, 1.0)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
+        self.closed = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start new episodes in all worlds, or where ``options["reset_mask"]`` is True, bool (num_envs,).

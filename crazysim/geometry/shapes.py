@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError
+from crazysim.tables import read_floats
 
 N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
 """Number of entries of ``Shape.size`` for each kind."""
@@ -49,10 +51,10 @@ class Shape:
     """Heights of a height field, rows along y and columns along x, m. (n_rows, n_columns)"""
 
     def __post_init__(self) -> None:
-        if self.kind not in N_SIZES:
+        if not isinstance(self.kind, str) or self.kind not in N_SIZES:
             raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
         n_sizes = N_SIZES[self.kind]
-        numbers = np.asarray(self.size, np.float64).reshape(-1)
+        numbers = read_floats("size", self.size).reshape(-1)
         size = numbers[:n_sizes]
         if len(size) < n_sizes or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ConfigError(
@@ -82,6 +84,7 @@ class Shape:
         return hash(self._content())
 
 
+@check_arguments
 def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     """Return a convex mesh.
 
@@ -125,6 +128,7 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     return Shape("mesh", (), *map(_read_only_copy, (v[used_vertices], indices.reshape(-1, 3), plane_normals, offsets)))
 
 
+@check_arguments
 def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     """Return the ground below a surface of triangles over a rectangular grid, two per cell.
 
@@ -137,7 +141,7 @@ def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     h = np.asarray(heights, np.float64)
     if h.ndim != 2 or min(h.shape) < 2:
         raise ConfigError(f"expected heights of two or more rows and columns, got shape {h.shape}")
-    shape = Shape("hfield", tuple(size), heights=_read_only_copy(h))
+    shape = Shape("hfield", tuple(np.ravel(size)), heights=_read_only_copy(h))
     if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
         raise ConfigError(f"expected heights between 0 and {shape.size[2]} m, got {h.min()} to {h.max()}")
     return shape

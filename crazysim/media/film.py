@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.core.settings import check_flag
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, show_flight_at
@@ -47,6 +47,7 @@ class Film:
     n_frames: int
     """Number of frames so far."""
 
+    @check_arguments
     def __init__(
         self,
         path: str | Path,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
@@ -99,6 +100,7 @@ class Flight:
             np.savez_compressed(file, format=FORMAT, **arrays)
 
     @classmethod
+    @check_arguments
     def load(cls, path: str | Path) -> Flight:
         """Load a flight written by ``save`` or by a ``Recorder`` with a path, even if the recording program crashed.
 

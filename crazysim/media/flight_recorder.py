@@ -11,9 +11,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.core.functional import default_feedforward, stage_command, staged_leaves
 from crazysim.eager import fetch_rows
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
 from crazysim.media.poses import mocap_poses
@@ -50,6 +51,7 @@ class Recorder:
     crashes, ``Flight.load`` returns the flight up to the last sample.
     """
 
+    @check_arguments
     def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
         """Create a recorder without samples.
 
@@ -129,6 +131,7 @@ class Recorder:
             self._journal.close()
 
 
+@check_arguments
 def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = None) -> Flight:
     """Return the flight of states that ``sim.rollout`` returned.
 
@@ -139,6 +142,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
         worlds: Indices of the worlds to record; None for all.
     """
     indices, sizes = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
+    if not hasattr(states, "pos") or not hasattr(states, "quat"):
+        raise ConfigError(f"expected states as sim.rollout returns them, got {short_repr(states)}")
     if np.shape(states.pos)[1:] != (*sizes, 3) or np.shape(states.quat) != (len(states.pos), *sizes, 4):
         raise ConfigError(
             f"expected positions of shape (n, *{(*sizes, 3)}) and quaternions of shape (n, *{(*sizes, 4)}), as "

@@ -36,7 +36,7 @@ class Trail:
         Args:
             seconds: Duration of the trail, s.
         """
-        if not np.isfinite(seconds) or seconds <= 0:
+        if not isinstance(seconds, (int, float, np.number)) or not 0 < seconds < np.inf:
             raise ConfigError(f"expected a positive duration of a trail, s, got {seconds!r}")
         self.seconds = float(seconds)
         self._samples: deque[tuple[NDArray, NDArray]] = deque()

@@ -85,7 +85,10 @@ class View:
         self.width, self.height = (
             positive_integer(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height")
         )
-        self.worlds = [self.worlds] if isinstance(self.worlds, (int, np.integer)) else list(self.worlds)
+        worlds = np.atleast_1d(np.asarray(self.worlds))  # ``check_settings`` has checked that these are numbers
+        if worlds.ndim != 1:
+            raise ConfigError(f"expected worlds as a list of indices, got {short_repr(self.worlds)}. Use (0,).")
+        self.worlds = worlds.tolist()
         if self.columns is not None:
             positive_integer("columns", self.columns)
         if min(self.tile_size) < 1:

@@ -19,10 +19,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.arguments import check_flag
 from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData, require_states
 from crazysim.core.pair_reductions import reduce_over_others
-from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.points import components

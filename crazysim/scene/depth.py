@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.arguments import check_flag
 from crazysim.core.data import SimData, require_states
-from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE

@@ -14,8 +14,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_flag
 from crazysim.core.data import Objects, SimData, require_data
-from crazysim.core.settings import as_mask, check_flag, positive_integer
+from crazysim.core.settings import as_mask, positive_integer
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.pytree import device_array, select_worlds
@@ -55,6 +56,9 @@ class Handle:
 
     def __getitem__(self, k: int | slice) -> Handle:
         """Return the handle of the objects at an index or slice."""
+        n = len(self)
+        if not isinstance(k, slice) and (not isinstance(k, (int, np.integer)) or not -n <= k < n):
+            raise IndexError(f"expected an index from 0 to {n - 1} or a slice, got {short_repr(k)}, of {self.name!r}")
         select = (lambda x: x[k]) if isinstance(k, slice) else (lambda x: (x[k],))
         return Handle(self.name, select(self.numbers), select(self.rows) if self.movable else ())
 

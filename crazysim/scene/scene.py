@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any
 
 import jax
 import mujoco
@@ -15,6 +15,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
@@ -323,6 +324,7 @@ class Scene:
         """
         return contact_report.build_contact_fn(self.collision_model, objects, floor, drones, self.plugins)
 
+    @check_arguments
     def depth_fn(
         self,
         camera: str | int | depth.DroneCamera = "fpv_cam",
@@ -455,7 +457,7 @@ class Scene:
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
-        if not isinstance(world, SupportsIndex) or not 0 <= world < self.n_worlds:
+        if not isinstance(world, (int, np.integer)) or isinstance(world, bool) or not 0 <= world < self.n_worlds:
             raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {short_repr(world)}")
         self.compile_if_edited()
         sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)

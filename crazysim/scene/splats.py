@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
@@ -48,6 +49,7 @@ class SplatScene:
     gaussians: Gaussians
     """The Gaussians, in the world frame."""
 
+    @check_arguments
     def __init__(
         self,
         path: str | Path,

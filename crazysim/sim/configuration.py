@@ -11,6 +11,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import check_flag
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_airframe_list, load_airframes
@@ -19,7 +20,6 @@ from crazysim.core.data import SimData, SimState
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import (
-    check_flag,
     check_rates,
     check_settings,
     control_freqs,
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators import Estimator
 
 STATE_FIELDS = tuple(field.name for field in dataclasses.fields(SimState))  # type: ignore[arg-type]
+MAX_WORLDS = 2**31 - 1
+"""Largest number of worlds; their indices are int32."""
+MAX_DRONES = 10_000
+"""Largest number of drones in a world; each is a body of the scene."""
 COMMAND_LEVELS = ("state", "attitude", "body_rate", "force_torque")
 """Fields of ``SimControls`` with the records of command levels."""
 COMMAND_FIELDS = ("cmd", "staged_cmd", "feedforward", "staged_feedforward", "staged_ang_vel_des")
@@ -125,7 +129,8 @@ class Configuration:
         switch: Callable[..., Array] | ArrayLike | None = None,
     ) -> Configuration:
         """Return the configuration for the arguments of ``Sim``, as users pass them."""
-        n_worlds, n_drones = positive_integer("n_worlds", n_worlds), positive_integer("n_drones", n_drones)
+        n_worlds = positive_integer("n_worlds", n_worlds, MAX_WORLDS)
+        n_drones = positive_integer("n_drones", n_drones, MAX_DRONES)
         freq = physics_freq(freq)
         n_drones = len(drone) if n_drones == 1 and is_airframe_list(drone) and len(drone) else n_drones
         dynamics, control = enum_member(Dynamics, "dynamics", dynamics), enum_member(Control, "control", control)

@@ -14,6 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments, check_array, check_flag
 from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
@@ -24,7 +25,7 @@ from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import BuiltPipeline, Pipeline
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.random import seed_sim
-from crazysim.core.settings import check_flag, positive_integer
+from crazysim.core.settings import positive_integer
 from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
@@ -174,7 +175,12 @@ class Sim:
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = SceneQueries(self._scene)
         self._seed = as_key(rng_key)
-        self.build_data()
+        try:
+            self.build_data()
+        except MemoryError as error:
+            raise ConfigError(
+                f"expected a number of worlds that fits into memory, got n_worlds={n_worlds}: {error}. Use fewer."
+            ) from error
         self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
@@ -184,6 +190,7 @@ class Sim:
             self.add(plugin)
 
     @classmethod
+    @check_arguments
     def from_mjcf(
         cls,
         xml_path: str | Path,
@@ -243,6 +250,7 @@ class Sim:
         """Names of all drones, then of the members of all populations."""
         return (*self.drone_names, *self.plugins.members)
 
+    @check_arguments
     def __getitem__(self, name: str) -> Member:
         """Return a view of a drone or member by its name, to read and to command: ``sim["Crazyflie_0"].pos``.
 
@@ -352,6 +360,7 @@ class Sim:
     # Plugins ----------------------------------------------------------------------------------------------------------
 
     @locked
+    @check_arguments
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add an effect, a sensor, a log or any other plugin, and return it.
 
@@ -366,6 +375,7 @@ class Sim:
         return self.plugins.add(plugin, name)
 
     @locked
+    @check_arguments
     def remove(self, plugin: Plugin | str) -> None:
         """Remove a plugin, with its record and its stages; stages that it had replaced return.
 
@@ -510,6 +520,7 @@ class Sim:
         self._stepper.advance(n_steps)
 
     @locked
+    @check_arguments
     def rollout(
         self,
         policy: Policy,
@@ -539,6 +550,8 @@ class Sim:
         for name, function in (("policy", policy), ("keep", keep)):
             if not callable(function):
                 raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
+        for leaf in jax.tree.leaves(params):
+            check_array("every leaf of params", leaf)
         n_substeps = self.freq // self.control_freq
         self._stepper.count_steps(n_substeps, positive_integer("n_control_steps", n_control_steps))
         data, records = run_rollout(
@@ -698,6 +711,7 @@ class Sim:
         """
         return self._queries.contact_report(self._data_with_moved_objects(), objects, floor, drones)
 
+    @check_arguments
     def depth(
         self,
         camera: str | int = "fpv_cam",

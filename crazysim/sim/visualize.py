@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.core.settings import as_rgba, check_flag
+from crazysim.arguments import check_flag
+from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import DEFAULT_COLOR
 from crazysim.sim.sim import Sim

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from crazysim.arguments import check_arguments
 from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import Env
@@ -198,6 +199,7 @@ class TrainConfig:
             object.__setattr__(self, name, value)
 
     @staticmethod
+    @check_arguments
     def create(
         task: str | Task,
         algorithm: str | None = None,

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import check_flag
+from crazysim.arguments import check_flag
 from crazysim.errors import ConfigError
-from crazysim.tables import read_floats
+from crazysim.tables import MAX_NUMBER, read_floats
 from crazysim.trajectories.trajectory import Trajectory
 
 FIT_TOLERANCE = 5e-6
@@ -227,8 +227,8 @@ def _resolve_period(period: float | None, speed: float | None, length: float, na
 
 def require_positive(name: str, value: float) -> float:
     """Return the value of a setting as a float after a check that it is positive and finite."""
-    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not is_number or not np.isfinite(value) or value <= 0:
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
+    if not is_number or not 0 < value <= MAX_NUMBER:
         raise ConfigError(f"expected {name} as a positive number, got {value!r}")
     return float(value)
 

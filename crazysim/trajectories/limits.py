@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import check_arguments
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
@@ -167,6 +168,7 @@ def tolerance_scale(name: str, limit: float) -> float:
     return max(abs(limit), 1.0) if QUANTITIES[name].orders == (0,) else abs(limit)
 
 
+@check_arguments
 def check(
     trajectories: Trajectory | Sequence[Trajectory],
     limits: Limits,
@@ -197,6 +199,8 @@ def check(
     if len(flights) == 1 and np.ndim(starts) == 1:
         flights *= np.size(starts)
     table = PieceTable.create(flights, starts, duration)
+    if not isinstance(names, (Sequence, type(None))) or isinstance(names, str):
+        raise ConfigError(f"expected names as a list of texts, got {short_repr(names)}. Pass one name per trajectory.")
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(flights)))
     if len(labels) != len(flights):
         raise ConfigError(

@@ -15,6 +15,8 @@ from crazysim.tables import read_floats
 from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
 
+MAX_DURATION = 86_400.0
+"""Longest duration, and largest time before it at which a trajectory may start, s: a day."""
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -56,10 +58,11 @@ class PieceTable:
         host_trajectories = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
         ends = [start + float(t.ends[-1]) for start, t in zip(starts, host_trajectories, strict=True)]
         end = max(ends) if duration is None else float(duration)
-        if not 0 < end < np.inf:
+        if not 0 < end < MAX_DURATION or np.min(starts) < -MAX_DURATION:
             actual_text = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
             raise ConfigError(
-                f"expected a positive, finite duration, s, got {actual_text}. Use for example duration=10.0."
+                f"expected a positive, finite duration of up to a day, s, and starts within a day, got "
+                f"{actual_text} and starts from {np.min(starts):g} s. Use for example duration=10.0."
             )
         n_coefficients = max(t.coefficients.shape[-1] for t in host_trajectories)
         parts = [

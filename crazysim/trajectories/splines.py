@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation
@@ -41,7 +42,7 @@ def spline(
             f"expected times (n_points,) and points (n_points, 3), got shapes {knots.shape} and {x.shape}. Pass one "
             "time per point."
         )
-    n_min = 2 if at_rest else SPLINE_ORDERS[degree]
+    n_min = 2 if check_flag("at_rest", at_rest) else SPLINE_ORDERS[degree]
     if len(knots) < n_min:
         raise ConfigError(
             f"expected at least {n_min} points for a spline of degree {degree}, got {len(knots)}. Add points, or lower "
@@ -72,7 +73,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         repeats: True to start again after the end.
     """
     end_times = read_floats("ends", ends)
-    if not isinstance(control_points, (list, tuple, np.ndarray)):
+    if not isinstance(control_points, (list, tuple, np.ndarray)) or not getattr(control_points, "ndim", 1):
         raise ConfigError(
             f"expected control points as a list with an array per curve, got {short_repr(control_points)}"
         )

@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import check_flag
 from crazysim.control.setpoint import Setpoint
-from crazysim.core.settings import check_flag
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, leaf

@@ -143,7 +143,7 @@ def test_given_numbers_replace_estimates():
             "agree on the thrust, got 5.886 and 60 in row 2",
         ),
         ({"mass": "heavy"}, "mass as a number, got 'heavy'"),
-        ({"cells": np.nan}, "cells to be positive, got nan"),
+        ({"cells": np.nan}, "cells as a whole number, got nan"),
     ],
 )
 def test_law_09_wrong_numbers_are_refused(change, message):

@@ -19,12 +19,16 @@ class ActionQueue(PyTree):
     """The n actions that have not arrived yet, the oldest first. (n_worlds, n_drones, n, k)"""
 
 
+MAX_FRAMES = 1000
+"""Largest number of environment steps that a wrapper keeps; its memory is copied in every step."""
+
+
 class ActionDelay(Wrapper):
     """Delay actions by ``n`` environment steps; the first ``n`` actions of an episode are zero, by default hover."""
 
     def __init__(self, env: Env, n: int):
         super().__init__(env)
-        self.n = positive_integer("n", n)
+        self.n = positive_integer("n", n, MAX_FRAMES)
 
     def after_reset(self, state: EnvState) -> EnvState:
         n_drones, size = state.action.shape

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from crazysim.arguments import check_arguments
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.hooks import Hooks
 from crazysim.errors import ConfigError
@@ -12,6 +13,7 @@ from crazysim.errors import ConfigError
 class Wrapper(Hooks, Env):
     """An environment around another environment. Subclasses override hooks, which the phases of a step call."""
 
+    @check_arguments
     def __init__(self, env: Env):
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from crazysim.arguments import check_arguments
 from crazysim.core.settings import dividing_rate
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
 
 
@@ -23,6 +24,7 @@ class CameraImages(Wrapper):
     images.
     """
 
+    @check_arguments
     def __init__(self, env: Env, camera: ImageSensor, names: Mapping[str, str] | None = None):
         """Add images to the observations of an environment.
 
@@ -37,6 +39,11 @@ class CameraImages(Wrapper):
         if not isinstance(camera, ImageSensor):
             raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).")
         self.camera = camera
+        if unknown_outputs := set(names or {}) - set(camera.outputs):
+            raise ConfigError(
+                f"expected names of {', '.join(camera.outputs)}, the outputs of {camera.name!r}, got one of "
+                f"{short_repr(min(unknown_outputs, key=str))}. Use outputs= of the camera."
+            )
         self.names = {output: f"{camera.name}.{output}" for output in camera.outputs} | dict(names or {})
         """Names of the observations by output."""
         used_names = {name for wrapper in env.wrappers if isinstance(wrapper, CameraImages) for name in wrapper.shapes}

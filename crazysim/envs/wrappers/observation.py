@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.arguments import check_array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.random import normal, world_key
@@ -21,6 +22,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.tasks.goals import state_of
+from crazysim.envs.wrappers.action import MAX_FRAMES
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, leaf, scopes
@@ -53,6 +55,8 @@ class Observe(Wrapper):
                 f"expected the function of {self.name!r} to return a dict of names to arrays, got {short_repr(obs)}. "
                 f"Use for example {{'vector': flatten(obs)}}."
             )
+        for path, x in jax.tree_util.tree_leaves_with_path(dict(obs)):
+            check_array(f"observation {jax.tree_util.keystr(path)} of {self.name!r}", x)
         return state.replace(obs=jax.tree.map(jnp.asarray, dict(obs)))
 
 
@@ -176,7 +180,7 @@ class FrameStack(Wrapper):
 
     def __init__(self, env: Env, n: int):
         super().__init__(env)
-        self.n = positive_integer("n", n)
+        self.n = positive_integer("n", n, MAX_FRAMES)
 
     def after_reset(self, state: EnvState) -> EnvState:
         frames = jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.record.obs)

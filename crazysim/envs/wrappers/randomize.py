@@ -31,6 +31,8 @@ class RandomizeWith(Wrapper):
         if not callable(fn):
             raise ConfigError(f"expected a function (data, key) -> data, got {short_repr(fn)}")
         params = (params,) if isinstance(params, str) else params
+        if not isinstance(params, (tuple, list)) or not all(isinstance(name, str) for name in params):
+            raise ConfigError(f"expected params as names of parameters, got {short_repr(params)}. Use ('mass',).")
         sim_params = env.sim.data.params
         fields = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
         if unknown_params := [name for name in params if fields.get(name) is None]:

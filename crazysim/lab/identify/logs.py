@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import motion as motion_module
 from crazysim.lab.identify.checks import check_motion
@@ -70,6 +71,7 @@ class Log:
         return float(np.median(np.diff(self.t)))
 
 
+@check_arguments
 def read_log(
     path: str | Path | Mapping[str, NDArray],
     columns: Columns | str | None = None,

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.core.settings import check_flag
+from crazysim.arguments import check_flag
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import ConfigError
 from crazysim.lab.live.loop import Live

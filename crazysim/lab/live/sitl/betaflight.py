@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import check_flag
+from crazysim.arguments import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
 from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, check_origin, to_frd

@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.arguments import check_flag
 from crazysim.control import Control
 from crazysim.core.airframes import as_airframes
-from crazysim.core.settings import check_flag, dividing_rate
+from crazysim.core.settings import dividing_rate
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.attitude import rotate

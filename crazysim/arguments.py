@@ -1,0 +1,156 @@
+"""Checks of settings and arguments by their annotations."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import itertools
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.errors import ConfigError, short_repr
+from crazysim.tables import ANY_NUMBER, Range, Shapes, read_numbers
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+NUMERIC_TYPES = frozenset((int, float, np.ndarray))
+"""Types of fields with numbers; ``np.ndarray`` represents ``ArrayLike``."""
+
+
+class Numbers:
+    """Stand-in for ``ArrayLike`` in annotations, which is a union of many types."""
+
+
+class NumbersByName:
+    """Stand-in for ``Mapping[str, float]`` among the types of a field."""
+
+
+TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
+"""Names of types for messages, where they differ from the names of the classes."""
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Return a setting that is on or off.
+
+    Args:
+        name: Name of the setting, for messages.
+        value: The setting.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ConfigError(f"expected {name} as True or False, got {short_repr(value)}")
+    return bool(value)
+
+
+def check_value(
+    name: str,
+    value: object,
+    value_types: Sequence[type],
+    allowed: Range = ANY_NUMBER,
+    shapes: Shapes | None = ((),),
+    *,
+    whole: bool = False,
+    remedy: str = "",
+) -> None:
+    """Check a value by the types of its annotation.
+
+    Args:
+        name: Name for messages.
+        value: The value.
+        value_types: Types that it may have, from ``annotated_types``; empty for any.
+        allowed: Range of numbers.
+        shapes: Shapes of numbers; None for any.
+        whole: True for whole numbers, which they must be in any case if ``int`` is the only numeric type.
+        remedy: Sentence for the end of messages.
+    """
+    if not value_types or (value is None and type(None) in value_types):
+        return
+    value_types = set(value_types) - {type(None)}
+    classes, numeric_types = tuple(value_types - NUMERIC_TYPES), value_types & NUMERIC_TYPES
+    if value_types == {bool}:
+        check_flag(name, value)
+    elif value_types == {NumbersByName}:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
+        for key, item in value.items():
+            read_numbers(f"{key!r} in {name}", item, allowed, ((),), remedy=remedy)
+    elif numeric_types and not isinstance(value, classes):
+        read_numbers(name, value, allowed, shapes, whole=whole or numeric_types == {int}, remedy=remedy)
+    elif not isinstance(value, classes):
+        names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in value_types))
+        raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
+
+
+def check_arguments(function: F) -> F:
+    """Decorate a public function so that it checks its arguments by their annotations, as ``check_settings`` fields.
+
+    Numbers must be finite. Arrays may have any shape and any real numbers or bools, which the function checks itself.
+    Traced values are not checked.
+    """
+    signature = inspect.signature(function)
+
+    @functools.cache
+    def allowed_types() -> dict[str, tuple[type, ...]]:
+        names = getattr(function, "__globals__", {}) | {"ArrayLike": Numbers}
+        annotated = {k: p.annotation for k, p in signature.parameters.items() if p.annotation is not p.empty}
+        return {key: annotated_types(hint, names) for key, hint in annotated.items()}
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        for key, value in signature.bind(*args, **kwargs).arguments.items():
+            types, default = allowed_types().get(key, ()), signature.parameters[key].default
+            if isinstance(value, jax.core.Tracer) or (value is None and default is None):
+                continue
+            if np.ndarray in types and not isinstance(value, tuple(set(types) - NUMERIC_TYPES)):
+                check_array(key, value)
+            else:
+                owner = function.__qualname__.removesuffix(".__init__")
+                check_value(key, value, types, remedy=f"help({owner}) describes it.")
+        return function(*args, **kwargs)
+
+    return checked  # type: ignore[return-value]
+
+
+def check_array(name: str, value: object) -> None:
+    """Check that a value is an array of real numbers or bools, which may be traced, without reading it."""
+    try:
+        dtype: Any = value.dtype if isinstance(value, jax.Array) else np.asarray(value).dtype
+    except (TypeError, ValueError, RecursionError):
+        dtype = np.dtype(object)
+    is_too_large = isinstance(value, int) and not -(2**31) <= value < 2**31  # for JAX's int32
+    if is_too_large or not any(jnp.issubdtype(dtype, kind) for kind in (np.bool_, np.integer, np.floating)):
+        raise ConfigError(f"expected {name} as numbers, got {short_repr(value)}. Use an array of numbers.")
+
+
+def annotated_types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
+    """Return the types of an annotation; an empty tuple if it contains anything but classes, functions and numbers."""
+    if isinstance(hint, str):
+        try:
+            hint = eval(hint, dict(names))
+        except Exception:  # a name that is only imported for type checkers
+            return ()
+    if hint is Numbers or hint == ArrayLike:
+        return (np.ndarray,)
+    if typing.get_origin(hint) in (Mapping, dict):
+        return (NumbersByName,) if typing.get_args(hint)[1:] == (float,) else (Mapping,)
+    if typing.get_origin(hint) is Literal:
+        return tuple({type(value) for value in typing.get_args(hint)})
+    if typing.get_origin(hint) is Callable:
+        return (Callable,)  # type: ignore[return-value]  # a class for ``isinstance``
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        parts = [annotated_types(part, names) for part in typing.get_args(hint)]
+        return tuple(itertools.chain(*parts)) if all(parts) else ()
+    if typing.get_origin(hint) is Sequence and (inner := annotated_types(typing.get_args(hint)[0], names)):
+        return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
+    if hint is None:
+        return (type(None),)
+    # Fields that are annotated as arrays are not checked: they may hold NumPy or JAX arrays of any dtype.
+    is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
+    return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()

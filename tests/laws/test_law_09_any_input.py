@@ -1,0 +1,344 @@
+"""Law 9 for any input: a public function with an argument of any type, shape or size works, or says what it expected.
+
+It neither hangs nor raises an error of Python, NumPy, JAX or MuJoCo. ``test_law_09_wrong_numbers.py`` has the settings
+of plugins and tasks.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import signal
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes
+
+import crazysim
+from crazysim import MPPI, ConfigError, Sim, SlungLoad, Wind, envs, load_airframe, trajectories
+from crazysim.core import functional as F
+from crazysim.drones import estimate_airframe
+from crazysim.envs import DroneSingleEnv, DroneVectorEnv, make
+from crazysim.envs.brax import BraxEnv
+from crazysim.envs.pettingzoo import DroneParallelEnv
+from crazysim.geometry import Shape, hfield, hull
+from crazysim.lab.identify import read_log
+from crazysim.media import Flight, Recorder, Trail, View, flight_of
+from crazysim.train import TrainConfig
+
+PACKAGE = Path(crazysim.__file__).parent
+TIME_LIMIT = 60
+"""Time after which a call counts as one that hangs, s; they take milliseconds, and a compilation some seconds."""
+
+
+@dataclasses.dataclass
+class Lazy:
+    """An argument that is made when it is needed."""
+
+    make: Callable[[], Any]
+
+
+@functools.cache
+def sim():
+    """Return a simulation of two worlds of two drones with a load, a movable object and full-state commands."""
+    sim = Sim(2, 2, control="state", plugins=[SlungLoad(0.01), Wind()])
+    sim.handle = sim.scene.add("sphere", "ball", count=2, pos=(0, 0, 5.0))
+    return sim
+
+
+@functools.cache
+def env(n_worlds=2, n_drones=1):
+    return make("hover", n_worlds, n_drones=n_drones)
+
+
+@functools.cache
+def adapter(kind):
+    return kind(env(1))
+
+
+def adapted(kind, method, **arguments):
+    """Call a method of an adapter after a reset."""
+    adapter(kind).reset(seed=0)
+    return getattr(adapter(kind), method)(**arguments)
+
+
+def on_sim(method):
+    """Return a call of a method of the simulation, whose data it leaves as they were."""
+
+    def call(**arguments):
+        before = sim().data
+        try:
+            return getattr(sim(), method)(**arguments)
+        finally:
+            sim().data = before
+
+    return call
+
+
+def in_new_scene(**arguments):
+    return Sim().scene.add(**arguments)
+
+
+def state():
+    return env().reset(jax.random.key(0))
+
+
+def register_for_a_moment(**arguments):
+    tasks, ids = dict(envs.TASKS), set(gymnasium.registry)
+    try:
+        return envs.register(**arguments)
+    finally:
+        envs.TASKS.clear()
+        envs.TASKS.update(tasks)
+        for added in set(gymnasium.registry) - ids:
+            del gymnasium.registry[added]
+
+
+FALL = lambda params, data: jnp.zeros((2, 2, 16))  # noqa: E731
+CIRCLE = trajectories.circle()
+CALLS = {
+    "Sim": (Sim, {
+        "n_worlds": 1, "n_drones": 1, "drone": "cf21B_500", "dynamics": "first_principles", "control": "state",
+        "integrator": "euler", "freq": 500, "state_freq": 100, "attitude_freq": 500, "body_rate_freq": 500,
+        "force_torque_freq": 500, "device": "cpu", "xml_path": None, "rng_key": 0, "mesh": None, "engine": "auto",
+        "strict": False, "controller": "auto", "switch": None, "estimator": None, "aero": None, "plugins": (),
+    }),
+    "make": (make, {
+        "task": "hover", "n_worlds": 2, "freq": 50, "actions": None, "sensors": (), "effects": (), "randomize": None,
+        "camera": None, "depth_image": None, "seconds": 5.0,
+    }),
+    "sim.step": (on_sim("step"), {"n_steps": 1}),
+    "sim.reset": (on_sim("reset"), {"mask": None}),
+    "sim.seed": (on_sim("seed"), {"seed": 0}),
+    "sim.state_control": (on_sim("state_control"), {
+        "check_finite": False, "pos": np.zeros(3), "vel": np.zeros(3), "acc": np.zeros(3), "yaw": 0.0,
+        "feedforward": np.zeros((2, 2, 8)),
+    }),
+    "sim.state_control whole": (on_sim("state_control"), {"controls": np.zeros((2, 2, 16))}),
+    "sim.rollout": (on_sim("rollout"), {
+        "policy": FALL, "params": None, "n_control_steps": 1, "every": 1,
+        "progress": False,
+    }),
+    "sim.contacts": (on_sim("contacts"), {"body": None}),
+    "sim.contact_report": (on_sim("contact_report"), {"objects": None, "floor": True, "drones": True}),
+    "sim.depth": (on_sim("depth"), {
+        "camera": "fpv_cam", "width": 4, "height": 4, "drones": True, "hide_own": True, "along": "axis",
+    }),
+    "sim.sync": (on_sim("sync"), {"world": None}),
+    "sim.add": (lambda plugin, name: Sim().add(plugin, name), {"plugin": Wind(), "name": "breeze"}),
+    "sim.remove": (lambda plugin: Sim(plugins=[Wind()]).remove(plugin), {"plugin": "wind"}),
+    "sim.replace": (lambda plugin: Sim(plugins=[Wind()]).replace(plugin), {"plugin": Wind((1, 0, 0))}),
+    "sim.shard": (lambda mesh: Sim(2).shard(mesh), {"mesh": crazysim.core.sharding.world_mesh(jax.devices()[:2])}),
+    "sim.data": (lambda value: setattr(sim(), "data", value), {"value": Lazy(lambda: sim().data)}),
+    "sim.default_data": (lambda value: setattr(sim(), "default_data", value), {"value": Lazy(lambda: sim().data)}),
+    "sim[name]": (lambda name: sim()[name], {"name": "Crazyflie_0"}),
+    "member.set": (lambda pos: sim()["Crazyflie_0"].set(pos=pos), {"pos": np.zeros(3)}),
+    "member.command": (lambda command: sim()["Crazyflie_0"].command(command), {"command": np.zeros(16)}),
+    "F.state_control": (lambda **k: F.state_control(sim().data, **k), {"controls": np.zeros((2, 2, 16))}),
+    "F.state_control data": (lambda data: F.state_control(data, np.zeros((2, 2, 16))),
+        {"data": Lazy(lambda: sim().data)}),
+    "scene.add": (in_new_scene, {
+        "source": "box", "name": "a", "count": 1, "pos": np.zeros(3), "quat": (0, 0, 0, 1), "mocap": True,
+        "rgba": (1, 0, 0, 1), "size": (0.1, 0.1, 0.1),
+    }),
+    "scene.add gate": (in_new_scene, {"source": "gate", "width": 0.5, "height": 0.5, "bar": 0.05, "stand": 1.0}),
+    "scene.add_map": (lambda **k: Sim().scene.add_map(**k), {
+        "source": 0.2 * np.eye(3), "name": "a", "resolution": 0.1, "pos": np.zeros(3), "quat": (0, 0, 0, 1),
+        "scale": None, "min_points": 1, "rgba": (1, 0, 0, 1),
+    }),
+    "handle[k]": (lambda k: sim().handle[k], {"k": 1}),
+    "handle.set_pose": (lambda **k: sim().handle.set_pose(**k), {
+        "data": Lazy(lambda: sim().data), "pos": np.zeros(3), "quat": (0, 0, 0, 1), "vel": np.zeros(3), "mask": None,
+    }),
+    "ActionDelay": (lambda **k: envs.ActionDelay(env(), **k).reset(jax.random.key(0)), {"n": 1}),
+    "AutoReset": (lambda **k: envs.AutoReset(env(), **k), {"mode": "SameStep"}),
+    "CameraImages": (lambda **k: envs.CameraImages(env(), **k), {"camera": crazysim.Camera(4, 4), "names": None}),
+    "FrameStack": (lambda **k: envs.FrameStack(env(), **k).reset(jax.random.key(0)), {"n": 2}),
+    "Normalize": (lambda **k: envs.Normalize(env(), **k), {"stats": None}),
+    "ObservationNoise": (lambda std: envs.ObservationNoise(env(), {"pos": std}).reset(jax.random.key(0)), {"std": 0.1}),
+    "ObservationNoise std": (lambda **k: envs.ObservationNoise(env(), **k), {"std": {}}),
+    "Observe": (lambda **k: envs.Observe(env(), **k), {"fn": lambda obs, data: obs}),
+    "Observe result": (
+        lambda x: envs.Observe(env(), lambda obs, data: x).reset(jax.random.key(0)), {"x": {"a": np.zeros((1, 3))}}
+    ),
+    "Observe entry": (
+        lambda x: envs.Observe(env(), lambda obs, data: {"a": x}).reset(jax.random.key(0)), {"x": np.zeros((1, 3))}
+    ),
+    "RandomizeWith": (lambda **k: envs.RandomizeWith(env(), **k), {"fn": lambda data, key: data, "params": ()}),
+    "wrapper env": (lambda env: envs.FrameStack(env, 2), {"env": Lazy(functools.partial(env, 1))}),
+    "DroneEnv": (lambda **k: envs.DroneEnv(env().sim, env().task, **k), {
+        "freq": 50, "actions": None, "measured": False
+    }),
+    "DroneEnv parts": (envs.DroneEnv, {"sim": Lazy(lambda: env().sim), "task": Lazy(lambda: env().task)}),
+    "DroneVectorEnv": (DroneVectorEnv, {
+        "env": Lazy(functools.partial(env, 1)), "autoreset_mode": "NextStep", "render_mode": None,
+        "render_worlds": None,
+        "render_size": (64, 48), "numpy": False,
+    }),
+    "DroneSingleEnv": (DroneSingleEnv, {"env": Lazy(functools.partial(env, 1)), "render_mode": None,
+        "render_size": (64, 48)}),
+    "BraxEnv": (BraxEnv, {"env": Lazy(functools.partial(env, 1))}),
+    "DroneParallelEnv": (DroneParallelEnv, {"env": Lazy(functools.partial(env, 1)), "render_mode": None,
+        "render_size": (64, 48)}),
+    "vector reset": (functools.partial(adapted, DroneVectorEnv, "reset"), {"seed": 0, "options": None}),
+    "single reset": (functools.partial(adapted, DroneSingleEnv, "reset"), {"seed": 0, "options": None}),
+    "parallel reset": (functools.partial(adapted, DroneParallelEnv, "reset"), {"seed": 0, "options": None}),
+    "vector step": (functools.partial(adapted, DroneVectorEnv, "step"), {"actions": np.zeros((1, 4))}),
+    "single step": (functools.partial(adapted, DroneSingleEnv, "step"), {"action": np.zeros(4)}),
+    "parallel step": (functools.partial(adapted, DroneParallelEnv, "step"), {"actions": {"drone_0": np.zeros(4)}}),
+    "parallel action": (
+        lambda action: adapted(DroneParallelEnv, "step", actions={"drone_0": action}), {"action": np.zeros(4)}
+    ),
+    "env.reset": (lambda key: env().reset(key), {"key": jax.random.key(0)}),
+    "env.step": (lambda action: env().step(state(), action), {"action": np.zeros((2, 1, 4), np.float32)}),
+    "env.step state": (lambda state: env().step(state, np.zeros((2, 1, 4), np.float32)), {"state": Lazy(state)}),
+    "env.set_goal": (lambda pos: env().set_goal(state(), pos), {"pos": np.zeros(3)}),
+    "env.restart": (lambda mask: env().restart(state(), mask), {"mask": None}),
+    "envs.rollout": (
+        lambda **k: envs.rollout(env(), state(), **k),
+        {"policy": lambda obs, key, memory: (jnp.zeros((2, 1, 4)), (), ()), "key": jax.random.key(0), "n_steps": 2},
+    ),
+    "register": (register_for_a_moment, {"name": "any_input", "task": envs.TASKS["hover"].task,
+        "control": "attitude", "n_drones": 1}),
+    "circle": (trajectories.circle, {"radius": 1.0, "period": 3.0, "height": 1.0, "along": False}),
+    "circle speed": (trajectories.circle, {"speed": 1.0}),
+    "figure_eight": (trajectories.figure_eight, {"width": 2.0, "depth": 1.0, "period": 4.0, "height": 1.0}),
+    "helix": (trajectories.helix, {"radius": 1.0, "climb": 0.5, "turns": 3.0, "period": 3.0, "height": 0.5}),
+    "hover": (trajectories.hover, {"pos": np.zeros(3), "yaw": 0.0, "duration": 1.0}),
+    "line": (trajectories.line, {"start": np.zeros(3), "end": np.ones(3), "duration": 1.0, "yaw": 0.0}),
+    "lissajous": (trajectories.lissajous, {
+        "amplitudes": (1.0, 1.0, 0.2), "frequencies": (1, 2, 3), "phases": np.zeros(3), "period": 5.0,
+        "center": (0, 0, 1.0),
+    }),
+    "minimum_snap": (trajectories.minimum_snap, {
+        "waypoints": np.eye(3), "durations": (1.0, 1.0), "limits": None, "yaw": 0.0, "corridors": None,
+        "velocities": None, "accelerations": None, "jerks": None,
+    }),
+    "minimum_snap limits": (trajectories.minimum_snap, {
+        "waypoints": np.eye(3), "limits": trajectories.Limits(speed=1.0, acceleration=2.0)
+    }),
+    "of_bezier": (trajectories.of_bezier, {
+        "ends": [1.0], "control_points": [np.zeros((8, 4))], "repeats": False
+    }),
+    "spline": (trajectories.spline, {
+        "times": np.arange(8.0), "points": np.ones((8, 3)), "degree": 5, "yaw": 0.0, "at_rest": True
+    }),
+    "check": (trajectories.check, {
+        "trajectories": CIRCLE, "limits": trajectories.Limits(speed=1.0), "airframe": None, "starts": 0.0,
+        "duration": 1.0, "names": None, "tolerance": 0.001,
+    }),
+    "Limits": (trajectories.Limits, {"speed": 1.0, "thrust": 2.0, "floor": 0.0}),
+    "load_csv": (trajectories.load_csv, {"path": "nowhere.csv"}),
+    "pack_compressed": (trajectories.pack_compressed, {"trajectory": trajectories.line(np.zeros(3), np.ones(3), 1.0)}),
+    "load_airframe": (load_airframe, {"source": "cf21B_500"}),
+    "estimate_airframe": (estimate_airframe, {
+        "mass": 0.5, "propeller": 0.127, "arm": 0.11, "n_rotors": 4, "layout": "x", "positions": None, "spins": None,
+        "thrust_to_weight": 3.0, "pitch": None, "inertia": None, "time_constant": None,
+    }),
+    "Shape": (Shape, {"kind": "sphere", "size": (0.1,)}),
+    "hfield": (hfield, {"heights": np.zeros((3, 3)), "size": (1.0, 1.0, 1.0, 1.0)}),
+    "hull": (hull, {"vertices": np.vstack([np.zeros(3), np.eye(3)]), "faces": None}),
+    "read_log": (read_log, {"path": "nowhere.csv", "columns": None, "motion": None, "between": (0.0, np.inf)}),
+    "View": (View, {
+        "worlds": (0,), "width": 64, "height": 48, "camera": -1, "cam_config": None, "follow": None, "hold": None,
+        "lag": 0.3, "trail": 0.0, "setpoints": False, "rgba": None, "text": None,
+    }),
+    "Trail": (Trail, {"seconds": 1.0}),
+    "Recorder": (lambda **k: Recorder(sim(), **k), {"worlds": None, "path": None}),
+    "flight_of": (lambda **k: flight_of(sim(), **k), {"states": Lazy(lambda: on_sim("rollout")(policy=FALL)),
+        "dt": 0.1, "worlds": None}),
+    "Flight.load": (Flight.load, {"path": "nowhere.npz"}),
+    "MPPI": (lambda **k: MPPI(env().sim, **k), {
+        "horizon": 5, "samples": 4, "substeps": 2, "knots": 2, "freq": None, "noise": None, "temperature": 0.05,
+        "seed": 0,
+    }),
+    "TrainConfig.create": (functools.partial(TrainConfig.create, "hover"), {"algorithm": "ppo", "seed": 0,
+        "n_worlds": 4}),
+    "SplatScene": (crazysim.SplatScene, {"path": "nowhere.ply", "pos": np.zeros(3), "quat": (0, 0, 0, 1),
+        "scale": None}),
+    "from_mjcf": (Sim.from_mjcf, {"xml_path": "nowhere.xml", "n_worlds": 1, "kinds": None, "plugins": ()}),
+    "stage": (crazysim.stage, {"scope": "drone", "when": None, "phase": "each"}),
+}  # fmt: skip
+"""Calls and their arguments, of which one at a time gets any value. A call that always fails is tried all the same."""
+
+SPECIAL = [
+    None, True, False, 0, 1, -1, 5, 10**12, -(10**12), 2**70, 1.5, -0.5, np.nan, np.inf, 1e300, 1j, "", "text",
+    "nowhere.txt", b"1",
+    [], {}, (), set(), object(), [None], ["text"], {"a": 1}, [[1.0], [1.0, 2.0]], (1, 2), np.zeros(3), np.zeros((2,
+    3)), np.zeros(0),
+    np.array(["text"]), np.array([None]), np.nan * np.zeros(3), Sim, Path("nowhere"), range(3), iter([1]),
+    np.float32(2), np.int8(-3),
+]  # fmt: skip
+DTYPES = (bool, np.int8, np.int64, np.uint32, np.float16, np.float32, np.float64, np.complex64, "U3", object)
+ANY_ARRAY = st.builds(
+    lambda shape, dtype, fill, on_device: (
+        jnp.asarray if on_device and np.dtype(dtype).kind not in "UO" else np.asarray
+    )(np.full(shape, fill).astype(dtype)),
+    array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4),
+    st.sampled_from(DTYPES),
+    st.sampled_from([0, 1, -1, 100]),
+    st.booleans(),
+)
+ANY_VALUE = st.one_of(st.sampled_from(SPECIAL), ANY_ARRAY, st.integers(), st.floats(), st.text(max_size=3))
+
+
+def is_clear(error):
+    """Return True for a refusal by crazysim with what it expected."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    is_ours = isinstance(error, (ConfigError, crazysim.errors.RenderError)) or "expected " in str(error)
+    return is_ours and "unpack" not in str(error) and Path(frame.filename).is_relative_to(PACKAGE)
+
+
+def describe_fault(call, arguments):
+    """Return what a call does that it should not: None, a raw error, or that it hangs."""
+
+    def interrupt(*_):
+        raise TimeoutError(f"took more than {TIME_LIMIT} s")
+
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    signal.alarm(TIME_LIMIT)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            call(**{name: x.make() if isinstance(x, Lazy) else x for name, x in arguments.items()})
+    except Exception as error:
+        return None if is_clear(error) else f"{type(error).__name__}: {error}"
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+    return None
+
+
+NO_FILES = ("load_csv", "read_log", "Flight.load", "SplatScene", "from_mjcf")
+"""Calls that are tried with a file that does not exist."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def folder(tmp_path_factory):
+    """A recorder and others write files of any name."""
+    with contextlib.chdir(tmp_path_factory.mktemp("any_input")):
+        yield
+
+
+@pytest.mark.parametrize("label", [x for x in CALLS if x not in NO_FILES])
+def test_the_calls_work_with_right_arguments(label):
+    call, arguments = CALLS[label]
+    call(**{name: x.make() if isinstance(x, Lazy) else x for name, x in arguments.items()})
+
+
+@pytest.mark.parametrize("label", CALLS)
+@given(data=st.data())
+def test_any_argument_is_taken_or_refused_with_what_was_expected(label, data):
+    call, arguments = CALLS[label]
+    name, value = data.draw(st.sampled_from(sorted(arguments))), data.draw(ANY_VALUE)
+    fault = describe_fault(call, arguments | {name: value})
+    assert fault is None, f"{label}({name}={value!r}): {fault}"
