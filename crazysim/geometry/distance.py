@@ -40,9 +40,9 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
     The overlap is the length of the shortest translation that separates them. For a sphere ``a``, the distance is as
     exact as ``point_distance``. The distance is exact for capsules and boxes against a plane, sphere or capsule, and
-    for a capsule against a box. For other pairs see ``convex_distance`` and, for height fields, ``drone_to_field``.
-    First derivatives follow the nearest points; second derivatives of shapes other than spheres treat the nearest
-    points as fixed on their shapes.
+    for a capsule against a box, where MuJoCo's overlap is up to half a metre too small. For other pairs see
+    ``convex_distance`` and, for height fields, ``drone_to_field``. First derivatives follow the nearest points; second
+    derivatives of shapes other than spheres treat the nearest points as fixed on their shapes.
 
     Args:
         a: Shape of the drone: a sphere, capsule or box.

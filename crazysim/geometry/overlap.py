@@ -41,8 +41,9 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
     The error is below 1e-3 m for shapes of up to a few metres that are separated or overlap slightly. The overlap of
     two boxes is exact, by the 15 normals of the separating axis theorem (Gottschalk 1996). The depth of a deep overlap
-    with another shape is an upper bound, from the best direction found. The gradient follows the nearest points; deep
-    inside a curved shape, its direction has an error of a few hundredths.
+    with another shape is an upper bound, from the best direction found: of 1,400 capsules deep in a mesh of half a
+    metre, five were too deep by more than 1 mm, at most by 4.5 cm, where MuJoCo is right. The gradient follows the
+    nearest points; deep inside a curved shape, its direction has an error of a few hundredths.
 
     Args:
         a: Box, or the core of a capsule, without its radius.
