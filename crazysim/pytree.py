@@ -208,6 +208,17 @@ def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
     return _map_leaves(lambda _, metadata, *__: bool(metadata.get(flag)), tree, {}, "", None)
 
 
+def watched_flags(tree: Any) -> Any:
+    """Return a tree of the same structure, True for leaves of drones, members and worlds except parameters and scratch.
+
+    Such leaves of plugins must be finite; see ``crazysim.core.stages.watched_leaves``.
+    """
+    declared = ("drone", "member", "world")
+    return _map_leaves(
+        lambda _, metadata, *__: metadata.get("scope") in declared and not metadata.get("scratch"), tree, {}, "", None
+    )
+
+
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
     """Check that every leaf has the axes of its scope."""
     batches = {"world": (n_worlds, 1), "shared": ()}

@@ -108,8 +108,8 @@ class SimCore(PyTree):
     episode: Array = leaf("world")
     """Number of resets of the world. Its random numbers depend on it. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """True where the world has become non-finite, or has taken more than ``MAX_STEPS`` steps, since its last reset.
-    (n_worlds, 1)"""
+    """True where the world has become non-finite in ``crazysim.core.stages.watched_leaves``, or has taken more than
+    ``MAX_STEPS`` steps, since its last reset. (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
     n_drones: int = static()

@@ -19,10 +19,14 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage, StageScope, is_tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
+from crazysim.pytree import Members, PyTree, has_members, n_batch_axes, scopes, select_worlds, watched_flags
 
 FLOOR_HEIGHT = -0.001
 """Height of the floor, at which drones stop, m. It is slightly below zero: a negative height means a landed drone."""
+
+
+_UNWATCHED = "unwatched"
+"""Mark of leaves that ``watched_leaves`` leaves out."""
 
 
 def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
@@ -165,17 +169,30 @@ def increment_steps(data: SimData) -> SimData:
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
 
 
-def watched_records(data: SimData) -> Any:
-    """Return the records that ``nonfinite_worlds`` checks: states and controls of drones, and other populations."""
-    populations = [record for record in data.plugins.values() if isinstance(record, Members)]
-    return data.states, data.controls, populations
+def watched_leaves(data: SimData) -> dict[int, bool]:
+    """Return the indices of the leaves in which NaN flags a world, each with True if infinity does so, too.
+
+    NaN and infinity flag a world in states, controls and populations. NaN alone flags it in what other records of
+    plugins hold for drones and worlds, except parameters and scratch; infinity may mean "none so far" there. Records
+    with ``watched = False`` are left out. What a user passes to compiled code ends up in one of these leaves.
+    """
+    records = {name: x for name, x in data.plugins.items() if getattr(x, "watched", isinstance(x, PyTree))}
+    populations = {name: x for name, x in records.items() if isinstance(x, Members)}
+
+    def finite_flags(tree: Any) -> Any:
+        return jax.tree.map(lambda scope: True if has_members(scope) else _UNWATCHED, scopes(tree))
+
+    flags = jax.tree.map(lambda _: _UNWATCHED, data)
+    nan_flags = jax.tree.map(lambda x: False if x else _UNWATCHED, {k: watched_flags(x) for k, x in records.items()})
+    flags = flags.replace(
+        states=finite_flags(data.states), controls=finite_flags(data.controls),
+        plugins=flags.plugins | nan_flags | {name: finite_flags(x) for name, x in populations.items()},
+    )  # fmt: skip
+    return {i: flag for i, flag in enumerate(jax.tree.leaves(flags)) if flag is not _UNWATCHED}
 
 
 def nonfinite_worlds(data: SimData) -> Array:
-    """Return True for worlds that are flagged, hold NaN or infinity, or exceed ``MAX_STEPS``.
-
-    All leaves of drones and members in ``watched_records`` are checked: states, commands, memory of controllers, and
-    gains with one value per drone.
+    """Return True for worlds that are flagged, hold NaN or infinity in ``watched_leaves``, or exceed ``MAX_STEPS``.
 
     The step counter overflows to a negative number after ``MAX_STEPS``, and one call takes too few steps for it to
     become positive again. The data may be of all worlds or of one world.
@@ -183,12 +200,18 @@ def nonfinite_worlds(data: SimData) -> Array:
     Returns:
         (n_worlds, 1), or () in one world
     """
-    records, core = watched_records(data), data.core
+    leaves, core = jax.tree.leaves(data), data.core
     n_axes = max(core.steps.ndim - 1, 0)
-    pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
-    leaves = [x for scope, x in pairs if has_members(scope)]
-    is_finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
-    return core.nonfinite | ~jnp.all(is_finite, axis=0).reshape(core.steps.shape) | (core.steps < 0)
+    floats = [
+        (leaves[i], must_be_finite)
+        for i, must_be_finite in watched_leaves(data).items()
+        if jnp.issubdtype(leaves[i].dtype, jnp.floating)
+    ]
+    is_valid = [
+        jnp.all(jnp.isfinite(x) if must_be_finite else ~jnp.isnan(x), axis=tuple(range(n_axes, x.ndim)))
+        for x, must_be_finite in floats
+    ]
+    return core.nonfinite | ~jnp.all(jnp.stack(is_valid), axis=0).reshape(core.steps.shape) | (core.steps < 0)
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:

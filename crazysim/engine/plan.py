@@ -30,7 +30,7 @@ from jax.sharding import PartitionSpec
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage
-from crazysim.core.stages import watched_records
+from crazysim.core.stages import watched_leaves
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.host_call import HostCall, is_host_call_possible
@@ -163,7 +163,7 @@ class Planner(NamedTuple):
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
         lowered_programs = [
-            lower_stages(g.stages, data, shared_zeros, _watched_leaves, population=g.population, tracer=tracer)
+            lower_stages(g.stages, data, shared_zeros, watched_leaves(data), population=g.population, tracer=tracer)
             for g in groups
         ]
         has_one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
@@ -398,11 +398,6 @@ def _join_runs(
         return [results[i] for i in written_leaves], functools.reduce(operator.or_, flags)
 
     return run_all, tuple(written_leaves)
-
-
-def _watched_leaves(data: SimData) -> list[Any]:
-    """Return the leaves in which NaN or infinity flags a world, as ``watched_records`` defines them."""
-    return jax.tree.leaves(watched_records(data))
 
 
 def _input_leaves(program: Program) -> list[int]:

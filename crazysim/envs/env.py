@@ -173,7 +173,7 @@ class Env(ABC):
 
         Raises:
             ConfigError: If the goals of the task are not positions, if ``pos`` has another shape, or if it contains
-                host numbers that are not finite.
+                host numbers that are not finite. Other goals that are not finite end the episode at the next step.
         """
         with use_device_of(state.full_data.core.steps):
             pos = validate_goals(pos, state)
@@ -183,7 +183,8 @@ class Env(ABC):
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one environment step later. With ``AutoReset``, worlds that are done begin a new episode.
 
-        A world that becomes non-finite terminates, sets ``info["nonfinite"]``, and is observed as zeros.
+        A world that becomes non-finite, also in an observation or its reward, terminates, sets ``info["nonfinite"]``,
+        and is observed as zeros.
 
         Args:
             state: The state of all worlds.

@@ -222,9 +222,11 @@ class Phases:
 
         results = vectorize(evaluate, task.batched)(state.data, action, state.action)
         state = vectorize(fill_results, False)(state, action, results)
-        for wrapper in self.wrappers:
+        state = vectorize(_end_bad_world, False)(state)
+        wrappers = [wrapper for wrapper in self.wrappers if type(wrapper).after_step is not Hooks.after_step]
+        for wrapper in wrappers:
             state = vectorize(wrapper.after_step, wrapper.batched)(state)
-        return state
+        return vectorize(_end_bad_world, False)(state) if wrappers else state
 
     def reset_episode(self, state: EnvState, default: SimData, vectorize: Vectorize) -> EnvState:
         """Return the state at the start of an episode. Only data, info and memory of the earlier state are read.
@@ -263,6 +265,21 @@ class Phases:
     def _observe_task(self, data: SimData) -> Obs:
         """Return the observations of the task, from measured states if ``measure_states`` is set."""
         return self.task.observe(data if self.measure_states is None else self.measure_states(data))
+
+
+def _end_bad_world(state: EnvState) -> EnvState:
+    """Return the state of one world, ended if an observation or a reward is not finite: a goal may reach only these."""
+    obs, reward, core = state.record.obs, state.reward, state.data.core
+    numbers = [reward, *(x for x in obs.values() if jnp.issubdtype(x.dtype, jnp.floating))]
+    is_bad = functools.reduce(jnp.logical_or, [~jnp.isfinite(x).all() for x in numbers])
+    nonfinite = core.nonfinite | is_bad
+    return state.replace(
+        data=state.data.replace(core=core.replace(nonfinite=nonfinite)),
+        obs=jax.tree.map(lambda x: jnp.where(is_bad, jnp.zeros((), x.dtype), x), obs),
+        reward=jnp.where(is_bad, jnp.zeros((), reward.dtype), reward),
+        terminated=state.terminated | is_bad,
+        info=state.info | {"nonfinite": nonfinite},
+    )
 
 
 def _flag_nonfinite(data: SimData, vectorize: Vectorize) -> SimData:

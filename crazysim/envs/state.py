@@ -31,6 +31,8 @@ Obs = dict[str, Array]
 class EnvRecord(PyTree):
     """Record that an environment adds to the data of its simulation; ``EnvState`` is its public interface."""
 
+    watched = False  # ``Phases.observe`` checks observations and rewards itself
+
     obs: Obs = leaf("drone", 1)
     """Observations. (n_worlds, n_drones, k) each"""
     images: Obs = leaf("drone", 1)

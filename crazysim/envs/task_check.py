@@ -17,7 +17,7 @@ from crazysim.core.sharding import fetch_arrays
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_world_axes, scopes
+from crazysim.pytree import n_world_axes, scopes, watched_flags
 from crazysim.sim.sim import Sim
 
 GUIDE = "docs/guides/tasks.md"
@@ -38,14 +38,18 @@ def require_installed(sim: Sim, task: object) -> None:
 
 
 def require_finite_start(task: Task, state: EnvState) -> None:
-    """Check that episodes begin in finite states."""
-    states = state.data.states
-    for field in dataclasses.fields(states):  # type: ignore[arg-type]
-        value = fetch_arrays(getattr(states, field.name))
-        if not np.all(np.isfinite(value)):
-            world = int(np.argwhere(~np.isfinite(value))[0, 0])
+    """Check that episodes begin in finite states, and without NaN in the record of the task."""
+    states, record = state.data.states, state.data.plugins.get(TASK_RECORD_NAME)
+    arrays = {field.name: getattr(states, field.name) for field in dataclasses.fields(states)}  # type: ignore[arg-type]
+    flags = zip(tree_leaves_with_path(record), jax.tree.leaves(watched_flags(record)), strict=True)
+    record_arrays = {keystr(path): x for (path, x), is_watched in flags if is_watched and x.dtype.kind == "f"}
+    for name, x in (arrays | record_arrays).items():
+        value = fetch_arrays(x)
+        is_bad = np.isnan(value) if name in record_arrays else ~np.isfinite(value)
+        if is_bad.any():
+            world = int(np.argwhere(is_bad)[0, 0])
             raise ConfigError(
-                f"task {task.name!r}: expected spawn to return finite states, got {field.name} with NaN or infinity in "
+                f"task {task.name!r}: expected spawn to return finite states, got {name} with NaN or infinity in "
                 f"world {world}. Check the settings of the task and the numbers that spawn draws."
             )
 

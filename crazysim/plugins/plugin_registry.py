@@ -24,7 +24,7 @@ from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_wo
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import PyTree, n_batch_axes
+from crazysim.pytree import PyTree, n_batch_axes, watched_flags
 
 P = TypeVar("P", bound=Plugin)
 
@@ -104,6 +104,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_unique_terms(plugin, self.values())
         with self._restore_on_error():
             record, default, reads_in_record = self._make_records(plugin)
+            _require_numbers(plugin, default)
             pipeline, installed = self._make_stages(dict(self._sim.step_pipeline), plugin)
             installed.reads_in_record = reads_in_record
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
@@ -558,6 +559,17 @@ def _are_equal(a: Any, b: Any) -> bool:
         return bool(a == b)
     except ValueError:  # sequences of arrays have no truth value: assume a difference, and compile the step again
         return False
+
+
+def _require_numbers(plugin: Plugin, record: Any) -> None:
+    """Check that the leaves in which NaN flags a world begin without NaN."""
+    flags = zip(jax.tree_util.tree_leaves_with_path(record), jax.tree.leaves(watched_flags(record)), strict=True)
+    for (path, x), is_watched in flags:
+        if is_watched and x.dtype.kind == "f" and np.isnan(x).any():
+            raise ConfigError(
+                f"{type(plugin).__name__} {plugin.name!r}: expected numbers in {jax.tree_util.keystr(path)}, got NaN, "
+                f"by which worlds are flagged as nonfinite. Use infinity, or a flag of its own."
+            )
 
 
 def _in_order(pipeline: Pipeline, names: list[str], old: _InstalledPlugin, new: _InstalledPlugin) -> Pipeline:

@@ -14,7 +14,7 @@ from crazysim.engine.ir.program import Segment
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, leaf_indices
 
 SCALAR = jax.ShapeDtypeStruct((), np.float32)
 
@@ -43,7 +43,11 @@ def step():
     """Return the program of a built-in step and its leaves, the last of which packs all shared numbers."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     program = optimise(
-        lower_stages(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+        lower_stages(
+            as_stages(sim.step_pipeline),
+            sim.data,
+            watched=dict.fromkeys(jax.tree.leaves(leaf_indices(sim.data).states), True),
+        )
     )
     leaves = jax.tree.leaves(sim.data)
     packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])

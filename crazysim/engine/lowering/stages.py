@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -30,7 +30,7 @@ def lower_stages(
     stages: Sequence[Stage],
     data: Any,
     zeros: Zeros = (),
-    watched: Callable[[Any], list[Any]] | None = None,
+    watched: Mapping[int, bool] | None = None,
     population: str = "drone",
     tracer: Tracer | None = None,
 ) -> Program:
@@ -43,9 +43,8 @@ def lower_stages(
         data: Data of the simulation, or its shapes and types.
         zeros: Leaves with the elements that are known to be zero. Terms with them are left out, unless a stage writes
             the leaf.
-        watched: Function that selects the leaves to check for NaN and infinity after the last step, from a tree of
-            leaf indices with the structure of the data. None for no check. There is no check either if a stage writes
-            ``core.nonfinite`` itself.
+        watched: Leaves to check after the last step, as ``watched_leaves`` returns them. None for no check. There is no
+            check either if a stage writes ``core.nonfinite`` itself.
         population: Population whose members are the lanes. The members are called drones below.
         tracer: Cache of traced stages; None for a new one.
     """
@@ -76,10 +75,13 @@ def lower_stages(
     core = axes.leaf_indices.core
     if watched is None or core.nonfinite in program.written_leaves:
         return program
-    lane_leaves = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked_leaves = sorted((lane_leaves | axes.views & set(program.written_leaves)) & set(watched(axes.leaf_indices)))
+    lane_leaves = {i for i, scope in enumerate(axes.scopes) if scope in ("drone", "world")} - axes.views
+    checked_leaves = (lane_leaves | axes.views & set(program.written_leaves)) & watched.keys()
     return dataclasses.replace(
-        program, check_segment=_make_finite_check(axes, leaves, core.nonfinite, core.steps, checked_leaves)
+        program,
+        check_segment=_make_finite_check(
+            axes, leaves, core.nonfinite, core.steps, {i: watched[i] for i in sorted(checked_leaves)}
+        ),
     )
 
 
@@ -227,24 +229,27 @@ def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> Elemen
 
 
 def _make_finite_check(
-    axes: Axes, leaves: Sequence[Any], flag: int, steps: int, checked_leaves: Sequence[int]
+    axes: Axes, leaves: Sequence[Any], flag: int, steps: int, checked_leaves: Mapping[int, bool]
 ) -> Segment:
-    """Return a segment that flags a drone if its world was flagged or one of its checked numbers is not finite.
+    """Return a segment that flags a drone if its world was flagged or one of its checked numbers is not valid.
 
+    A number is valid if it is finite or, where ``checked_leaves`` is False for its leaf, if it is not NaN.
     It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
     count has overflowed and is negative.
     """
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []
-    is_finite: Element = constant(True, bool)
+    is_valid: Element = constant(True, bool)
     avals = axes.unbatched_shapes(list(leaves), "drone")
-    for i in checked_leaves:
+    for i, must_be_finite in checked_leaves.items():
         if avals[i].dtype.kind == "f":
             for k, item in enumerate(scalars(inputs(builder, avals[i]))):
                 reads.append((i, k))
-                is_finite = builder.add("and", (is_finite, builder.add("is_finite", (item,), bool)), bool)
+                infinity = constant(np.inf, avals[i].dtype)
+                operation, operands = ("is_finite", (item,)) if must_be_finite else ("le", (item, infinity))
+                is_valid = builder.add("and", (is_valid, builder.add(operation, operands, bool)), bool)
     reads += [(steps, 0), (flag, 0)]
     has_overflowed = builder.add("lt", (builder.input(avals[steps].dtype), constant(0, avals[steps].dtype)), bool)
-    is_invalid = builder.add("or", (has_overflowed, builder.add("not", (is_finite,), bool)), bool)
+    is_invalid = builder.add("or", (has_overflowed, builder.add("not", (is_valid,), bool)), bool)
     flagged = builder.add("or", (builder.input(bool), is_invalid), bool)
     return Segment("drone", ("finite_check",), "after", builder.finish([flagged]), tuple(reads), ())

@@ -1,0 +1,169 @@
+"""Law 7 for what a user hands over inside ``jit``: NaN and infinity end the world, and change no other.
+
+Outside of ``jit`` such values are errors. Inside, nothing can raise: the world is flagged as nonfinite, its episode
+ends, and the next episode is as if nothing had happened.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env_cases import random_action
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazysim import IMU, Battery, Cars, ConfigError, MotionCapture, RangeFinder, Sim, SlungLoad, Wind
+from crazysim.core.plugin import Plugin
+from crazysim.core.stages import watched_leaves
+from crazysim.envs import ActionDelay, AutoReset, EpisodeStatistics, FrameStack, ObservationNoise, make
+from crazysim.pytree import PyTree, host_array, leaf, scopes
+
+WORLDS = np.array([0, 2])
+"""Worlds that stay as they are; world 1 is the bad one."""
+BAD = (np.nan, np.inf, -np.inf)
+
+
+def batched_floats(tree):
+    """Return the indices of the leaves with one value for every world, and of floating type."""
+    leaf_scopes, leaves = jax.tree.leaves(scopes(tree)), jax.tree.leaves(tree)
+    return [i for i, (scope, x) in enumerate(zip(leaf_scopes, leaves, strict=True))
+            if scope not in ("shared", "opaque") and jnp.issubdtype(x.dtype, jnp.floating)]  # fmt: skip
+
+
+def poison(tree, i, value):
+    """Return a tree in whose leaf ``i`` every number of world 1 is ``value``."""
+    leaves, treedef = jax.tree.flatten(tree)
+    leaves[i] = jnp.asarray(leaves[i]).at[1].set(value)
+    return treedef.unflatten(leaves)
+
+
+def assert_others_equal(tree, expected):
+    leaf_scopes = jax.tree.leaves(scopes(tree))
+    paths = jax.tree_util.tree_leaves_with_path(tree)
+    for scope, (path, x), y in zip(leaf_scopes, paths, jax.tree.leaves(expected), strict=True):
+        if scope not in ("shared", "opaque") and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(
+                np.asarray(x)[WORLDS], np.asarray(y)[WORLDS], err_msg=jax.tree_util.keystr(path)
+            )
+
+
+@functools.cache
+def simulation():
+    """Return data with records of many kinds, a compiled flight of two steps, and the data after it."""
+    plugins = [Battery(), Wind((1.0, 0, 0)), RangeFinder(), IMU(delay=0.004), MotionCapture(freq=250), SlungLoad(0.005),
+               Cars(1)]  # fmt: skip
+    sim = Sim(3, 2, control="attitude", plugins=plugins)
+    fly = jax.jit(lambda data: sim.step_fn(data, 2))
+    return sim.data, fly, fly(sim.data)
+
+
+@pytest.mark.long("compiles a simulation with many plugins")
+@given(draw=st.integers(0, 10**6), value=st.sampled_from(BAD))
+def test_a_bad_value_in_the_data_flags_its_world_or_vanishes(draw, value):
+    data, fly, clean = simulation()
+    floats = batched_floats(data)
+    i = floats[draw % len(floats)]
+    after = fly(poison(data, i, value))
+    assert_others_equal(after, clean)
+    leaves, watched = jax.tree.leaves(after), watched_leaves(after)
+    paths = jax.tree_util.tree_leaves_with_path(after)
+    tests = {k: np.isfinite if watched.get(k) else lambda x: ~np.isnan(x) for k in batched_floats(after)}
+    bad = [jax.tree_util.keystr(paths[k][0]) for k, is_valid in tests.items() if not is_valid(leaves[k])[1].all()]
+    # What only the user reads stays as it is: poses of objects, and parameters that nothing uses.
+    unread = set() if i in watched else {jax.tree_util.keystr(paths[i][0])}
+    assert after.core.nonfinite[1, 0] or set(bad) <= unread, f"{paths[i][0]} set to {value} is silent in {bad}"
+    assert not after.core.nonfinite[WORLDS].any()
+
+
+@functools.cache
+def environment(task, mode):
+    env = make(task, 3, engine="interpret")
+    env = (
+        EpisodeStatistics(FrameStack(ActionDelay(ObservationNoise(env, {"pos": 0.01}), 1), 2))
+        if task == "hover"
+        else env
+    )
+    env = AutoReset(env, mode)
+    state = env.reset(jax.random.key(0))
+    step = jax.jit(env.step)
+    action = random_action(state)
+    return env, state, step, action, step(state, action)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("task", ["hover", "avoid", "swarm"])
+@pytest.mark.parametrize("value", BAD)
+def test_a_goal_that_is_not_finite_ends_the_episode_in_jit(task, mode, value):
+    env, state, step, action, _ = environment(task, mode)
+    goals = np.broadcast_to(np.float32([0.5, 0.5, 1.0]), state.full_data.states.pos.shape).copy()
+    set_goal = jax.jit(env.set_goal)
+    with pytest.raises(ConfigError, match="expected pos"):
+        env.set_goal(state, np.full(3, value))
+    clean = step(set_goal(state, goals), action)
+    goals[1, 0, 0] = value
+    assert_ends_and_heals(env, step(set_goal(state, goals), action), clean, step, action)
+
+
+def assert_ends_and_heals(env, after, clean, step, action):
+    """Assert that world 1 has ended and is flagged, and that its next episode is as finite as the others."""
+    np.testing.assert_array_equal(after.info["nonfinite"], [False, True, False])
+    assert after.done[1]
+    assert_others_equal(after, clean)
+    for x in jax.tree.leaves((after.obs, after.reward, after.final_obs)):
+        assert np.isfinite(x).all()
+    later = step(step(after, action), action)
+    assert not later.info["nonfinite"].any()
+    for x in jax.tree.leaves((later.obs, later.reward)):
+        assert np.isfinite(x).all()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("task", ["hover", "race"])
+def test_any_bad_value_in_a_state_ends_its_episode_or_vanishes(task, mode):
+    env, state, step, action, clean = environment(task, mode)
+    paths = jax.tree_util.tree_leaves_with_path(state)
+    for i in batched_floats(state):
+        for value in BAD[:2]:
+            after = step(poison(state, i, value), action)
+            if after.info["nonfinite"][1]:
+                assert_ends_and_heals(env, after, clean, step, action)
+            else:
+                name = jax.tree_util.keystr(paths[i][0])
+                assert_others_equal(after, clean)
+                for x in jax.tree.leaves((after.obs, after.reward, after.full_data.states, step(after, action).obs)):
+                    assert np.isfinite(x).all(), f"{name} set to {value} is silent"
+
+
+@pytest.mark.parametrize("value", BAD)
+def test_an_action_that_is_not_finite_ends_the_episode(value):
+    env, state, step, action, clean = environment("race", "SameStep")
+    bad = action.copy()
+    bad[1] = value
+    with pytest.raises(ConfigError, match=r"expected finite actions, got NaN or infinity in world\(s\) \[1\]"):
+        env.step(state, bad)
+    assert_ends_and_heals(env, step(state, bad), clean, step, action)
+
+
+class Best(PyTree):
+    value: object = leaf("drone")
+
+
+class KeepBest(Plugin):
+    """Keep the smallest height so far."""
+
+    name: str = "best"
+    start: object = np.inf
+
+    def record(self, sim):
+        return Best(host_array(self.start, sim.n_worlds, sim.n_drones))
+
+
+def test_a_record_that_begins_with_nan_is_refused():
+    """Infinity is a usual start of a smallest value; NaN would flag every world."""
+    with pytest.raises(ConfigError, match=r"KeepBest 'best': expected numbers in \.value, got NaN"):
+        Sim(plugins=[KeepBest(start=np.nan)])
+    sim = Sim(plugins=[KeepBest()], engine="plain")
+    sim.step()
+    assert not sim.data.core.nonfinite.any()
