@@ -268,7 +268,7 @@ def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]
         if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in used_levels:
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so its period is "
-                f"not a whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
+                f"not a whole number of steps. Use the nearest rate below, {largest_divisor(freq, requested)} Hz."
             )
 
 
@@ -309,7 +309,7 @@ def default_rates(freq: int, defaults: Mapping[str, int], suffix: str = "") -> d
 
     def find_low_rates(freq: int) -> list[str]:
         limits = {name: min(default, max(freq, SLOW_FREQ)) for name, default in defaults.items()}
-        return [name for name, limit in limits.items() if 2 * _largest_divisor(freq, defaults[name]) < limit]
+        return [name for name, limit in limits.items() if 2 * largest_divisor(freq, defaults[name]) < limit]
 
     if names := find_low_rates(freq):
         name, default = names[0], defaults[names[0]]
@@ -317,10 +317,10 @@ def default_rates(freq: int, defaults: Mapping[str, int], suffix: str = "") -> d
         usable_freq = next(f for f in candidates if not find_low_rates(f))
         raise ConfigError(
             f"expected a freq with a divisor near {default} Hz, the default of {name}{suffix}, got {freq} Hz, whose "
-            f"largest divisor up to that is {_largest_divisor(freq, default)} Hz. Use freq={usable_freq}, or set "
+            f"largest divisor up to that is {largest_divisor(freq, default)} Hz. Use freq={usable_freq}, or set "
             f"{name}{suffix}."
         )
-    return {name: _largest_divisor(freq, default) for name, default in defaults.items()}
+    return {name: largest_divisor(freq, default) for name, default in defaults.items()}
 
 
 def dividing_rate(name: str, rate: object, freq: int) -> int:
@@ -329,7 +329,7 @@ def dividing_rate(name: str, rate: object, freq: int) -> int:
     if freq % rate:
         raise ConfigError(
             f"expected {name} to divide freq = {freq} Hz, got {rate} Hz. Use the nearest rate below, "
-            f"{_largest_divisor(freq, rate)} Hz."
+            f"{largest_divisor(freq, rate)} Hz."
         )
     return rate
 
@@ -374,5 +374,6 @@ def controller_at_rates(
     return dataclasses.replace(controller, **rates)  # type: ignore[type-var]
 
 
-def _largest_divisor(freq: int, limit: int) -> int:
+def largest_divisor(freq: int, limit: int) -> int:
+    """Return the largest divisor of a rate that is not above a limit, Hz."""
     return next(f for f in range(min(limit, freq), 0, -1) if freq % f == 0)

@@ -39,6 +39,7 @@ def rollout(
     keep: KeepFunction = get_states,
     every: int = 1,
     zeros: Zeros | None = None,
+    wait: bool = False,
 ) -> tuple[SimData, Any]:
     """Return the data after some control steps, and the arrays that were recorded after these steps.
 
@@ -56,6 +57,7 @@ def rollout(
         keep: ``keep(data)`` returns the arrays to record after a control step.
         every: Number of control steps from one recording to the next.
         zeros: Result of ``step.zeros(data)`` from before ``data`` was traced.
+        wait: True to step to the next multiple of ``n_substeps`` first, if it is equally far in all worlds.
 
     Returns:
         The data, and the recorded arrays with a leading time axis. (n_control_steps // every, ...)
@@ -67,6 +69,10 @@ def rollout(
     zeros = step.zeros(data) if zeros is None else zeros
     staged = F.staged_leaves(leaf_indices(data))
     flat = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
+    if wait and n_substeps > 1:
+        n_waits = -data.core.steps % n_substeps
+        n_waits = jnp.where(jnp.all(n_waits == n_waits[0]), n_waits[0, 0], 0)
+        flat = jax.lax.cond(n_waits > 0, lambda flat: step.advance(flat, n_waits), lambda flat: flat, flat)
     carried = sorted({*flat.plan.written_leaves, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
@@ -85,7 +91,7 @@ def rollout(
     return flat.replace(carried, carry).data(), recordings
 
 
-STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
+STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros", "wait")
 
 compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
 """``rollout`` in one compiled call, which does not donate the buffers of its arguments."""

@@ -230,6 +230,15 @@ class SceneObjects:
             self._initial_poses.append((poses[0], poses[1]))
         return handle
 
+    def repeated(self, n: int) -> SceneObjects:
+        """Return the same objects with each world ``n`` times."""
+        objects = SceneObjects(n * self._n_worlds)
+        objects._handles = self._handles[:]
+        objects._initial_poses = [
+            (np.repeat(pos, n, axis=0), np.repeat(quat, n, axis=0)) for pos, quat in self._initial_poses
+        ]
+        return objects
+
     def count_objects(self, name: str) -> int:
         """Return the number of added objects of a kind, by its name as in ``Handle.name``; 0 if there are none."""
         return sum(len(handle) for handle in self._handles if handle.name == name)

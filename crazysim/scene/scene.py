@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -144,6 +145,20 @@ class Scene:
             handle = self.added_objects.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
+
+    def repeated(self, n: int, plugins: ListPlugins) -> Scene:
+        """Return a scene with the same bodies and with each world ``n`` times, for a second simulation.
+
+        Args:
+            n: Number of times.
+            plugins: Function that returns the plugins of the second simulation.
+        """
+        scene = copy.copy(self)
+        scene.n_worlds, scene.plugins, scene.mesh = n * self.n_worlds, plugins, None
+        scene.spec, scene.added_objects = self.spec.copy(), self.added_objects.repeated(n)
+        scene.renderer = SceneRenderer(self.device)
+        scene.compile()
+        return scene
 
     def add_map(
         self,

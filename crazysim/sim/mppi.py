@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from crazysim import rotation
 from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState, as_key
 from crazysim.core.functional import stage_command
-from crazysim.core.settings import positive_integer
+from crazysim.core.settings import largest_divisor, positive_integer
 from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
@@ -121,7 +122,7 @@ class MPPI:
         """Build the rollouts.
 
         Args:
-            sim: Simulation that is controlled; the rollouts use its present settings and plugins.
+            sim: Simulation that is controlled; the rollouts use its present settings, plugins and objects.
             horizon: Number of control steps of a rollout.
             samples: Number of rollouts for each world.
             substeps: Physics steps of a control step.
@@ -151,10 +152,14 @@ class MPPI:
             raise ConfigError(f"expected cost as a function, got {short_repr(cost)}. Use tracking_cost.")
         self.temperature, self.cost, self._key = temperature, cost, as_key(seed)
         freq = c.freq if freq is None else positive_integer("freq", freq)
+        rates: dict[str, Any] = {
+            f"{level.value}_freq": largest_divisor(freq, rate) for level, rate in c.control_freqs.items()
+        }
         self._sim = Sim(
             sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
-            device=c.device, engine=c.engine, controller=c.controller or "auto",
+            device=c.device, engine=c.engine, controller=c.controller or "auto", **rates,
         )  # fmt: skip
+        self._sim._use_scene(sim.scene.repeated(self.samples, self._sim.plugins.values))
         for plugin in sim.plugins.values():
             self._sim.add(plugin)
         self.period = self.substeps / freq
@@ -256,6 +261,12 @@ class MPPI:
             raise ConfigError(
                 f"expected data with the plugins that the simulation had when MPPI was built, "
                 f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
+            )
+        names, expected_names = [x.objects.names if x.objects is not None else () for x in (data, template)]
+        if names != expected_names:
+            raise ConfigError(
+                f"expected data with the objects that the scene had when MPPI was built, {list(expected_names)}, got "
+                f"{list(names)}. Build MPPI after adding them."
             )
 
         def repeat_for_rollouts(scope: str, default: Array, x: Array) -> Array:

@@ -189,6 +189,12 @@ class Sim:
         for plugin in first_plugins:
             self.add(plugin)
 
+    def _use_scene(self, scene: Scene) -> None:
+        """Replace the scene of a new simulation by another with its drones, and the data by data with its objects."""
+        self._scene, self._queries, self._adopted_revision = scene, SceneQueries(scene), scene.revision
+        self.build_data()
+        self._default_data = self._stepper.data
+
     @classmethod
     @check_arguments
     def from_mjcf(
@@ -533,7 +539,8 @@ class Sim:
     ) -> Any:
         """Fly many control steps in one compiled call, and return a record of them.
 
-        A control step evaluates the policy, stages its command, and steps until the next command takes effect.
+        A control step evaluates the policy, stages its command, and steps until the next command takes effect. Between
+        two ticks of the controller, the simulation first steps to the next tick, unless worlds are at different ones.
 
         Args:
             policy: ``policy(params, data) -> command``, for all worlds at once; compiled once for each function
@@ -553,10 +560,11 @@ class Sim:
         for leaf in jax.tree.leaves(params):
             check_array("every leaf of params", leaf)
         n_substeps = self.freq // self.control_freq
-        self._stepper.count_steps(n_substeps, positive_integer("n_control_steps", n_control_steps))
+        n_control_steps = positive_integer("n_control_steps", n_control_steps)
+        self._stepper.count_steps(n_substeps, n_control_steps + 1)  # with the steps to the next tick
         data, records = run_rollout(
             self.step_fn, self.data, policy, params, n_control_steps, check_flag("progress", progress), every,
-            n_substeps=n_substeps, keep=keep,
+            n_substeps=n_substeps, keep=keep, wait=True,
         )  # fmt: skip
         self._stepper.accept(data)
         return records

@@ -458,6 +458,31 @@ def test_a_rollout_equals_its_loop_of_steps(capfd):
     assert "control steps" not in capfd.readouterr().err  # no bar without a terminal
 
 
+@pytest.mark.parametrize("offset", [0, 1, 4])
+def test_a_rollout_begins_at_a_tick_of_the_controller(offset):
+    """Between two ticks its first command would have no effect for some steps, and the last one hardly any."""
+    sim = Sim(n_worlds=2, control="attitude", attitude_freq=100)
+    period, commands = sim.freq // sim.control_freq, jnp.asarray([0.3, 0.4, 0.5])
+
+    def policy(commands, data):
+        command = commands[(data.core.steps[0, 0] - first_tick) // period]
+        return jnp.zeros((2, 1, 4)).at[..., 3].set(command)
+
+    def keep(data):
+        return data.core.steps[0, 0], data.controls.attitude.cmd[0, 0, 3]
+
+    sim.step(period + offset)
+    first_tick = period * (2 if offset else 1)
+    steps, applied = sim.rollout(policy, commands, 3, keep=keep)
+    np.testing.assert_array_equal(steps, first_tick + period * np.arange(1, 4))
+    np.testing.assert_array_equal(applied, commands)
+    # Worlds between different ticks have none in common.
+    sim.data = sim.data.replace(core=sim.data.core.replace(steps=jnp.asarray([[3], [4]], jnp.int32)))
+    first_tick = 0
+    steps, _ = sim.rollout(policy, commands, 1, keep=keep)
+    np.testing.assert_array_equal(steps, [3 + period])
+
+
 def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     attitude = sim.data.controls.attitude.replace(cmd=sim.data.controls.attitude.staged_cmd)

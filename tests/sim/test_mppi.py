@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import Sim, Wind
+from crazysim import ContactResponse, Sim, Wind
 from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
-from crazysim.sim.mppi import MPPI, setpoint_after, tracking_cost
+from crazysim.sim.mppi import MPPI, RolloutRecord, setpoint_after, tracking_cost
 from crazysim.trajectories import figure_eight
 
 
@@ -143,4 +143,54 @@ def test_data_with_other_plugins_is_refused():
     mppi = MPPI(sim, samples=2, freq=125, horizon=2)
     sim.add(Wind())
     with pytest.raises(ConfigError, match="Build MPPI after adding them"):
+        mppi.command(sim.data, setpoint())
+
+
+def predicted_states(sim, mppi, n_steps):
+    """Return the states that a rollout of the hovering plan predicts. (n_worlds, n_drones, ...)"""
+    memory = mppi.init(sim.n_worlds, sim.n_drones)
+    record = RolloutRecord(memory.plan, jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 1, len(x))), setpoint()),
+                           jnp.zeros((2, 1, 1)))  # fmt: skip
+    return mppi._step(mppi._rollouts(sim.data, record), n_steps).states
+
+
+def flown_states(sim, mppi, n_steps):
+    """Return the states after the same steps of the simulation."""
+    sim.attitude_control(mppi.init(sim.n_worlds, sim.n_drones).plan[:, :, 0])
+    sim.step(n_steps)
+    return sim.data.states
+
+
+@pytest.mark.parametrize("controller", ["auto", "crazyflow"])
+def test_rollouts_predict_at_the_rates_of_the_simulation(controller):
+    """At the default rates, a drone that is rolled by 69 degrees would recover sooner than at 50 Hz."""
+    settings = {"control": "attitude", "attitude_freq": 50, "force_torque_freq": 250, "controller": controller}
+    sim = Sim(n_worlds=2, **settings)
+    mppi = MPPI(sim, samples=1, horizon=10, substeps=10)
+    assert mppi._sim.configuration.control_freqs == sim.configuration.control_freqs
+    place_drones(sim, [0, 0, 1.0], [np.sin(0.6), 0, 0, np.cos(0.6)])
+    predicted = predicted_states(sim, mppi, 60)
+    for x, y in zip(jax.tree.leaves(predicted), jax.tree.leaves(flown_states(sim, mppi, 60)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)  # rounding of two kernels
+    # The rates of rollouts with another physics rate are the next lower divisors.
+    assert set(MPPI(sim, samples=1, freq=125)._sim.configuration.control_freqs.values()) <= {25, 125}
+
+
+@pytest.mark.long("compiles contact response for two simulations")
+def test_rollouts_meet_the_objects_of_the_scene():
+    """Each world has its own wall, 0.3 m ahead in the first; a drone that is pushed there stops in the rollout, too."""
+    sim = Sim(n_worlds=2, control="attitude")
+    sim.scene.add("sphere", pos=[0, 3.0, 1], radius=0.1, mocap=False)
+    wall = sim.scene.add("wall", pos=[[[0.3, 0, 0]], [[5.0, 0, 0]]], length=4.0, height=3.0, thickness=0.1)
+    sim.add(ContactResponse())
+    mppi = MPPI(sim, samples=1, horizon=10, substeps=10)
+    place_drones(sim, [0, 0, 1.0], vel=[2.0, 0, 0])
+    predicted = predicted_states(sim, mppi, 100)
+    assert predicted.pos[0, 0, 0] < 0.25 < predicted.pos[1, 0, 0]
+    flown = flown_states(sim, mppi, 100)
+    np.testing.assert_allclose(predicted.pos, flown.pos, atol=1e-4)  # a contact enlarges rounding
+    sim.data = wall.set_pose(sim.data, pos=[5.0, 0, 0])
+    assert np.isfinite(mppi.command(sim.data, setpoint())).all()
+    sim.scene.add("pole", pos=[1, 1, 0])
+    with pytest.raises(ConfigError, match=r"expected data with the objects .* Build MPPI after adding them"):
         mppi.command(sim.data, setpoint())
