@@ -119,6 +119,7 @@ def assert_ends_and_heals(env, after, clean, step, action):
         assert np.isfinite(x).all()
 
 
+@pytest.mark.long("steps once or thrice for every array of a state")
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("task", ["hover", "race"])
 def test_any_bad_value_in_a_state_ends_its_episode_or_vanishes(task, mode):
