@@ -90,6 +90,7 @@ __all__ = [
     "equations",
     "expand_primitive",
     "ffi_include_folder",
+    "fori_loop",
     "gather_from_hosts",
     "is_key",
     "is_stop_requested",
@@ -406,6 +407,19 @@ def expand_primitive(eqn: Any) -> Callable[..., list[Any]]:
     """Return a ``call_hi_primitive`` of JAX 0.12 as a function of arrays, written in terms of other primitives."""
     primitive = eqn.params["_prim"]
     return lambda *args: jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+
+def fori_loop(n: int, fn: Callable[[jax.Array, Any], Any], start: Any) -> Any:
+    """Return ``jax.lax.fori_loop(0, n, fn, start)``, with an index of 32 bits.
+
+    JAX's index has 64 bits where float64 is enabled; kernels have no such numbers.
+    """
+
+    def iterate(carry: tuple[jax.Array, Any], _: None) -> tuple[tuple[jax.Array, Any], None]:
+        k, value = carry
+        return (k + 1, fn(k, value)), None
+
+    return jax.lax.scan(iterate, (jax.numpy.int32(0), start), length=n)[0][1]
 
 
 # Arrays ---------------------------------------------------------------------------------------------------------

@@ -18,13 +18,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.support import segment_support_point
 from crazysim.geometry.triangle import closest_point, closest_point_off_bc, from_barycentric
 from crazysim.geometry.vector import Vector, axis_vector, normalize, rounding_margin, select_vector, stack_vectors
+from crazysim.jaxcompat import fori_loop
 
 BestDirection = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""
@@ -111,7 +112,7 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
         return (*simplex, pair.with_candidate(n, best))
 
     first_point = pair.support_point(n)
-    triangle, nearest, best = lax.fori_loop(0, steps, step, ((first_point,) * 3, first_point[0], (pair.gap(n), n)))
+    triangle, nearest, best = fori_loop(steps, step, ((first_point,) * 3, first_point[0], (pair.gap(n), n)))
     weights = closest_point(*(point for point, _ in triangle))
     coordinates = [
         jnp.asarray(sum(w * x for w, x in zip(weights, xs, strict=True)))

@@ -19,6 +19,7 @@ from crazysim.geometry.points import ellipsoid_normal
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import MIN_SQUARED_SINE
 from crazysim.geometry.vector import Vector, axis_vector, normalize, select_vector, stack_vectors, to_vector
+from crazysim.jaxcompat import fori_loop
 
 SEPARATION_STEPS = 16
 """Number of steps towards the nearest points of separated shapes; curved shapes need more than polytopes."""
@@ -125,7 +126,7 @@ def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirectio
         sign = [-1.0 if k == shortest_axis else 1.0 for k in range(3)]
         return pair.with_candidate(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.with_candidate(n, best))
 
-    return lax.fori_loop(0, 2 ** len(pair.edges), try_corner, best)
+    return fori_loop(2 ** len(pair.edges), try_corner, best)
 
 
 def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
@@ -182,8 +183,7 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     # An arc is (n, p, m, q, peak): directions n and m with support points p and q, and the estimate between them.
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first_point = support_point(start)
-    _, _, gap, initial_arc = lax.fori_loop(
-        0,
+    _, _, gap, initial_arc = fori_loop(
         N_ARCS,
         try_arc,
         (start, first_point, jnp.full_like(x, -jnp.inf), (start, first_point, start, first_point, start)),
@@ -199,7 +199,7 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         m, q = _choose(is_rising, m, middle), _choose(is_rising, q, r)
         return jnp.where(middle_gap > gap, middle_gap, gap), (n, p, m, q, _choose(middle_gap > gap, middle, peak))
 
-    _, (*_, peak) = lax.fori_loop(0, N_ARC_STEPS, narrow_arc, (gap, initial_arc))
+    _, (*_, peak) = fori_loop(N_ARC_STEPS, narrow_arc, (gap, initial_arc))
     n = direction(peak)
     n = normalize(n, e)
     return pair.gap(n), n

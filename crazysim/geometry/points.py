@@ -14,6 +14,7 @@ from jax import Array, lax
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import closest_point, from_barycentric
 from crazysim.geometry.vector import Vector, to_vector
+from crazysim.jaxcompat import fori_loop
 from crazysim.rotation import clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12
@@ -117,7 +118,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     start = constant_point[0] * 0
     for x, gap in zip(constant_point, square_gaps, strict=True):
         start = maximum(start, jnp.abs(x) - gap)
-    s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton_step(s, constant_point), start)
+    s = fori_loop(ELLIPSOID_STEPS - 1, lambda _, s: newton_step(s, constant_point), start)
     s = newton_step(s, scaled_point)  # the last step carries the derivative of the root
     x, y, z = (p / (s + gap) for p, gap in zip(displaced_point, square_gaps, strict=True))
     return x, y, z

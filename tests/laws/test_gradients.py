@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import build_stagewise_step
 
-from crazysim import Sim, load_airframe
+from crazysim import ContactResponse, Sim, load_airframe
 from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
 
@@ -114,6 +114,38 @@ def test_gradient_equals_central_differences(dynamics, control, engine, mode, x6
         np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-6, err_msg=name)
         compared += abs(numeric) > 1e-6
     assert compared >= 5, "the loss hardly depends on its inputs: nothing was compared"
+
+
+@pytest.mark.long("compiles a kernel of contacts and of their derivative")
+def test_gradients_of_contacts_equal_central_differences(x64):
+    """A tilted drone slides over the floor, and another is put down on it, in one kernel in float64.
+
+    Worlds are at the start, one step ahead of it and one step behind it. Errors are as in the test above.
+    """
+    sim = Sim(6, control="rotor_vel", engine="auto", plugins=[ContactResponse(objects=())])
+    step, rng, h = sim.build_step_fn(), np.random.default_rng(1), 1e-7
+    start = {"pos": [0.0, 0.0, 0.005], "vel": [0.4, 0.2, -0.3], "ang_vel": [0.1, -0.2, 0.3]}
+    directions = {name: np.zeros((6, 1, 3)) for name in start}
+    x = {name: np.tile(value, (6, 1, 1)).astype(float) for name, value in start.items()}
+    for name in start:
+        directions[name][:] = rng.normal(size=3)
+        x[name] += h * np.tile([0.0, 1.0, -1.0], 2)[:, None, None] * directions[name]
+    x["vel"][3:] *= 0.0
+    directions["vel"][3:] = 0.0
+
+    def end(x):
+        data = jax.tree.map(lambda a: a.astype(float) if a.dtype == np.float32 else a, sim.data)
+        quat = jnp.broadcast_to(jnp.array([0.1, 0.05, 0.0, 1.0]) / np.sqrt(1.0125), (6, 1, 4))
+        after = step(data.replace(states=data.states.replace(quat=quat, **x)), 5)
+        states, push = after.states, after.plugins["contact_response"].impulse[..., 2]
+        return states.pos @ jnp.array([1.0, -2.0, 3.0]) + states.vel @ jnp.ones(3) + states.ang_vel @ jnp.ones(3), push
+
+    (values, push), (slopes, _) = jax.tree.map(np.ravel, jax.jit(functools.partial(forward_mode, end))(x, directions))
+    assert np.all(push > 0)
+    for k in (0, 3):
+        numeric = (values[k + 1] - values[k + 2]) / (2 * h)
+        assert abs(numeric) > 0.1
+        np.testing.assert_allclose(slopes[k], numeric, rtol=1e-5)
 
 
 def one_sided_quotients(fn, x, h):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
 from crazysim.geometry.small_matrices import solve_symmetric
+from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.contacts.contact_points import ContactPoints
 
 BOUNCE_SPEED = 0.1
@@ -92,7 +92,7 @@ def velocity_after_contact(
             matrix, rotation.matvec(inertia, initial_vel) + jnp.sum(friction_pull + normal_pull, axis=-2)
         )
 
-    new_vel = jax.lax.fori_loop(0, iterations, iterate, initial_vel)
+    new_vel = fori_loop(iterations, iterate, initial_vel)
     normal_impulse = jnp.where(is_active, stiffness * jnp.maximum(target_speed - point_speeds(new_vel)[0], 0.0), 0.0)
     new_vel = new_vel + material.restitution * solve_symmetric(
         inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * normal_wrench, axis=-2)

@@ -17,6 +17,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.geometry.small_matrices import matmul, matvec
+from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, MAX_PUSH_SPEED
 
 MAX_ACTING_GAP = 1e-3
@@ -196,7 +197,7 @@ def solve_contacts(
         is_near[:, None], initial_impulses.friction - rotation.dot(initial_impulses.friction, normal) * normal, 0.0
     )
     initial = Impulses(normal_start, friction_start)
-    impulses, *_ = jax.lax.fori_loop(0, iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
+    impulses, *_ = fori_loop(iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
     total = impulses.normal[:, None] * normal + impulses.friction
     vel_change, ang_vel_change = velocity_change(total)
     energy_factor = _energy_factor(total, initial_vel, contact_velocity(vel_change, ang_vel_change))

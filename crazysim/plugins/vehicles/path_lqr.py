@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.control.lqr import solve_on_host, weight_matrix
 from crazysim.control.riccati import gain_discrete
 from crazysim.core.settings import setting
+from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
@@ -142,4 +143,4 @@ def matrix_exponential(matrix: Array) -> Array:
     total = eye
     for k in range(6, 0, -1):
         total = eye + scaled_matrix @ total / k
-    return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, total)
+    return fori_loop(N_SQUARINGS, lambda _, x: x @ x, total)
