@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import glob
 import hashlib
@@ -31,6 +32,10 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 """Suffixes of the formats in which figures are saved."""
 MAX_TOML_BYTES = 2**20
 """Largest TOML file, bytes; the built-in ones have up to 12,000."""
+MAX_TEXT_BYTES = 2**24
+"""Largest text that people write, such as a list of points or the code of a task, bytes."""
+MAX_FILE_BYTES = 2**36
+"""Largest file that is read in parts or unpacked, bytes: recorded flights and checkpoints."""
 MAX_ARRAYS = 10_000
 """Largest number of arrays in an ``.npz`` file."""
 MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO = 2**30, 100
@@ -71,15 +76,49 @@ def read_bytes(path: str | Path, max_bytes: int) -> bytes:
     Raises:
         ConfigError: If it does not exist, cannot be read, or is larger.
     """
-    if not is_file(path):
-        raise ConfigError(f"expected an existing file, got {str(path)[:200]!r}")
     try:
-        size = Path(path).stat().st_size
-        if size > max_bytes:
-            raise ConfigError(f"expected a file of at most {max_bytes} bytes, got {size} in {path}")
-        return Path(path).read_bytes()
+        with open_file(path, max_bytes) as file:
+            content = file.read(max_bytes + 1)
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise ConfigError(f"expected an existing file, got {str(path)[:200]!r}") from None
     except OSError as error:
-        raise ConfigError(f"expected a file that can be read, got {str(path)!r}: {error}") from error
+        raise ConfigError(f"expected a file that can be read, got {str(path)[:200]!r}: {error}") from error
+    _check_size(path, len(content), max_bytes)  # a file may grow, and those of /proc state no size
+    return content
+
+
+def open_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> BinaryIO:
+    """Open a file of data for reading, after the check of ``check_file``.
+
+    Raises:
+        OSError: If it does not exist, is a folder, or cannot be read.
+        ConfigError: If it is a device or a pipe, or is larger than ``max_bytes``.
+    """
+    check_file(path, max_bytes)
+    return open(path, "rb")
+
+
+def check_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> None:
+    """Check a file that is opened elsewhere: devices and pipes may wait for ever, or have no end.
+
+    Raises:
+        OSError: If it does not exist, or is a folder.
+        ConfigError: If it is a device or a pipe, or is larger than ``max_bytes``.
+    """
+    try:
+        status = os.stat(path)
+    except ValueError:  # a null byte, for example
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise ConfigError(f"expected a file, got the device or pipe {str(path)[:200]!r}. Save its contents to a file.")
+    _check_size(path, status.st_size, max_bytes)
+
+
+def _check_size(path: str | Path, size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise ConfigError(f"expected a file of at most {max_bytes} bytes, got {size} in {str(path)[:200]}")
 
 
 def read_text(path: str | Path, max_bytes: int) -> str:

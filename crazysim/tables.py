@@ -48,6 +48,8 @@ MASS = Range("from 1e-6 to 1e6 kg", 1e-6, 1e6)
 INERTIA = Range("from 1e-15 to 1e9 kg m^2", 1e-15, 1e9)
 LENGTH = Range("from 1e-6 to 1e3 m", 1e-6, 1e3)
 LENGTH_OR_ZERO = Range("from 0 to 1e3 m", 0.0, 1e3)
+TIMEOUT_RANGE = Range("positive, at most 1e+06", 1 / MAX_NUMBER, 1e6)
+"""Range of times to wait for another program, s."""
 COORDINATE = Range("from -1e3 to 1e3 m", -1e3, 1e3)
 
 

@@ -11,6 +11,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -21,8 +22,11 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from crazysim.commands.options import duration
 from crazysim.errors import ConfigError, DivergedError
 
+MAX_PORT = 65535
+"""Largest TCP port."""
 HOST_VARIABLE = "CRAZYSIM_HOST"
 """Environment variable of the process of a host: its ``Host`` as JSON."""
 STOP_KEY = "crazysim/stop"
@@ -62,9 +66,9 @@ def add_options(add: Callable[..., Any]) -> None:
     add("--host-id", type=int, metavar="I", help="number of this host, from 0")
     add("--hosts", type=int, metavar="N", help="number of hosts")
     heartbeat_help = "time without a sign of life after which a host counts as lost, s"
-    add("--heartbeat-timeout", type=int, default=100, metavar="SECONDS", help=heartbeat_help)
+    add("--heartbeat-timeout", type=duration, default=100, metavar="SECONDS", help=heartbeat_help)
     connect_help = "time within which all hosts must have connected, s"
-    add("--connect-timeout", type=int, default=300, metavar="SECONDS", help=connect_help)
+    add("--connect-timeout", type=duration, default=300, metavar="SECONDS", help=connect_help)
 
 
 def has_several_hosts(options: argparse.Namespace) -> bool:
@@ -99,17 +103,31 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
 
 def _host_from_options(options: argparse.Namespace) -> Host:
     """Return the host that the options describe."""
-    if not re.fullmatch(r".+:\d+", options.coordinator):
-        raise ConfigError(
-            f"expected HOST:PORT or auto as --coordinator, got {options.coordinator!r}. Use for example 10.0.0.1:1234."
-        )
     n, i = options.hosts, options.host_id
     if n is None or i is None or not 0 <= i < n:
         raise ConfigError(
             f"expected --hosts N, and --host-id from 0 to N - 1, got --hosts {n} --host-id {i}. Use for example "
             f"--hosts 2 --host-id 0 on the host of the coordinator, and --hosts 2 --host-id 1 on the other."
         )
+    _check_coordinator(options.coordinator)
     return Host(options.coordinator, i, n, None, options.heartbeat_timeout, options.connect_timeout)
+
+
+def _check_coordinator(text: str) -> None:
+    """Check an address, which JAX would try to connect with until ``--connect-timeout``, or for ever."""
+    match = re.fullmatch(r"(.+):(\d{1,5})", text)
+    if match is None or not 1 <= int(match[2]) <= MAX_PORT:
+        raise ConfigError(
+            f"expected HOST:PORT or auto as --coordinator, with a port from 1 to {MAX_PORT}, got {text!r}. Use for "
+            f"example 10.0.0.1:1234."
+        )
+    try:
+        socket.getaddrinfo(match[1].strip("[]"), int(match[2]))
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(
+            f"expected a host that this machine knows as --coordinator, got {match[1]!r}: {error}. Use its IP address, "
+            f"such as 10.0.0.1:{match[2]}."
+        ) from error
 
 
 def _host_from_scheduler(options: argparse.Namespace) -> Host:

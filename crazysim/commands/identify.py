@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter
+from crazysim.commands.options import DefaultsFormatter, count
 from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import FITTED_MODELS
 from crazysim.errors import ConfigError
@@ -32,6 +32,9 @@ from crazysim.lab.identify import (
     with_speeds,
 )
 from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
+
+MAX_HIDDEN = 10_000
+"""Largest number of hidden units of ``--network``."""
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
@@ -58,8 +61,9 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         default="first_principles",
         help="model to fit",
     )
-    add("--network", type=int, metavar="N", help="train a residual wrench with N hidden units, 0 for linear terms")
-    add("--iterations", type=int, default=1000, metavar="N", help="iterations of the training of --network")
+    network_help = "train a residual wrench with N hidden units, 0 for linear terms"
+    add("--network", type=count(MAX_HIDDEN), metavar="N", help=network_help)
+    add("--iterations", type=count(), default=1000, metavar="N", help="iterations of the training of --network")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
     add(
         "--columns",

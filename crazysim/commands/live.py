@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crazysim.commands.options import (
+    MAX_DRONES,
     SIMULATION_OPTIONS,
     DefaultsFormatter,
     add_page_options,
     add_simulation_options,
+    count,
     has_screen,
     load_policy_and_env,
     require_screen,
@@ -33,8 +35,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--policy", type=Path, metavar="FOLDER", help=policy_help)
     goals_help = "goals of the policy, one after another: x,y,z in each line, m"
     add("--goals", type=Path, metavar="FILE", help=goals_help)
-    add("--drones", type=int, metavar="N", help="drones in each world; by default 4")
-    add("--worlds", type=int, default=1, metavar="N", help="number of worlds")
+    add("--drones", type=count(MAX_DRONES), metavar="N", help="drones in each world; by default 4")
+    add("--worlds", type=count(), default=1, metavar="N", help="number of worlds")
     add("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")
     add("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
     add("--window", action="store_true", help="show a window; by default where there is a screen")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,36 @@ class DefaultsFormatter(argparse.HelpFormatter):
         if text is None or has_no_default or "by default" in text:
             return text
         return f"{text} (default: %(default)s)"
+
+
+MAX_COUNT = 2**26
+"""Largest number of worlds, iterations and so on of an option."""
+MAX_DRONES = 2**16
+"""Largest number of drones in a world of an option."""
+
+
+def count(at_most: int = MAX_COUNT) -> Callable[[str], int]:
+    """Return the type of an option that is a whole number; what it counts checks its lower bound."""
+
+    def whole_number(text: str) -> int:
+        n = int(text)
+        if n > at_most:
+            raise argparse.ArgumentTypeError(f"expected at most {at_most:,}, got {text}. Use a smaller number.")
+        return n
+
+    return whole_number
+
+
+def duration(text: str) -> int:
+    """Return an option that is a time to wait, s."""
+    seconds = int(text)
+    if not 1 <= seconds <= MAX_WAIT:
+        raise argparse.ArgumentTypeError(f"expected 1 to {MAX_WAIT} s, got {text}. Use for example 60.")
+    return seconds
+
+
+MAX_WAIT = 86400
+"""Longest time of an option to wait for something, s."""
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:

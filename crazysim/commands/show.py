@@ -44,11 +44,14 @@ def run(options: argparse.Namespace) -> None:
     """Fly a show, and write figures, films and pages of it."""
     from crazysim.lab.shows import film, fly_show, page, report, summary
     from crazysim.lab.shows.view import play
+    from crazysim.media.web import require_free_port
     from crazysim.progress import progress_bar
 
     for path, suffixes in ((options.report, (".json",)), (options.page, (".html",)), (options.film, (".mp4", ".gif"))):
         if path is not None:
             check_writable(path, suffixes)
+    if options.browser and not options.live:
+        require_free_port(options.host, options.port, "--")  # the page is served after the flight
     show = load_show(options.file)
     if options.window:
         require_screen("--browser or --film FILE")

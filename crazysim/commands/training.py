@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands import hosts
-from crazysim.commands.options import DefaultsFormatter, load_policy_and_env, specified_options
+from crazysim.commands.options import DefaultsFormatter, count, load_policy_and_env, specified_options
 from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
@@ -39,11 +39,11 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     sweep_help = "values of hyperparameters, each trained with each seed in one program"
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep_help)
     worlds_help = "number of parallel worlds of a training, but not of a recipe's teacher; by default the recipe's"
-    add("--worlds", type=int, help=worlds_help)
+    add("--worlds", type=count(), help=worlds_help)
     iterations_help = (
         "number of rollouts, each with its updates, but not of a recipe's teacher; by default the recipe's"
     )
-    add("--iterations", type=int, help=iterations_help)
+    add("--iterations", type=count(), help=iterations_help)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume_help = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
     add("--resume", action="store_true", help=resume_help)
@@ -59,7 +59,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--no-film", action="store_true", help="write no film")
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
-    add("--worlds", type=int, default=1000, help="number of initial states")
+    add("--worlds", type=count(), default=1000, help="number of initial states")
     add("--seed", type=int, help="seed of other initial states than the held-out ones")
     add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
     _add_task_and_device(add)
@@ -73,7 +73,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
-    add("--worlds", type=int, default=4, help="number of worlds side by side")
+    add("--worlds", type=count(), default=4, help="number of worlds side by side")
     add("--seed", type=int, default=1, help="seed of the initial states")
     _add_task_and_device(add)
 
@@ -93,14 +93,15 @@ def _add_task_and_device(add: Any) -> None:
     add("--device", help="device: cpu, gpu; by default the training's")
 
 
-def parse_seeds(text: str) -> list[int]:
+def parse_seeds(text: str) -> Sequence[int]:
     """Return the seeds of ``FIRST:END``, from FIRST to END - 1, or of a list with commas."""
+    seeds: Sequence[int]
     start, colon, stop = text.partition(":")
     try:
-        seeds = list(range(int(start), int(stop))) if colon else [int(x) for x in text.split(",")]
+        seeds = range(int(start), int(stop)) if colon else [int(x) for x in text.split(",")]
     except ValueError:
         seeds = []
-    if not seeds or len(set(seeds)) < len(seeds):
+    if not seeds or (not colon and len(set(seeds)) < len(seeds)):
         raise argparse.ArgumentTypeError(
             f"expected FIRST:END with FIRST below END, or seeds with commas, each once, got {text!r}. Use for example "
             f"0:8, for the seeds 0 to 7."

@@ -17,7 +17,7 @@ from crazysim.arguments import check_arguments
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.drones.airframe_checks import MAX_ROTORS
 from crazysim.errors import ConfigError, short_repr
-from crazysim.storage import is_file
+from crazysim.storage import MAX_TEXT_BYTES, is_file, read_text
 from crazysim.tables import POSITIVE, read_number, read_numbers
 
 AIR_DENSITY = 1.225
@@ -426,7 +426,7 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
     """Return the columns of a CSV file by their names in its first line."""
     if not is_file(path):
         raise ConfigError(f"expected a motor table as an existing CSV file, got {str(path)!r}")
-    lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
+    lines = [line for line in read_text(path, MAX_TEXT_BYTES).splitlines() if line.strip() and line[0] != "#"]
     header, *rows = csv.reader(lines) if lines else [[]]
     if not header or not rows or any(len(row) != len(header) for row in rows):
         raise ConfigError(f"expected a line of names and lines of as many numbers in {str(path)!r}")

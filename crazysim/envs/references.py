@@ -20,7 +20,7 @@ from types import ModuleType
 from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
-from crazysim.storage import make_private_folder, untrusted_reason
+from crazysim.storage import MAX_TEXT_BYTES, make_private_folder, open_file, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES_BY_REFERENCE: dict[str, type[Task]] = {}
@@ -122,9 +122,14 @@ def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
 def code_digest(reference: str) -> str:
     """Return the SHA-256 hash of the file of a reference, hexadecimal; empty if there is no file."""
     location, _ = split_reference(reference)
-    with contextlib.suppress(OSError):
-        return hashlib.sha256(Path(location).read_bytes()).hexdigest() if location.endswith(".py") else ""
+    with contextlib.suppress(OSError, ConfigError):
+        return hashlib.sha256(_read_code(Path(location))).hexdigest() if location.endswith(".py") else ""
     return ""
+
+
+def _read_code(path: Path) -> bytes:
+    with open_file(path, MAX_TEXT_BYTES) as file:
+        return file.read()
 
 
 def _is_task(x: object) -> bool:
@@ -134,7 +139,7 @@ def _is_task(x: object) -> bool:
 def _import_file(path: Path) -> ModuleType:
     """Return the module of a file. Each version of the file is executed once, with its folder on ``sys.path``."""
     try:
-        source = path.read_bytes()
+        source = _read_code(path)
     except OSError as error:
         raise ConfigError(
             f"expected a file with a task, got {str(path)!r}: {error.strerror}. Write the path of a Python file."

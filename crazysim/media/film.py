@@ -32,6 +32,10 @@ ENCODERS = {
 """Arguments of ffmpeg for each suffix."""
 
 
+MAX_FPS = 1000
+"""Largest number of frames per second of film."""
+
+
 class Film:
     """A film of a simulation.
 
@@ -78,6 +82,8 @@ class Film:
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
+        if fps > MAX_FPS:
+            raise ConfigError(f"expected fps of at most {MAX_FPS}, got {fps!r}. Use a smaller speed for slow motion.")
         size = self.view.width, self.view.height
         if self.path.suffix.lower() == ".mp4" and any(n % 2 for n in size):
             even_size = [n + n % 2 for n in size]

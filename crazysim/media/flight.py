@@ -14,7 +14,7 @@ from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
-from crazysim.storage import open_replacement, read_arrays, wrap_read_errors
+from crazysim.storage import open_file, open_replacement, read_arrays, wrap_read_errors
 
 FORMAT = 1
 """Version of the file format."""
@@ -113,7 +113,7 @@ class Flight:
             if is_journal(path):
                 arrays = _read_samples(path)
             else:
-                with path.open("rb") as file:
+                with open_file(path) as file:
                     arrays = read_arrays(file, str(path))
             if int(arrays["format"]) != FORMAT:
                 raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import Closeable, read_arrays
+from crazysim.storage import Closeable, open_file, read_arrays
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
         ValueError: If the file is not a journal.
         OSError: If the file cannot be read.
     """
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError(f"the first line is not {MAGIC.decode().strip()!r}")
         size = os.fstat(file.fileno()).st_size

@@ -286,6 +286,29 @@ def import_viser() -> Any:
     return viser
 
 
+def require_free_port(host: str, port: int, prefix: str = "") -> int:
+    """Return ``port`` if it is free, and any free port for 0; viser itself would silently use another port.
+
+    Args:
+        host: Host of the address.
+        port: Port of the address.
+        prefix: Text before the name of the setting, for the message.
+
+    Raises:
+        RenderError: If the port is in use or does not exist.
+    """
+    if port == 0:
+        return free_port()
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+            probe.listen()
+    except (OSError, OverflowError) as error:
+        raise RenderError(address_message(host, port, error, prefix)) from error
+    return port
+
+
 def free_port() -> int:
     """Return the number of a free port of this machine."""
     with socket.socket() as probe:

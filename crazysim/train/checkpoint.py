@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import open_replacement, read_arrays, wrap_read_errors
+from crazysim.storage import open_file, open_replacement, read_arrays, wrap_read_errors
 
 T = TypeVar("T")
 META_ENTRY = "meta"
@@ -44,7 +44,7 @@ def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged or not a checkpoint.
     """
-    with wrap_checkpoint_errors(path), open(path, "rb") as file:
+    with wrap_checkpoint_errors(path), open_file(path) as file:
         arrays = read_arrays(file, str(path))
         return arrays, dict(json.loads(str(arrays.pop(META_ENTRY))))
 

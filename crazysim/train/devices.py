@@ -59,18 +59,18 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     selection, first_device = _read_devices(devices), find_device(device)
     platform, available = first_device.platform, jax.devices(first_device.platform)
     if isinstance(selection, tuple):
-        indices = list(selection)
+        indices, last = selection, max(selection)
     elif selection is None:
-        indices = list(range(len(available)))
+        indices, last = range(len(available)), len(available) - 1
     else:
         start = available.index(first_device) if isinstance(device, str) and ":" in device else 0
-        indices = list(range(start, start + selection))
-    if missing := [i for i in indices if i >= len(available)]:
+        indices, last = range(start, start + selection), start + selection - 1
+    if last >= len(available):
         hint = "" if platform != "cpu" else (
             " A CPU is one device, or N with XLA_FLAGS=--xla_force_host_platform_device_count=N in the environment."
         )  # fmt: skip
         raise ConfigError(
-            f"expected devices among the {len(available)} of {platform!r}, got {platform}:{missing[-1]}. Use "
+            f"expected devices among the {len(available)} of {platform!r}, got {platform}:{last}. Use "
             f"--devices all, and --device for another platform.{hint}"
         )
     return [available[i] for i in indices]

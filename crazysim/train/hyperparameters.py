@@ -23,6 +23,8 @@ LIMIT_NAMES = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
 COUNT_NAMES = ("memory",)
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
+MAX_COUNT, MAX_SIZE = 2**26, 2**14
+"""Largest whole number, and largest size of a layer or a memory."""
 CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
 """Allowed values of the hyperparameters that are a choice of words, by name."""
 
@@ -45,7 +47,8 @@ def check_hyperparameters(config: Any) -> None:
         elif isinstance(default, str):
             value = _check_text(field.name, value)
         elif isinstance(default, int):
-            value = (_check_count if field.name in COUNT_NAMES else positive_integer)(field.name, value)
+            is_count = field.name in COUNT_NAMES
+            value = _check_count(field.name, value) if is_count else positive_integer(field.name, value, MAX_COUNT)
         else:
             value = _check_number(field.name, value, default)
         object.__setattr__(config, field.name, value)
@@ -61,12 +64,12 @@ def _check_sizes(name: str, value: object) -> tuple[int, ...]:
     if not isinstance(value, (list, tuple)):
         meaning = "channels of the layers" if name == "convolution" else "sizes of the hidden layers"
         raise ConfigError(f"expected {name} as the {meaning}, got {value!r}. Use for example [64, 64].")
-    return tuple(positive_integer(f"{name}[{i}]", size) for i, size in enumerate(value))
+    return tuple(positive_integer(f"{name}[{i}]", size, MAX_SIZE) for i, size in enumerate(value))
 
 
 def _check_count(name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise ConfigError(f"expected {name} as a whole number of at least 0, got {value!r}. Use for example 64.")
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= MAX_SIZE:
+        raise ConfigError(f"expected {name} as a whole number from 0 to {MAX_SIZE}, got {value!r}. Use for example 64.")
     return int(value)
 
 

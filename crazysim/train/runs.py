@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,10 @@ def run_many(
     return results
 
 
+MAX_TRAININGS = 10_000
+"""Largest number of trainings in one program."""
+
+
 def make_variants(
     seeds: Iterable[int], sweep: Mapping[str, Sequence[float]], config: Mapping[str, Any]
 ) -> dict[str, tuple[int, dict[str, float]]]:
@@ -207,9 +212,14 @@ def make_variants(
         )
     for name, values in sweep.items():
         _require_iterable(name, values)
-    values_by_name: dict[str, list[Any]] = {"seeds": list(seeds)} | {
-        name: list(values) for name, values in sweep.items()
+    values_by_name: dict[str, list[Any]] = {
+        name: list(itertools.islice(values, MAX_TRAININGS + 1)) for name, values in {"seeds": seeds, **sweep}.items()
     }
+    if (n := math.prod(map(len, values_by_name.values()))) > MAX_TRAININGS:
+        raise ConfigError(
+            f"expected at most {MAX_TRAININGS} trainings in one program, got {n} or more of seeds and values. Use "
+            f"several calls."
+        )
     for name, values in values_by_name.items():
         if not values or len(set(map(str, values))) < len(values):
             raise ConfigError(

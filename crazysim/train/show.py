@@ -21,7 +21,7 @@ from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points, draw_text
-from crazysim.storage import as_path, wrap_read_errors, write_figure
+from crazysim.storage import MAX_TEXT_BYTES, as_path, open_file, wrap_read_errors, write_figure
 from crazysim.train.evaluation import TERM_PREFIX, act, as_tree, fly_episodes, held_out_key, initial_memory
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
@@ -208,7 +208,8 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
     """
     path = as_path(folder) / CURVE_FILE
     with wrap_read_errors(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
-        curve = json.loads(path.read_bytes())
+        with open_file(path, MAX_TEXT_BYTES) as file:
+            curve = json.load(file)
         return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
 
 

@@ -35,7 +35,7 @@ from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError, require_callable, warn
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
-from crazysim.storage import as_path, make_folder, open_replacement, write_file
+from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, open_replacement, read_text, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
@@ -514,7 +514,7 @@ def load_policy(
         raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {folder.parent}.")
     path = folder / POLICY_FILE
     if not path.exists() and (folder / TABLE_FILE).exists():
-        names = [row["name"] for row in json.loads((folder / TABLE_FILE).read_text())]
+        names = [row["name"] for row in json.loads(read_text(folder / TABLE_FILE, MAX_TEXT_BYTES))]
         raise ConfigError(
             f"expected the folder of one training, got {str(folder)!r} with several. Use one of its folders: "
             f"{', '.join(names)}."

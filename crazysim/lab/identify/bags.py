@@ -19,7 +19,7 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.identify.columns import Columns, without_huge_numbers
 from crazysim.lab.identify.readers import Stream, resample
-from crazysim.storage import read_text
+from crazysim.storage import check_file, read_text
 
 XYZ, XYZW = "xyz", "xyzw"
 POSE_FIELDS = {
@@ -53,6 +53,7 @@ class _BagPath(type(Path())):
     def open(self, *args: Any, **kwargs: Any) -> Any:
         """Open the file for reading."""
         del args, kwargs
+        check_file(self)
         return _BagFile(io.FileIO(self))
 
     def read_text(self, *args: Any, **kwargs: Any) -> str:

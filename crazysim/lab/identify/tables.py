@@ -18,7 +18,7 @@ from crazysim.lab.identify.delimited import read_delimited
 from crazysim.lab.identify.readers import read_crazyflie
 from crazysim.lab.identify.repairs import check_period
 from crazysim.lab.identify.ulog import read_ulog
-from crazysim.storage import read_arrays, wrap_read_errors
+from crazysim.storage import check_file, read_arrays, wrap_read_errors
 
 MAX_LOG_BYTES = 2**31
 """Largest log file, bytes. ROS bags have no limit, since they are not read into memory as a whole."""
@@ -57,6 +57,8 @@ def _read_source(
     if isinstance(source, Mapping):
         return "log", _convert_time("log", source, columns)
     path = Path(source)
+    if path.exists() and not path.is_dir():
+        check_file(path)
     if is_bag(path) and path.exists():
         with wrap_read_errors(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
             return path.stem, read_bag(path, repairs, columns)

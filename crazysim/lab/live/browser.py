@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.errors import ConfigError, RenderError, address_message
+from crazysim.errors import ConfigError
 from crazysim.lab.live.browser_panel import BrowserPanel
 from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
@@ -21,7 +20,7 @@ from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, start_guarded_server
-from crazysim.media.web import FOV, free_port, import_viser
+from crazysim.media.web import FOV, import_viser, require_free_port
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -102,7 +101,7 @@ class Browser(Viewer[Live]):
         viser, sim = import_viser(), live.sim
         worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
         access = self._access
-        access.port = _require_free_port(access.host, access.port)
+        access.port = require_free_port(access.host, access.port)
         if access.host not in LOOPBACK_ADDRESSES:
             log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
                         "watch and command the simulation", access.host, access.port)  # fmt: skip
@@ -161,21 +160,3 @@ class Browser(Viewer[Live]):
                 stop_thread = threading.Thread(target=server.stop, daemon=True)
                 stop_thread.start()
                 stop_thread.join(CLOSE_TIMEOUT)
-
-
-def _require_free_port(host: str, port: int) -> int:
-    """Return ``port`` if it is free, and any free port for 0; viser itself would silently use another port.
-
-    Raises:
-        RenderError: If the port is in use or does not exist.
-    """
-    if port == 0:
-        return free_port()
-    try:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-            probe.listen()
-    except (OSError, OverflowError) as error:
-        raise RenderError(address_message(host, port, error)) from error
-    return port

@@ -8,8 +8,9 @@ from pathlib import Path
 from crazysim.errors import ConfigError
 from crazysim.lab.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.lab.show_files.show_trajectory import format_trajectory
-from crazysim.storage import Closeable
+from crazysim.storage import Closeable, read_bytes
 from crazysim.trajectories import Trajectory
+from crazysim.trajectories.files.checks import MAX_FILE_BYTES
 
 
 class _Client(Closeable):
@@ -129,7 +130,7 @@ class StreamClient(_Client):
 
     def load_show(self, path: str | Path) -> None:
         """Send the show of a ``.skyc`` file."""
-        self.send(Path(path).read_bytes() + b"SKYC")
+        self.send(read_bytes(path, MAX_FILE_BYTES) + b"SKYC")
 
     def start_show(self) -> None:
         """Start the trajectories of all drones that have received one."""

@@ -23,7 +23,7 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import FLOOR, GoalTask
 from crazysim.errors import ConfigError
 from crazysim.lab.live.loop import Live
-from crazysim.storage import wrap_read_errors
+from crazysim.storage import MAX_TEXT_BYTES, open_file, wrap_read_errors
 from crazysim.train.evaluation import act, initial_memory
 from crazysim.train.interface import check_policy
 
@@ -224,8 +224,9 @@ def read_points(path: str | Path) -> NDArray:
     Raises:
         ConfigError: If the file does not exist, or a line is not a point.
     """
-    with wrap_read_errors(path, "a list of points", "Write x,y,z in each line, m."):
-        lines = Path(path).read_text().splitlines()
+    errors = wrap_read_errors(path, "a list of points", "Write x,y,z in each line, m.")
+    with errors, open_file(path, MAX_TEXT_BYTES) as file:
+        lines = file.read().decode("utf-8-sig").splitlines()
     points = []
     for number, line in enumerate(lines, 1):
         if text := line.partition("#")[0].strip():

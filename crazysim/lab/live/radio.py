@@ -22,6 +22,7 @@ from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
 from crazysim.storage import Closeable
+from crazysim.tables import TIMEOUT_RANGE, read_number
 
 LOG_VARIABLES = {
     "pos": ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
@@ -71,6 +72,7 @@ class Radio(Closeable):
         Raises:
             ConfigError: If ``arm`` is True, and cflib is not installed or the drone does not answer.
         """
+        read_number("timeout", timeout, TIMEOUT_RANGE)
         self.name, self.armed, self.max_height = uri, bool(arm), max_height
         loaded_airframe = load_airframe(airframe)
         self._max_thrust = loaded_airframe.n_rotors * float(np.max(loaded_airframe.value("rotors.thrust_max")))

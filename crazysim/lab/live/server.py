@@ -18,6 +18,7 @@ from crazysim.errors import ConfigError, address_message
 from crazysim.lab.live.commands import Command, parse_command
 from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 from crazysim.storage import Closeable
+from crazysim.tables import TIMEOUT_RANGE, read_number
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
 """Ports for commands to single drones and for the stream to all drones, as in AIMotionLab's test server,
@@ -93,7 +94,7 @@ class CommandServer(CommandQueue):
             ConfigError: If it cannot listen there.
         """
         super().__init__()
-        self.drones, self.timeout = frozenset(drones), timeout
+        self.drones, self.timeout = frozenset(drones), read_number("timeout", timeout, TIMEOUT_RANGE)
         self._claimed_drones: set[int] = set()
         self._lock = threading.Lock()
         self._stop_event = threading.Event()
@@ -195,7 +196,7 @@ class StreamListener(CommandQueue):
         super().__init__()
         self._stop_event = threading.Event()
         self._peer = connect(host, port, timeout)
-        self._timeout = timeout
+        self._timeout = float(timeout)
         self._thread = threading.Thread(target=self._listen, args=(f"{host}:{port}",), daemon=True)
         self._thread.start()
 
@@ -225,8 +226,9 @@ def connect(host: str, port: int, timeout: float) -> socket.socket:
     """Return a connection.
 
     Raises:
-        ConfigError: If there is no server.
+        ConfigError: If the timeout is out of range, or there is no server.
     """
+    read_number("timeout", timeout, TIMEOUT_RANGE)
     try:
         return socket.create_connection((host, port), timeout)
     except (OSError, OverflowError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
+from crazysim.storage import read_text
 from crazysim.tables import POSITIVE, read_numbers
 
 VOXEL_EDGE = 0.01
@@ -70,6 +71,10 @@ class JetTable(NamedTuple):
         return JetTable(speeds, arrays.get("pressure"), arrays.get("velocity"), origin, np.broadcast_to(spacing, (3,)))
 
 
+MAX_TABLE_BYTES = 2**28
+"""Largest file of a table, bytes."""
+
+
 def load_jet_table(
     folder: str | Path,
     shape: tuple[int, int, int] | None = None,
@@ -103,8 +108,8 @@ def load_jet_table(
     rows_by_speed: dict[int, dict[int, np.ndarray]] = {1: {}, 3: {}}
     for path, speed in path_speeds:
         try:
-            rows = np.loadtxt(path, ndmin=2)
-        except (ValueError, OSError) as error:
+            rows = np.loadtxt(read_text(path, MAX_TABLE_BYTES).splitlines(), ndmin=2)
+        except ValueError as error:
             raise ConfigError(f"expected a table of numbers in {str(path)!r}, got: {error}") from error
         if rows.shape[1] not in rows_by_speed:
             raise ConfigError(f"expected one or three columns in {str(path)!r}, got {rows.shape[1]}")

@@ -12,6 +12,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.crazyflie_py.crazyflie import CrazyflieServer, TimeHelper
 from crazysim.lab.live.swarm import Swarm
 from crazysim.sim.sim import Sim
+from crazysim.storage import MAX_TEXT_BYTES, read_text
 
 CONFIGURATION_FILE = Path("crazyflies.yaml")
 """File in the working directory that describes the drones of ``Crazyswarm()``; optional."""
@@ -66,7 +67,7 @@ def _create_simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[S
                 "crazyflies.yaml needs PyYAML, which is not installed. Run pip install pyyaml."
             ) from error
         try:
-            configuration = yaml.safe_load(Path(configuration).read_text())
+            configuration = yaml.safe_load(read_text(configuration, MAX_TEXT_BYTES))
         except (OSError, yaml.YAMLError) as error:
             raise ConfigError(f"expected a crazyflies.yaml, got {str(configuration)!r}: {error}") from error
     robots = (configuration or {}).get("robots", {"cf1": {"initial_position": [0.0, 0.0, 0.0]}})  # type: ignore[union-attr]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.host_trajectory import HostTrajectory
+from crazysim.storage import MAX_TEXT_BYTES, read_text
 
 
 class Polynomial:
@@ -72,8 +73,9 @@ class Trajectory:
             ConfigError: If the file has another format.
         """
         try:
-            rows = np.loadtxt(filename, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
-        except (OSError, ValueError) as error:
+            lines = read_text(filename, MAX_TEXT_BYTES).splitlines()
+            rows = np.loadtxt(lines, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
+        except ValueError as error:
             raise ConfigError(f"expected rows of 33 numbers in {str(filename)!r}, got: {error}") from error
         if not len(rows) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
             raise ConfigError(f"expected finite numbers and positive durations in {str(filename)!r}")

@@ -24,8 +24,6 @@ MAX_PORT = 65535
 """Largest number of a port."""
 MAX_DRAIN_TIME = 0.1
 """Longest time for reading the waiting packets after the timeout, s, even if more keep arriving."""
-TIMEOUT_RANGE = range_between(high=1e6, positive=True)
-"""Allowed range of a timeout, s."""
 
 
 class FirmwareLink(Closeable):

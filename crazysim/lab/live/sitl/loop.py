@@ -18,14 +18,14 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.pace import Pace, Speed
-from crazysim.lab.live.sitl.link import ROUNDING_TOLERANCE, TIMEOUT_RANGE, FirmwareLink
+from crazysim.lab.live.sitl.link import ROUNDING_TOLERANCE, FirmwareLink
 from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.lab.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
 from crazysim.storage import Closeable
-from crazysim.tables import NOT_NEGATIVE, read_number
+from crazysim.tables import NOT_NEGATIVE, TIMEOUT_RANGE, read_number
 
 MAGNETIC_FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field without a ``Magnetometer``, world frame, T: roughly the field in central Europe."""

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, not_installed
-from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, TIMEOUT_RANGE, FirmwareLink, check_address
+from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, FirmwareLink, check_address
 from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, check_origin, to_frd, to_ned, to_ned_quat
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.tables import read_number
+from crazysim.tables import TIMEOUT_RANGE, read_number
 
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
