@@ -78,6 +78,8 @@ def import_required_packages() -> None:
     for name, import_package in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
         try:
             import_package()
+        except Warning:  # an error only where the user wants it, and its text says enough
+            raise
         except Exception as error:  # a damaged package can raise any error
             reason = str(error).strip().partition("\n")[0][:300]
             text = (

@@ -55,3 +55,11 @@ def test_the_log_of_xla_is_quiet_unless_chosen(monkeypatch):
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
     startup.set_variables()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
+
+
+def test_warnings_as_errors_blame_the_variable_and_no_package():
+    environment = os.environ | {"MUJOCO_GL": "nope"}
+    program = [sys.executable, "-W", "error::UserWarning", "-c", "import crazysim"]
+    result = subprocess.run(program, env=environment, capture_output=True, text=True)
+    assert "expected a MUJOCO_GL that MuJoCo can use, got 'nope'" in result.stderr
+    assert "Install it again" not in result.stderr

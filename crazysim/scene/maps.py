@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_rgba, positive_integer
 from crazysim.errors import ConfigError, short_repr
 from crazysim.scene.map_files import MapFile, read_map
@@ -69,7 +70,8 @@ def map_spec(
         max_voxels = MAX_UNSCALED_VOXELS if scale is None else MAX_VOXELS
         label = f"voxels of {resolution:g} m near triangles"
         _check_count(label, count_candidates(corners, resolution), max_voxels, remedy)
-        voxels = voxels_of_triangles(corners, resolution)
+        with announce_if_slow("finding the voxels of triangles", "up to 2 minutes for large meshes"):
+            voxels = voxels_of_triangles(corners, resolution)
     boxes = merge_voxels(voxels)
     if len(boxes) > MAX_BOXES:
         raise ConfigError(
