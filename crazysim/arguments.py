@@ -72,11 +72,11 @@ def check_value(
     """
     if not value_types or (value is None and type(None) in value_types):
         return
-    value_types = set(value_types) - {type(None)}
-    classes, numeric_types = tuple(value_types - NUMERIC_TYPES), value_types & NUMERIC_TYPES
-    if value_types == {bool}:
+    kinds = set(value_types) - {type(None)}
+    classes, numeric_types = tuple(kinds - NUMERIC_TYPES), kinds & NUMERIC_TYPES
+    if kinds == {bool}:
         check_flag(name, value)
-    elif value_types == {NumbersByName}:
+    elif kinds == {NumbersByName}:
         if not isinstance(value, Mapping):
             raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
         for key, item in value.items():
@@ -84,7 +84,7 @@ def check_value(
     elif numeric_types and not isinstance(value, classes):
         read_numbers(name, value, allowed, shapes, whole=whole or numeric_types == {int}, remedy=remedy)
     elif not isinstance(value, classes):
-        names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in value_types))
+        names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
         raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -34,6 +35,24 @@ def jit_eager_calls(*static: str) -> Callable[[F], F]:
         return call  # type: ignore[return-value]
 
     return decorate
+
+
+@contextlib.contextmanager
+def explain_traced_values(title: str) -> Iterator[None]:
+    """Add the remedy to JAX's error about a traced value in a Python ``if``, ``while``, ``int`` or array of NumPy."""
+    try:
+        yield
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        if not any("jnp.where" in note for note in getattr(error, "__notes__", ())):
+            error.add_note(
+                f"in {title}, which is compiled for all worlds at once: a value is not known yet. Use "
+                "jnp.where(condition, x, y) in place of a Python if, and jnp in place of np or math."
+            )
+        raise
 
 
 def fetch_rows(x: Any, rows: Any) -> NDArray:

@@ -29,6 +29,7 @@ replaced if a release removed it, and whether the replacement is implemented:
   of texts, and the variables of SLURM. Not implemented.
 - **jax.experimental.multihost_utils** (``gather_from_hosts``, ``broadcast_from_first``): programs with replicated
   results. Not implemented.
+- **backends_are_initialized** (``require_unforked_process``): a flag that the first call sets. Not implemented.
 - **_cache_size** (``n_compilations``): a counter in the traced function. Not implemented.
 
 ``CRAZYSIM_JAX_FALLBACKS=1`` selects all fallbacks, to try them.
@@ -55,7 +56,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, ja
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
 from jax.interpreters import ad, batching, mlir
 
-from crazysim.errors import UnsupportedError
+from crazysim.errors import ConfigError, UnsupportedError
 
 try:
     from jaxlib.xla_client import batched_device_put
@@ -103,6 +104,7 @@ __all__ = [
     "put_host_array",
     "read_equation",
     "register_target",
+    "require_unforked_process",
     "select_inputs",
     "set_xla_log_level",
     "threefry2x32_p",
@@ -647,3 +649,30 @@ def is_stop_requested(step: int) -> bool:
     All hosts must call it at every step.
     """
     return multihost_utils.reached_preemption_sync_point(step)
+
+
+# Processes ------------------------------------------------------------------------------------------------------
+
+
+def require_unforked_process() -> None:
+    """Check that this process was not forked from one that had used JAX, whose threads are missing in the copy."""
+    if _forked_after_use:
+        raise ConfigError(
+            "expected a process in which JAX can run, got one that was forked after JAX had been used: its calls would "
+            "hang. Start processes by 'spawn', such as multiprocessing.get_context('spawn') or "
+            "SubprocVecEnv(..., start_method='spawn'), or put all worlds into one environment, such as "
+            "gymnasium.make_vec(id, num_envs=64)."
+        )
+
+
+def _note_fork() -> None:
+    from jax._src import xla_bridge
+
+    if xla_bridge.backends_are_initialized():
+        _forked_after_use.append(os.getpid())
+
+
+_forked_after_use: list[int] = []
+"""This process's id if it was forked from one that had used JAX."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)

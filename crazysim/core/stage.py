@@ -16,6 +16,7 @@ from jax import Array
 from crazysim.arguments import check_arguments
 from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import MEMBER_AXIS
+from crazysim.eager import explain_traced_values
 from crazysim.errors import ConfigError
 from crazysim.pytree import (
     PyTree,
@@ -87,7 +88,8 @@ class Stage:
         Args:
             data: Data as the function takes it: of one unit of the scope, or with any leading axes if ``batched``.
         """
-        data_after = self.fn(data)
+        with explain_traced_values(f"stage {self.__name__!r}"):
+            data_after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
             return data_after
@@ -275,7 +277,8 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
         result_structure: dict[str, Any] = {}
 
         def apply_to_world(values: list[Any]) -> list[Any]:
-            result = fn(*treedef.unflatten(values))
+            with explain_traced_values(f"{getattr(fn, '__qualname__', fn)!r}"):
+                result = fn(*treedef.unflatten(values))
             paths, result_structure["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             result_structure["scopes"] = result_scopes = _leaf_scopes(result)
             # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. If two shared

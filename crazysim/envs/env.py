@@ -32,6 +32,7 @@ from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError, short_repr
+from crazysim.jaxcompat import require_unforked_process
 from crazysim.pytree import leaf_indices
 from crazysim.sim.configuration import describe_data
 from crazysim.sim.sim import Sim
@@ -134,6 +135,7 @@ class Env(ABC):
                 that is not finite. A compiled reset, such as ``jax.jit(env.reset)``, cannot raise an error for such a
                 state: the episode then ends at its first step, with ``info["nonfinite"]``.
         """
+        require_unforked_process()
         check_key(key)
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
         with use_device_of(key):

@@ -90,7 +90,7 @@ ENTRY_POINTS = "crazysim.tasks"
 
 RANDOMIZATIONS = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
 """Ready-made ranges of randomisation, by name."""
-SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
+SIM_OPTIONS = tuple(name for name in inspect.signature(Sim).parameters if name not in ("n_worlds", "freq"))
 """Options of ``make`` that are passed to ``Sim``."""
 
 
@@ -105,6 +105,7 @@ def make(
     randomize: str | None = None,
     camera: ImageSensor | Sequence[ImageSensor] | None = None,
     depth_image: Sequence[int] | None = None,
+    sim_freq: int = 500,
     **options: Any,
 ) -> Env:
     """Return an environment of many worlds of a task, with a new simulation.
@@ -125,6 +126,7 @@ def make(
             no images.
         depth_image: Width and height in pixels of depth images, which are an additional observation ``"depth"``. A
             ``Camera`` takes them in every step, instead of the camera of the task. None for no such images.
+        sim_freq: Physics steps per second, Hz, the ``freq`` of ``Sim``.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and settings of the task, such as ``seconds``, which ``help(crazysim.envs.TASKS[name].task)`` lists.
     """
@@ -151,7 +153,7 @@ def make(
                 f"Use effects=[Randomize(...)] for other ranges."
             )
         plugins.append(RANDOMIZATIONS[randomize]())
-    sim = Sim(n_worlds=n_worlds, **settings)
+    sim = Sim(n_worlds=n_worlds, freq=sim_freq, **settings)
     repeated_names = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
     if repeated_names:
         raise ConfigError(

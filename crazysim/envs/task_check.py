@@ -14,6 +14,7 @@ from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
 from crazysim.core.sharding import fetch_arrays
+from crazysim.eager import explain_traced_values
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.errors import ConfigError
@@ -115,12 +116,13 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     batch, batch_name = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
-    obs, rewards, terminated, error, info = jax.eval_shape(
-        lambda data, action: (
-            task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data),
-            task.info(data),
-        ), world, action,
-    )  # fmt: skip
+    with explain_traced_values(title):
+        obs, rewards, terminated, error, info = jax.eval_shape(
+            lambda data, action: (
+                task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data),
+                task.info(data),
+            ), world, action,
+        )  # fmt: skip
 
     for method, result in (("observe", obs), ("rewards", rewards)):
         if not isinstance(result, Mapping) or not result:

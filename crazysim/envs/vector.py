@@ -23,6 +23,7 @@ from crazysim.envs.state import EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError, short_repr
+from crazysim.jaxcompat import require_unforked_process
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -98,6 +99,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
         seed = as_seed(seed)
+        require_unforked_process()
         state_before = self.state
         if mask is not None and seed is not None:
             raise ConfigError(

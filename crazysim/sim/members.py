@@ -21,6 +21,7 @@ from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import is_on_host, jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import PluginRegistry
 from crazysim.pytree import PyTree
 
@@ -37,6 +38,7 @@ def locked(method: Method) -> Method:
 
     @functools.wraps(method)
     def locked_method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        require_unforked_process()
         with self.lock:
             return method(self, *args, **kwargs)
 

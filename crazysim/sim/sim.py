@@ -34,6 +34,7 @@ from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import KeepFunction, Policy, get_states, run_rollout
 from crazysim.errors import ConfigError, short_repr
+from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
 from crazysim.scene import mjx
@@ -147,6 +148,7 @@ class Sim:
                 state of a plugin depends on the drones' poses, such as that of a load, place the drones first, and then
                 call ``add``.
         """
+        require_unforked_process()
         rates = {
             Control.state: state_freq,
             Control.attitude: attitude_freq,
@@ -238,6 +240,13 @@ class Sim:
         for plugin in plugins:
             sim.add(plugin)
         return sim
+
+    def __getstate__(self) -> Any:
+        """Refuse to be pickled or copied: compiled programs, locks and MuJoCo's scene cannot be."""
+        raise TypeError(
+            "expected an object that can be pickled or copied, got a simulation, or an environment with one. Make it "
+            "again with the same settings, and pickle or copy its data: sim.data, or the state of an environment."
+        )
 
     @property
     def airframe(self) -> Airframe:

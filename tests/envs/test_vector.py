@@ -214,7 +214,7 @@ def test_wrong_resets_are_errors(next_step, kwargs, error, message):
         ({"render_size": 480}, "expected render_size as width and height"),
         ({"numpy": "no"}, "expected numpy as True or False, got 'no'"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
-        ({"color": "red"}, "effects, randomize, camera, depth_image; the simulation has"),
+        ({"color": "red"}, "effects, randomize, camera, depth_image, sim_freq; the simulation has"),
         ({"n_world": 2}, "did you mean n_worlds"),
         ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
         ({"seconds": 2.0, "max_episode_steps": 5}, "expected max_episode_steps or seconds, got 5 and 2.0: both"),

@@ -5,8 +5,12 @@ of plugins and tasks.
 """
 
 import contextlib
+import copy
 import dataclasses
 import functools
+import inspect
+import os
+import pickle
 import signal
 import traceback
 import warnings
@@ -27,9 +31,10 @@ import crazysim
 from crazysim import MPPI, ConfigError, Sim, SlungLoad, Wind, envs, load_airframe, trajectories
 from crazysim.core import functional as F
 from crazysim.drones import estimate_airframe
-from crazysim.envs import DroneSingleEnv, DroneVectorEnv, make
+from crazysim.envs import DroneSingleEnv, DroneVectorEnv, make, registry
 from crazysim.envs.brax import BraxEnv
 from crazysim.envs.pettingzoo import DroneParallelEnv
+from crazysim.envs.tasks.hover import Hover
 from crazysim.geometry import Shape, hfield, hull
 from crazysim.lab.identify import read_log
 from crazysim.media import Flight, Recorder, Trail, View, flight_of
@@ -342,3 +347,83 @@ def test_any_argument_is_taken_or_refused_with_what_was_expected(label, data):
     name, value = data.draw(st.sampled_from(sorted(arguments))), data.draw(ANY_VALUE)
     fault = describe_fault(call, arguments | {name: value})
     assert fault is None, f"{label}({name}={value!r}): {fault}"
+
+
+def test_a_process_that_was_forked_after_a_call_of_jax_refuses_with_the_remedy():
+    """Its calls would hang; gymnasium.make_vec(..., vectorization_mode="async") starts such processes."""
+    calls = (Sim, lambda: sim().step(), lambda: env().reset(jax.random.key(0)), lambda: adapter(DroneVectorEnv).reset())
+    adapter(DroneVectorEnv)
+    sim()
+    reader, writer = os.pipe()
+    with pytest.warns(RuntimeWarning, match="fork"):
+        child = os.fork()
+    if child == 0:
+        texts = []
+        for call in calls:
+            try:
+                call()
+            except Exception as error:
+                texts.append(str(error))
+        os.write(writer, "\n".join(texts).encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    os.close(writer)
+    with open(reader) as pipe:
+        texts = pipe.read().splitlines()
+    assert [("spawn" in text, "make_vec" in text) for text in texts] == [(True, True)] * len(calls)
+
+
+@pytest.mark.parametrize("copying", [pickle.dumps, copy.deepcopy])
+@pytest.mark.parametrize("make_one", [sim, env, functools.partial(adapter, DroneVectorEnv),
+    functools.partial(adapter, DroneSingleEnv), functools.partial(adapter, DroneParallelEnv)])  # fmt: skip
+def test_a_copy_of_a_simulation_is_refused_with_the_remedy(copying, make_one):
+    with pytest.raises(TypeError, match=r"Make it again with the same settings, .*sim.data"):
+        copying(make_one())
+
+
+def test_states_and_tasks_can_be_pickled_and_copied():
+    for value in (state(), sim().data, env().task, load_airframe("cf21B_500")):
+        assert jax.tree.structure(pickle.loads(pickle.dumps(value))) == jax.tree.structure(copy.deepcopy(value))
+
+
+def test_every_option_of_the_simulation_can_be_set_by_make():
+    defaults = {name: p.default for name, p in inspect.signature(Sim).parameters.items()}
+    for name in registry.SIM_OPTIONS:
+        assert make("hover", **{name: defaults[name]}).sim.n_worlds == 1
+    assert make("hover", sim_freq=1000).sim.freq == 1000
+    with pytest.raises(ConfigError, match="sim_freq") as error:
+        make("hover", foo=1)
+    assert "n_worlds, n_drones" not in str(error.value)
+
+
+class Branching(Hover):
+    """A task with a Python ``if`` on a traced value."""
+
+    def observe(self, data):
+        return super().observe(data) if data.states.pos[0, 2] > 0 else {}
+
+
+def branching_stage(data):
+    return data if data.states.pos[0] > 0 else data.replace()
+
+
+def branch_in_stage():
+    sim = Sim()
+    sim.step_pipeline = sim.step_pipeline | {"branch": crazysim.stage("drone")(branching_stage)}
+    sim.step()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: make(Branching()),
+        branch_in_stage,
+        lambda: envs.Observe(env(), lambda obs, data: obs if obs["pos"][0, 0] > 0 else {}).reset(jax.random.key(0)),
+        lambda: envs.Observe(env(), lambda obs, data: {"a": np.sin(obs["pos"])}).reset(jax.random.key(0)),
+    ],
+    ids=["task", "stage", "wrapper", "NumPy"],
+)
+def test_a_python_branch_on_a_traced_value_is_explained(call):
+    with pytest.raises(TypeError) as error:
+        call()
+    assert "jnp.where" in "".join(error.value.__notes__)

@@ -9,6 +9,7 @@ import jax
 
 from crazysim import jaxcompat
 from crazysim.core.stage import Axes, Stage
+from crazysim.eager import explain_traced_values
 from crazysim.engine.ir import dump
 
 
@@ -29,7 +30,8 @@ class TracedStage:
         """Indices of the leaves that it writes: the outputs of ``fn``."""
 
         def apply(values: list[Any]) -> list[Any]:
-            data_after = stage.fn(axes.treedef.unflatten(values))
+            with explain_traced_values(f"stage {stage.__name__!r}"):
+                data_after = stage.fn(axes.treedef.unflatten(values))
             self.written_leaves = axes.written_leaves(values, data_after, stage)
             leaves_after = jax.tree.leaves(data_after)
             return [leaves_after[i] for i in self.written_leaves]
