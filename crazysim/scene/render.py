@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Mapping
 
@@ -10,6 +11,7 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim import startup
 from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, RenderError, UnknownNameError, short_repr
 from crazysim.scene.overlays import Overlays
@@ -131,15 +133,30 @@ class ModelRenderer:
                         f"expected an image of a size that OpenGL can draw here, got {width} x {height} pixels: "
                         f"{error}. Use a smaller one."
                     ) from error
-                raise RenderError(
-                    f"expected a working OpenGL, got {type(error).__name__}: {error}. On a machine without a screen "
-                    f"set MUJOCO_GL=egl and install libegl1 and Mesa's drivers (Debian: apt-get install libegl1 "
-                    f"libgl1-mesa-dri)."
-                ) from error
+                raise RenderError(_opengl_message(error)) from error
             self._renderers[width, height] = renderer
             if len(self._renderers) > MAX_SIZES:
                 self._renderers.pop(next(iter(self._renderers))).close()
         return self._renderers[width, height]
+
+
+def _opengl_message(error: Exception) -> str:
+    """Return why MuJoCo cannot draw; it chooses a way to draw when it is imported, from ``MUJOCO_GL``."""
+    from mujoco.rendering.classic import gl_context
+
+    wanted = startup.refused_variables.get("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
+    context = getattr(gl_context, "GLContext", None)
+    if context is None or context.__module__ == gl_context.__name__:  # a placeholder
+        return f"expected a MUJOCO_GL with which MuJoCo can draw, got {wanted!r}. Use MUJOCO_GL=egl."
+    if wanted.lower() == "egl" and not context.__module__.endswith("egl"):
+        return (
+            f"expected MuJoCo to draw with MUJOCO_GL=egl, got {context.__module__}: MuJoCo was imported before the "
+            f"variable was set. Import crazysim before mujoco, or set MUJOCO_GL=egl before Python starts."
+        )
+    return (
+        f"expected a working OpenGL, got {type(error).__name__}: {error}. On a machine without a screen set "
+        f"MUJOCO_GL=egl and install libegl1 and Mesa's drivers (Debian: apt-get install libegl1 libgl1-mesa-dri)."
+    )
 
 
 def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
