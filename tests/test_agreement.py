@@ -6,7 +6,9 @@
 import importlib
 import pkgutil
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import sweep
 from cases import COMPILED_ENGINES
@@ -35,6 +37,15 @@ def test_every_engine_agrees_with_plain(name):
 @pytest.mark.parametrize("name", LONG_ON_LANES)
 def test_long_programs_on_lanes_agree_with_plain(name):
     compare(name, ["lanes"])
+
+
+@pytest.mark.long("lowers contacts of loads, and a height field")
+@pytest.mark.parametrize("name", ["load", "terrain"])
+def test_counters_and_indices_have_a_kernel_in_float64(name, x64):
+    """Kernels have no integers of 64 bits, which JAX counts with where float64 is enabled: a warning is an error."""
+    sim = sweep.CASES[name]()
+    data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, sim.data)
+    assert Step(sim.step_pipeline).plan(data).engine == COMPILED_ENGINES[-1]
 
 
 def compare(name, engines):

@@ -104,8 +104,8 @@ def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
         cell = jnp.floor((lax.stop_gradient(coordinate) + half) / side).astype(jnp.int32)
         starts.append(jnp.clip(cell - n_neighbours, 0, n - count))
         counts.append(count + 1)
-    rows = starts[0][..., None, None] + jnp.arange(counts[0])[:, None]
-    columns = starts[1][..., None, None] + jnp.arange(counts[1])
+    rows = starts[0][..., None, None] + jnp.arange(counts[0], dtype=jnp.int32)[:, None]
+    columns = starts[1][..., None, None] + jnp.arange(counts[1], dtype=jnp.int32)
     rows, columns = jnp.broadcast_arrays(rows, columns)
     dtype = position.x.dtype
     side_x, side_y = cell_sides(shape)

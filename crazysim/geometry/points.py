@@ -163,8 +163,9 @@ def triangles_distance(point: Vector, a: Vector, b: Vector, c: Vector) -> Array:
     constant_point = Vector(constant_point.x[..., None], constant_point.y[..., None], constant_point.z[..., None])
     a, b, c = a - constant_point, b - constant_point, c - constant_point
     nearest_points = from_barycentric(closest_point(a, b, c), a, b, c)
-    nearest = jnp.argmin(nearest_points.dot(nearest_points), axis=-1)
-    is_nearest = jnp.arange(nearest_points.x.shape[-1]) == nearest[..., None]
+    squares = nearest_points.dot(nearest_points)
+    nearest = lax.argmin(squares, squares.ndim - 1, np.int32)
+    is_nearest = jnp.arange(squares.shape[-1], dtype=np.int32) == nearest[..., None]
     nearest_points = Vector(
         *(
             jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1)

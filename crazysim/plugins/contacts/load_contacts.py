@@ -172,8 +172,8 @@ def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material
         for a, b in index_pairs
     }
     n_touches: list[Any] = [
-        sum(pairs.is_touching.sum(axis=1) for (a, _), pairs in contacts.items() if a == k)
-        + sum(pairs.is_touching.sum(axis=0) for (_, b), pairs in contacts.items() if b == k)
+        sum(pairs.is_touching.sum(axis=1, dtype=np.int32) for (a, _), pairs in contacts.items() if a == k)
+        + sum(pairs.is_touching.sum(axis=0, dtype=np.int32) for (_, b), pairs in contacts.items() if b == k)
         for k in range(len(colliders))
     ]
     changes: list[Array | float] = [0.0] * len(colliders)
