@@ -81,7 +81,7 @@ class RotorJet(Plugin):
 
     def record(self, sim: Simulation) -> RotorJetData:
         require_rotors(sim, "the jet of rotors")
-        self._loads(sim)
+        self.check_plugins(sim)
         table = None if self.table is None else self.table.checked()
         radius = checked_propeller_radius(sim, self.propeller_radius)
         names = ("speeds", "pressure", "velocity", "origin", "spacing")
@@ -91,14 +91,15 @@ class RotorJet(Plugin):
             sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared_values
         )
 
+    def check_plugins(self, sim: Simulation) -> None:
+        self._loads(sim)
+
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         loads, shape = self._loads(sim), self._loads(sim).shape()
         edge = 2 * max(shape.size) / PANELS_PER_LENGTH if self.panel is None else self.panel
         panels = shape_panels(shape, edge)
 
         def apply_jets(data: SimData) -> SimData:
-            if self.load not in data.plugins:
-                return self.write(data, without_wrench(self.read(data)))
             record, body, s = self.read(data), loads.body(data), data.states
             arm = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.pos, s.pos.dtype))
             normal = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.normal, s.pos.dtype))
@@ -132,11 +133,6 @@ class RotorJet(Plugin):
                 f"SlungLoad or Hook."
             )
         return loads[0]
-
-
-def without_wrench(record: RotorJetData) -> RotorJetData:
-    """Return the record without a wrench, for loads that were removed."""
-    return record.replace(force=jnp.zeros_like(record.force), torque=jnp.zeros_like(record.torque))
 
 
 def jet_force(data: SimData, name: str) -> Array | None:

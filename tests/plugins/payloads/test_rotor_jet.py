@@ -262,10 +262,12 @@ def test_law_09_wrong_settings():
         fitted.add(RotorJet())
 
 
-def test_a_jet_without_its_load_has_no_force():
+def test_the_load_of_a_jet_is_removed_after_the_jet():
     sim, plugin = build()
+    with pytest.raises(ConfigError, match=r"Use sim.remove\('rotor_jet'\) first"):
+        sim.remove("load")
     sim.step()
     assert np.asarray(plugin.read(sim.data).force).any()
+    sim.remove("rotor_jet")
     sim.remove("load")
     sim.step()
-    assert not np.asarray(plugin.read(sim.data).force).any()
