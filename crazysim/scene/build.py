@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -38,6 +39,7 @@ def build_spec(
     Raises:
         ConfigError: If the file does not exist, cannot be read, or has names that are reserved for drones.
     """
+    _handle_warnings_of_mujoco()
     spec = xml_path if isinstance(xml_path, mujoco.MjSpec) else read_spec(xml_path)
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
@@ -88,22 +90,21 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     if n_drones <= DRONES_PER_CHUNK:
         _add_bodies(spec, airframes, range(n_drones))
         return
-    with _suppress_attach_warnings():
-        for first in range(0, n_drones, DRONES_PER_CHUNK):
-            chunk = mujoco.MjSpec()
-            _add_bodies(chunk, airframes, range(first, min(first + DRONES_PER_CHUNK, n_drones)))
-            spec.attach(chunk, prefix="", frame=spec.worldbody.add_frame())
+    for first in range(0, n_drones, DRONES_PER_CHUNK):
+        chunk = mujoco.MjSpec()
+        _add_bodies(chunk, airframes, range(first, min(first + DRONES_PER_CHUNK, n_drones)))
+        spec.attach(chunk, prefix="", frame=spec.worldbody.add_frame())
 
 
-@contextlib.contextmanager
-def _suppress_attach_warnings() -> Iterator[None]:
-    """Suppress MuJoCo's warning that attached names have no prefix, on the terminal and in ``MUJOCO_LOG.TXT``."""
-    previous_handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(previous_handler)
+def _handle_warnings_of_mujoco() -> None:
+    """Print MuJoCo's warnings, which it would also append to ``MUJOCO_LOG.TXT`` in the user's folder.
+
+    Its warning that attached names have no prefix is left out: scenes are not saved here.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(
+            lambda text: None if "empty prefix" in text else print(f"MuJoCo: {text}", file=sys.stderr)
+        )
 
 
 def _add_bodies(spec: mujoco.MjSpec, airframes: Sequence[Airframe], indices: range) -> None:
