@@ -108,17 +108,17 @@ def check_arguments(function: F) -> F:
             types, default = allowed_types().get(key, ()), signature.parameters[key].default
             if isinstance(value, jax.core.Tracer) or (value is None and default is None):
                 continue
+            remedy = f"help({function.__qualname__.removesuffix('.__init__')}) describes it."
             if np.ndarray in types and not isinstance(value, tuple(set(types) - NUMERIC_TYPES)):
-                check_array(key, value)
+                check_array(key, value, remedy)
             else:
-                owner = function.__qualname__.removesuffix(".__init__")
-                check_value(key, value, types, remedy=f"help({owner}) describes it.")
+                check_value(key, value, types, remedy=remedy)
         return function(*args, **kwargs)
 
     return checked  # type: ignore[return-value]
 
 
-def check_array(name: str, value: object) -> None:
+def check_array(name: str, value: object, remedy: str = "Use an array of numbers.") -> None:
     """Check that a value is an array of real numbers or bools, which may be traced, without reading it."""
     try:
         dtype: Any = value.dtype if isinstance(value, jax.Array) else np.asarray(value).dtype
@@ -126,7 +126,7 @@ def check_array(name: str, value: object) -> None:
         dtype = np.dtype(object)
     is_too_large = isinstance(value, int) and not -(2**31) <= value < 2**31  # for JAX's int32
     if is_too_large or not any(jnp.issubdtype(dtype, kind) for kind in (np.bool_, np.integer, np.floating)):
-        raise ConfigError(f"expected {name} as numbers, got {short_repr(value)}. Use an array of numbers.")
+        raise ConfigError(f"expected {name} as numbers, got {short_repr(value)}. {remedy}")
 
 
 def annotated_types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:

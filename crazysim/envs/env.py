@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from crazysim.arguments import check_arguments
 from crazysim.core.data import SimCore, SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive_integer
@@ -308,7 +307,6 @@ class Env(ABC):
 class DroneEnv(Env):
     """Environment of many worlds with one task. Without ``AutoReset``, an episode that is over continues."""
 
-    @check_arguments
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
         """Create an environment of a simulation in which the task is installed.
 

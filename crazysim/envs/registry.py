@@ -94,7 +94,6 @@ SIM_OPTIONS = tuple(name for name in inspect.signature(Sim).parameters if name n
 """Options of ``make`` that are passed to ``Sim``."""
 
 
-@check_arguments
 def make(
     task: str | Task,
     n_worlds: int = 1,
@@ -147,7 +146,7 @@ def make(
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
     if randomize is not None:
-        if randomize not in RANDOMIZATIONS:
+        if not isinstance(randomize, str) or randomize not in RANDOMIZATIONS:
             raise ConfigError(
                 f"expected randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, got {short_repr(randomize)}. "
                 f"Use effects=[Randomize(...)] for other ranges."

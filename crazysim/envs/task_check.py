@@ -17,7 +17,7 @@ from crazysim.core.sharding import fetch_arrays
 from crazysim.eager import explain_traced_values
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import n_world_axes, scopes, watched_flags
 from crazysim.sim.sim import Sim
 
@@ -28,6 +28,8 @@ REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 
 def require_installed(sim: Sim, task: object) -> None:
     """Check that a task was installed in a simulation."""
+    if not isinstance(sim, Sim):
+        raise ConfigError(f"expected a simulation, got {short_repr(sim)}. Use Sim(), or crazysim.envs.make.")
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazysim.arguments import check_arguments
 from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import Env
@@ -199,7 +198,6 @@ class TrainConfig:
             object.__setattr__(self, name, value)
 
     @staticmethod
-    @check_arguments
     def create(
         task: str | Task,
         algorithm: str | None = None,
@@ -237,6 +235,8 @@ class TrainConfig:
             )
         elif is_reference(task):
             task = absolute_reference(task) if split_reference(task)[1] else reference_of(entry.task)
+        if not isinstance(algorithm, (str, type(None))):
+            raise ConfigError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {short_repr(algorithm)}")
         recipe = find_recipe(task, algorithm)
         if resumed is not None:
             seed = resumed.seed if seed is None else seed

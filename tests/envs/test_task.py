@@ -43,7 +43,7 @@ def test_an_environment_needs_the_task_installed(installed):
 def test_the_name_of_a_task_is_refused_where_a_task_is_expected():
     with pytest.raises(ConfigError, match="expected actions as Actions, got 3"):
         make("hover", actions=3)
-    with pytest.raises(ConfigError, match="expected task as Task, got 'hover'"):
+    with pytest.raises(ConfigError, match="expected a Task, got 'hover'"):
         DroneEnv(Sim(control="attitude"), "hover")
 
 

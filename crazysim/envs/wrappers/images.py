@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from crazysim.arguments import check_arguments
 from crazysim.core.settings import dividing_rate
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
@@ -24,7 +23,6 @@ class CameraImages(Wrapper):
     images.
     """
 
-    @check_arguments
     def __init__(self, env: Env, camera: ImageSensor, names: Mapping[str, str] | None = None):
         """Add images to the observations of an environment.
 
@@ -39,6 +37,8 @@ class CameraImages(Wrapper):
         if not isinstance(camera, ImageSensor):
             raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).")
         self.camera = camera
+        if not isinstance(names, (Mapping, type(None))):
+            raise ConfigError(f"expected names as a dict by output, got {short_repr(names)}. Use {{'depth': 'view'}}.")
         if unknown_outputs := set(names or {}) - set(camera.outputs):
             raise ConfigError(
                 f"expected names of {', '.join(camera.outputs)}, the outputs of {camera.name!r}, got one of "
