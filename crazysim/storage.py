@@ -106,8 +106,8 @@ def check_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> None:
         ConfigError: If it is a device or a pipe, or is larger than ``max_bytes``.
     """
     try:
-        status = os.stat(path)
-    except ValueError:  # a null byte, for example
+        status = os.stat(os.fspath(path))
+    except (TypeError, ValueError):  # not a path at all, or a null byte, for example
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

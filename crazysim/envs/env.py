@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from crazysim.arguments import check_flag
 from crazysim.core.data import SimCore, SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive_integer
@@ -341,7 +342,7 @@ class DroneEnv(Env):
         self.measure_states: Callable[[SimData], SimData] | None = None
         """``measure_states(data)``: the data with measured states, for one world, or for all worlds if the task is
         batched; None if the task observes the true states."""
-        if measured:
+        if check_flag("measured", measured):
             if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
                 raise ConfigError(
                     "expected a simulation with a sensor of states for measured=True, got none. Use "

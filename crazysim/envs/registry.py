@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium
 
-from crazysim.arguments import check_arguments
 from crazysim.control import Control
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.settings import enum_member, positive_integer
@@ -176,7 +175,6 @@ def make(
     return CameraImages(env, Camera(*depth_image), {"depth": "depth"})
 
 
-@check_arguments
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
     """Register a custom task by name, for ``make``, training and Gymnasium, and return its Gymnasium id.
 

@@ -55,9 +55,9 @@ class Observe(Wrapper):
                 f"expected the function of {self.name!r} to return a dict of names to arrays, got {short_repr(obs)}. "
                 f"Use for example {{'vector': flatten(obs)}}."
             )
-        for path, x in jax.tree_util.tree_leaves_with_path(dict(obs)):
-            check_array(f"observation {jax.tree_util.keystr(path)} of {self.name!r}", x)
-        return state.replace(obs=jax.tree.map(jnp.asarray, dict(obs)))
+        for name, x in obs.items():
+            check_array(f"observation {name!r} of {self.name!r}", x)
+        return state.replace(obs={name: jnp.asarray(x) for name, x in obs.items()})
 
 
 class PrivilegedObservation(Observe):
