@@ -411,7 +411,7 @@ def expand_primitive(eqn: Any) -> Callable[..., list[Any]]:
     return lambda *args: jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
 
 
-def fori_loop(n: int, fn: Callable[[jax.Array, Any], Any], start: Any) -> Any:
+def fori_loop(n: int, fn: Callable[[Any, Any], Any], start: Any) -> Any:
     """Return ``jax.lax.fori_loop(0, n, fn, start)``, with an index of 32 bits.
 
     JAX's index has 64 bits where float64 is enabled; kernels have no such numbers.

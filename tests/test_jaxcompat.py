@@ -190,6 +190,12 @@ def test_a_jaxpr_takes_what_it_closes_over():
     np.testing.assert_array_equal(result, [1.0, 2.0, 3.0])
 
 
+def test_the_index_of_a_loop_has_32_bits(x64):
+    jaxpr = jax.make_jaxpr(lambda x: jaxcompat.fori_loop(3, lambda k, x: x + k, x))(1.0)
+    assert "i64" not in str(jaxpr)
+    assert jaxcompat.jaxpr_as_fun(jaxpr)(1.0)[0] == 4.0
+
+
 # Arrays --------------------------------------------------------------------------------------------------------------
 
 

@@ -20,6 +20,7 @@ from crazysim.core.stage import Stage
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError
 from crazysim.geometry.small_matrices import matvec, solve_symmetric
+from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.payloads.colliders import LoadBody, rest_height
 from crazysim.plugins.payloads.link import TAUT_BAND, UnitPull, acceleration_at, correction_rate, link_geometry
 from crazysim.plugins.payloads.point_load import (
@@ -265,8 +266,7 @@ def _solve_tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool
         return solve(matrix, rhs, is_active)
     constant_matrix, constant_rhs = jax.lax.stop_gradient((matrix, rhs))
 
-    def pivot(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        k, is_taut = carry
+    def pivot(k: Array, is_taut: Array) -> Array:
         tension = solve(constant_matrix, constant_rhs, is_taut)
         excess = matvec(constant_matrix, tension) - constant_rhs
         scale = jnp.max(jnp.where(is_active, jnp.abs(constant_rhs), 0.0)) + jnp.max(jnp.abs(tension))
@@ -275,8 +275,7 @@ def _solve_tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool
         # Exchanges of the last cable alone cannot cycle.
         index = np.arange(n, dtype=np.int32)
         is_last = index == jnp.max(jnp.where(is_wrong, index, np.int32(-1)))
-        return (k + np.int32(1), is_taut ^ (is_wrong & (is_last | (k < N_BLOCK_PIVOTS)))), None
+        return is_taut ^ (is_wrong & (is_last | (k < N_BLOCK_PIVOTS)))
 
-    # Not fori_loop, whose counter has 64 bits in float64, which kernels do not have.
-    (_, is_taut), _ = jax.lax.scan(pivot, (jnp.int32(0), is_active), length=PIVOTS_PER_CABLE * n)
+    is_taut = fori_loop(PIVOTS_PER_CABLE * n, pivot, is_active)
     return jnp.maximum(solve(matrix, rhs, is_taut), 0.0)
