@@ -20,16 +20,14 @@ from crazysim.errors import ConfigError
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.motion import integrate
-from crazysim.lab.identify.motors import motor_lag, with_speeds
+from crazysim.lab.identify.motors import mean_motor_lag, with_speeds
 from crazysim.lab.identify.prediction import Model, cut_windows
 from crazysim.lab.identify.rotation import (
-    BLOCK_DURATION,
-    MIN_BLOCKS,
+    PIECE_DURATION,
     SAMPLING_ERROR,
     aligned,
-    deviation_factor,
+    deviation_of_sum,
     fast_rotation,
-    weighted_median,
 )
 from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
 from crazysim.rotation import rotate, rotate_inverse
@@ -82,9 +80,7 @@ class Identification:
     """Identified parameters by name, see ``FACTOR_NAMES``, ``FORCE_TERMS`` and ``TORQUE_TERMS``, and ``motor lag``,
     1/s, for logs with commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between 10 s blocks of the logs; NaN for fewer than three
-    blocks. They are larger if there are few blocks, so that an interval of three deviations contains the truth as often
-    as with many blocks. In simulated flights the interval contains the truth for at least 99% of the parameters."""
+    """Standard deviations of the parameters, with bias that the logs show; NaN for logs that are too short to tell."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -173,16 +169,15 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     thrust_factor = float(force_values[0])
     force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force_values[0])
     torque_values, torque_spread = _fit_torques(logs, params, thrust_factor, rotation_fit.values)
-    delayed_logs = [aligned(log, SLOW_TORQUE_DELAY_STD * log.dt) for log in logs]
-    torque_spread = np.hypot(
-        torque_spread, _fit_torques(delayed_logs, params, thrust_factor, rotation_fit.values)[0] - torque_values
-    )
-    for k, deviation in enumerate(rotation_fit.deviations):
-        if math.isfinite(deviation):
-            shifted_values = _fit_torques(
-                logs, params, thrust_factor, rotation_fit.values + deviation * (np.arange(5) == k)
-            )[0]
-            torque_spread = np.hypot(torque_spread, shifted_values - torque_values)
+    # Errors of the first steps are errors of the next.
+    delay = np.hypot(np.nan_to_num(rotation_fit.delay_deviation), SLOW_TORQUE_DELAY_STD * logs[0].dt)
+    late_logs = [aligned(log, delay) for log in logs]
+    force_spread = np.hypot(force_spread, _fit_forces(late_logs, params)[0] - force_values)
+    shifts = [_fit_torques(late_logs, params, thrust_factor, rotation_fit.values)[0]]
+    for k, deviation in enumerate(np.nan_to_num(rotation_fit.deviations)):
+        factors = rotation_fit.values + deviation * (np.arange(5) == k)
+        shifts.append(_fit_torques(logs, params, thrust_factor, factors)[0])
+    torque_spread = np.sqrt(torque_spread**2 + np.sum((np.array(shifts) - torque_values) ** 2, axis=0))
 
     def name_parameters(force_numbers: NDArray, torque_numbers: NDArray, rotation_numbers: NDArray) -> dict[str, float]:
         numbers = [*force_numbers, *torque_numbers, *rotation_numbers]
@@ -201,10 +196,8 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
             "more, or start from an airframe file nearer to the drone (--airframe)."
         )
     changes = _airframe_changes(base, flight_mass, values)
-    lag_rates = motor_lag(logs)
-    if 2 * np.sum(np.isfinite(lag_rates)) > lag_rates.size:
-        lag_rates = lag_rates[np.isfinite(lag_rates)]
-        values["motor lag"], deviations["motor lag"] = weighted_median(lag_rates, np.ones(len(lag_rates)))
+    if (lag := mean_motor_lag(logs)) is not None:
+        values["motor lag"], deviations["motor lag"] = lag
         changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
         new_airframe = load_airframe(_nest_tables(str(airframe), base.name, changes))
@@ -281,7 +274,7 @@ def _fit_regression(
         terms: Function that returns the rate of momentum per coefficient in a log, (n, 3, k), and the momentum, (n, 3).
         is_nonpositive: True for coefficients that are at most zero. (k,)
     """
-    regressors, momentum_changes, blocks = [], [], []
+    regressors, momentum_changes, pieces = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
         total, size = integrate(x, log.t), round(WINDOW_DURATION / log.dt)
@@ -289,8 +282,8 @@ def _fit_regression(
         starts = starts[[not np.any((log.gaps > start) & (log.gaps <= start + size)) for start in starts]]
         regressors.append(total[starts + size] - total[starts])
         momentum_changes.append(momentum[starts + size] - momentum[starts])
-        blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK_DURATION)
-    x, y, block = (np.concatenate(parts) for parts in (regressors, momentum_changes, blocks))
+        pieces.append(number * 1e6 + (log.t[starts] - log.t[0]) // PIECE_DURATION)
+    x, y, piece = (np.concatenate(parts) for parts in (regressors, momentum_changes, pieces))
     k = x.shape[-1]
     weights = np.ones(y.shape)
     coefficients, is_free = np.zeros(k), np.ones(k, bool)
@@ -308,19 +301,16 @@ def _fit_regression(
         residual = y - x @ coefficients
         scale = 1.4826 * np.median(np.abs(residual), axis=0)  # standard deviation, if residuals are normal
         weights = 1 / np.maximum(scale, np.abs(residual) / 2) / np.maximum(scale, 1e-30)
-    # Deviations by leaving out each block (jackknife), without bounds, which would hide the scatter of coefficients.
-    block_numbers = np.unique(block)
-    if len(block_numbers) < MIN_BLOCKS:
-        return coefficients, np.full(k, np.nan)
-    held_out_fits = []
-    for number in block_numbers:
-        is_training = block != number
-        normal = np.einsum("wri,wr,wrj->ij", x[is_training], weights[is_training], x[is_training])
-        vector = np.einsum("wri,wr,wr->i", x[is_training], weights[is_training], y[is_training])
-        held_out_fits.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
-    deviations = np.array(held_out_fits) - np.mean(held_out_fits, axis=0)
-    n = len(block_numbers)
-    return coefficients, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(deviations**2, axis=0))
+    # Influences by leaving out each piece (jackknife), without bounds, which would hide the scatter of coefficients.
+    pieces, n_pieces = np.unique(piece, return_inverse=True)[1], len(np.unique(piece))
+    normals, vectors = np.zeros((n_pieces, k, k)), np.zeros((n_pieces, k))
+    np.add.at(normals, pieces, np.einsum("wri,wr,wrj->wij", x, weights, x))
+    np.add.at(vectors, pieces, np.einsum("wri,wr,wr->wi", x, weights, y))
+    normal, vector = normals.sum(axis=0), vectors.sum(axis=0)
+    held_out_fits = [
+        np.linalg.lstsq(normal - a, vector - b, rcond=None)[0] for a, b in zip(normals, vectors, strict=True)
+    ]
+    return coefficients, deviation_of_sum(np.array(held_out_fits))
 
 
 def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +19,7 @@ from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
+from crazysim.lab.identify.rotation import MEDIAN_OVER_MEAN, PIECE_DURATION, deviation_of_sum
 
 VOLTAGE_WINDOW = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
@@ -23,6 +27,8 @@ GROUND_MARGIN = 1.0
 """Duration that is left out after take-off and before landing, s."""
 MIN_RATE, MAX_RATE = 2.0, 200.0
 """Rates between which the lag of motors is sought, 1/s."""
+N_TAPS = 2
+"""Number of samples of the command that act on the speed beside its lag."""
 MAX_DELAY = 0.04
 """Largest delay between commands and measured speeds, s."""
 
@@ -105,7 +111,39 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
     Returns:
         Rates, NaN where no rate from 2 to 200 1/s is best. (n_logs with both, n_rotors)
     """
-    lags = []
+    return np.array([[fit.rate for fit in rotors] for rotors in _fit_logs(logs, N_TAPS)])
+
+
+def mean_motor_lag(logs: Sequence[Log]) -> tuple[float, float] | None:
+    """Return the median rate of all rotors and its standard deviation, 1/s, or None if most rotors have no rate.
+
+    Commands that change between samples bias the rate, in either direction: the samples do not show how. A fit with
+    another interpolation of the commands is off by another bias, so the deviation contains the difference.
+    """
+    fits, other_fits = (list(itertools.chain.from_iterable(_fit_logs(logs, n))) for n in (N_TAPS, N_TAPS + 1))
+    pairs = [(a, b) for a, b in zip(fits, other_fits, strict=True) if np.isfinite(a.rate) and np.isfinite(b.rate)]
+    if 2 * len(pairs) <= len(fits):
+        return None
+    rates, other_rates = (np.array([fit.rate for fit in column]) for column in zip(*pairs, strict=True))
+    # Rotors of a flight share their manoeuvres: the influences of a piece of the flight on all of them are added.
+    n_pieces = max(len(a.influences) for a, _ in pairs)
+    influences = np.sum([np.pad(a.influences, (0, n_pieces - len(a.influences))) for a, _ in pairs], axis=0)
+    chance = deviation_of_sum(influences[:, None])[0] / len(pairs)
+    scatter = np.std(rates, ddof=1) / math.sqrt(len(rates)) if len(rates) > 1 else 0.0
+    bias = float(np.median(other_rates - rates))
+    return float(np.median(rates)), float(MEDIAN_OVER_MEAN * math.hypot(chance, scatter, bias))
+
+
+class _RateFit(NamedTuple):
+    """Rate of the lag of a rotor, 1/s, and the influences of pieces of its log on it. (n_pieces,)"""
+
+    rate: float
+    influences: NDArray
+
+
+def _fit_logs(logs: Sequence[Log], n_taps: int) -> list[list[_RateFit]]:
+    """Return the fits of the rotors of each log with commands and measured speeds."""
+    fits = []
     for log in logs:
         if log.modelled or log.command is None or not log.rotor_vel.shape[1]:
             continue
@@ -113,27 +151,48 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
             continue
         t = np.arange(log.t[0], log.t[-1], log.dt)
         series = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
-        lags.append([_fit_rate(u, r, log.dt) for u, r in zip(*series, strict=True)])
-    return np.array(lags)
+        fits.append([_fit_rate(u, r, log.dt, n_taps) for u, r in zip(*series, strict=True)])
+    return fits
 
 
-def _fit_rate(command: NDArray, speed: NDArray, dt: float) -> float:
-    """Return the rate of one rotor, 1/s, from a grid of rates and delays that is refined about its best point."""
+def _fit_rate(command: NDArray, speed: NDArray, dt: float, n_taps: int) -> _RateFit:
+    """Return the lag of one rotor, from a grid of rates and delays in samples that is refined about its best point.
+
+    The speed is a sum of ``n_taps`` lagged commands that are a sample later each, and of their squares. Two of them
+    are exact for any delay between samples of a command that is held; a single one would have to be a straight line
+    between samples.
+    """
     terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
-    rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), np.linspace(-MAX_DELAY, MAX_DELAY, 9)
-    index, inner_samples = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
-    rate = delay = 0.0
-    for _ in range(5):
-        responses = lag_signal(terms[:, None], dt, rates[:, None])
-        best_cost = np.inf
-        for d in delays:
-            for k, r in enumerate(rates):
-                # Shift the response, not the speed: interpolation would reduce the noise of the speed.
-                shifted_responses = [np.interp(index - d / dt, index, c)[inner_samples] for c in responses[:, k].T]
-                x = np.c_[shifted_responses[0], shifted_responses[1], np.ones(len(shifted_responses[0]))]
-                residual = speed[inner_samples] - x @ np.linalg.lstsq(x, speed[inner_samples], rcond=None)[0]
-                if (cost := float(residual @ residual)) < best_cost:
-                    best_cost, rate, delay = cost, float(r), float(d)
-        ratio, width = rates[1] / rates[0], delays[1] - delays[0]
-        rates, delays = np.geomspace(rate / ratio, rate * ratio, 9), np.linspace(delay - width, delay + width, 7)
-    return rate if 1.05 * MIN_RATE < rate < MAX_RATE / 1.05 else np.nan
+    n_delays, n = round(MAX_DELAY / dt), len(speed)
+    inner = np.arange(round(0.5 / dt), n - n_delays)
+    target = speed[inner]
+
+    def regressors(response: NDArray, delay: int) -> NDArray:
+        columns = [response[np.minimum(inner - delay - tap, n - 1)] for tap in range(n_taps)]
+        return np.concatenate([*columns, np.ones((len(inner), 1))], axis=1)
+
+    rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), range(-n_delays, n_delays + 1)
+    rate, delay = 0.0, 0
+    for _ in range(6):
+        responses, best_cost = lag_signal(terms[:, None], dt, rates[:, None]), np.inf
+        for k, d in itertools.product(range(len(rates)), delays):
+            x = regressors(responses[:, k], d)
+            coefficients = np.linalg.lstsq(x.T @ x, x.T @ target, rcond=1e-14)[0]
+            residual = target - x @ coefficients
+            if (cost := float(residual @ residual)) < best_cost:
+                best_cost, rate, delay = cost, float(rates[k]), d
+        ratio = rates[1] / rates[0]
+        rates, delays = np.geomspace(rate / ratio, rate * ratio, 7), range(delay - 1, delay + 2)
+    if not 1.05 * MIN_RATE < rate < MAX_RATE / 1.05:
+        return _RateFit(np.nan, np.zeros(0))
+    lower, middle, upper = (
+        regressors(x, delay)
+        for x in np.moveaxis(lag_signal(terms[:, None], dt, rate * np.array([[0.99], [1.0], [1.01]])), 1, 0)
+    )
+    coefficients = np.linalg.lstsq(middle.T @ middle, middle.T @ target, rcond=1e-14)[0]
+    slope = (upper - lower) @ coefficients / (0.02 * rate)
+    residual = target - middle @ coefficients
+    slope -= middle @ np.linalg.lstsq(middle.T @ middle, middle.T @ slope, rcond=1e-14)[0]
+    influences = residual * slope / (slope @ slope)
+    n_pieces = max(1, round(len(influences) * dt / PIECE_DURATION))
+    return _RateFit(rate, np.array([piece.sum() for piece in np.array_split(influences, n_pieces)]))

@@ -12,6 +12,7 @@ Commands have no such errors. If a log has commands, they are the instruments of
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,16 +32,17 @@ RESPONSE_DURATION = 0.15
 """Duration of the response from commands to rotor speeds, s."""
 BLOCK_DURATION = 10.0
 """Duration of the blocks of a log that are solved separately, each with its delay, s."""
-MIN_BLOCKS = 3
-"""Fewest blocks whose scatter gives a standard deviation."""
+PIECE_DURATION = 2.0
+"""Duration of the pieces of a log whose influences on a fit give its standard deviation, s."""
+MIN_PIECES = 5
+"""Fewest pieces whose scatter gives a standard deviation."""
 MAX_DELAY = 0.04
 """Largest delay, s."""
 SAMPLING_ERROR = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks. In simulated flights without noise, at
 100 and 500 Hz, it changed moments of inertia by 0.04 to 0.12%."""
-DELAY_DEVIATION = 0.02
-"""Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there,
-which quadrature turns into a delay of dt^2 / (12 time constant): 0.04 samples for 0.01 s and a constant of 0.02 s."""
+MEDIAN_OVER_MEAN = 1.2533
+"""Ratio of the standard deviations of median and mean of normal numbers, the root of pi / 2."""
 N_ITERATIONS = 3
 """Number of fits, each with gyroscopic torques from the moments of inertia of the previous fit."""
 
@@ -51,9 +53,11 @@ class FastRotation(NamedTuple):
     values: NDArray
     """Factors of the moments of inertia about x, y, z, of the torque curve and of the rotors' inertia. (5,)"""
     deviations: NDArray
-    """Standard deviations, from the scatter between blocks, ``SAMPLING_ERROR`` and ``DELAY_DEVIATION``. (5,)"""
+    """Standard deviations, from ``deviation_of_sum``, ``SAMPLING_ERROR`` and the change in a narrower band. (5,)"""
     delays: NDArray
     """Delay of the state behind the rotor speeds in each log, s. (n_logs,)"""
+    delay_deviation: float
+    """Standard deviation of the mean of the delays, s."""
 
 
 def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_factor: float = 1.0) -> FastRotation:
@@ -64,6 +68,9 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     assumed to be in the same proportion to the moments about x and y as in the airframe. Results are weighted medians
     over blocks, because streams of telemetry drift against each other and lose packets, which spoils single blocks.
 
+    Noise of rotor speeds, filters of the state and integrals between samples bias a fit the more, the higher its
+    frequencies. A fit in a band of half the upper limit shows how much.
+
     Args:
         logs: Logs of the same sample time.
         params: Parameters of the airframe.
@@ -73,16 +80,11 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         ConfigError: If the rotors turn the drone against their torque, or the logs are too short.
     """
     moments = np.diag(np.asarray(params.J, np.float64))
-    values, blocks = np.ones(5), []
+    values = np.ones(5)
     for _ in range(N_ITERATIONS):
-        blocks = [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values)) for log in logs]
-        estimates = np.concatenate(blocks)
-        if not len(estimates):
-            raise ConfigError(
-                f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs."
-            )
-        medians = [weighted_median(estimates[:, k], estimates[:, k + 5]) for k in range(4)]
-        (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
+        log_terms = [_LogTerms.create(log, params, thrust_factor, values) for log in logs]
+        medians, delays, influences = _solve_logs(log_terms, FAST_WIDTH)
+        roll, pitch, drag, reaction = medians[:4]
         if not (roll > 0 and pitch > 0):
             raise ConfigError(
                 "expected rotors that turn the drone in the direction of their torque, got the opposite. "
@@ -92,26 +94,24 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         z_factor = (x_factor * moments[0] + y_factor * moments[1]) / (moments[0] + moments[1])
         rotor_factors = (max(c, 0.0) * moments[2] * z_factor for c in (drag, reaction))
         values = np.array([x_factor, y_factor, z_factor, *rotor_factors])
-    delayed_estimates = np.concatenate(
-        [_solve_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
-    )
-    yaw_changes = [
-        weighted_median(delayed_estimates[:, k], delayed_estimates[:, k + 5])[0] - medians[k][0] for k in (2, 3)
-    ]
+    slow_medians, _, slow_influences = _solve_logs(log_terms, 2 * FAST_WIDTH)
+    change = slow_medians - medians
+    chance = deviation_of_sum(slow_influences - influences)
+    # What exceeds chance is bias. It grows with the square of the frequency, so a quarter of it is in both bands.
+    bias = 4 / 3 * np.sqrt(np.maximum(change**2 - np.nan_to_num(chance) ** 2, 0.0))
+    deviations = np.hypot(deviation_of_sum(influences), bias)
     inertia = moments * values[:3]
-    relative_deviations = np.array(deviations[:2]) / [roll, pitch]
+    relative_deviations = deviations[:2] / [roll, pitch]
     mean_tilt_deviation = np.hypot(*(relative_deviations * inertia[:2])) / np.sum(inertia[:2])
     deviation = np.hypot(
         [
             *relative_deviations * [x_factor, y_factor],
             mean_tilt_deviation * z_factor,
-            *inertia[2] * np.hypot(deviations[2:], yaw_changes),
+            *np.hypot(inertia[2] * deviations[2:4], mean_tilt_deviation * values[3:]),
         ],
         SAMPLING_ERROR * values,
     )
-    overall_delay = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
-    delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else overall_delay for b in blocks]
-    return FastRotation(values, deviation, np.array(delays))
+    return FastRotation(values, deviation, delays, float(deviations[4]))
 
 
 def aligned(log: Log, delay: float) -> Log:
@@ -120,23 +120,41 @@ def aligned(log: Log, delay: float) -> Log:
     return replace(log, rotor_vel=shift_series(log.rotor_vel, delay / log.dt), command=command)
 
 
-def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
-    """Return the median, weighted by inverse variances, and its standard deviation from the scatter.
+def weighted_medians(x: NDArray, variances: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the medians of columns, weighted by inverse variances, (k,), and the weights, which sum to 1. (n, k)"""
+    weights = 1 / np.maximum(variances, 0.25 * np.median(variances, axis=0))  # so that no single block decides
+    weights = weights / np.sum(weights, axis=0)
+    medians = []
+    for column, weight in zip(x.T, weights.T, strict=True):
+        order = np.argsort(column)
+        cumulative_weight = np.cumsum(weight[order]) - 0.5 * weight[order]
+        medians.append(np.interp(0.5, cumulative_weight, column[order]))
+    return np.array(medians), weights
 
-    The standard deviation is NaN for fewer than ``MIN_BLOCKS`` numbers.
+
+def deviation_of_sum(influences: NDArray) -> NDArray:
+    """Return standard deviations of sums of influences that are correlated with their neighbours. (k,)
+
+    An influence is the change of a fitted number by a piece of the logs. Errors of neighbouring pieces are correlated,
+    so the products of neighbours count, too (Newey and West 1987, Econometrica 55, 703-708), over a number of pieces
+    that grows with the cube root of their number. The deviations are NaN for fewer than ``MIN_PIECES``.
+
+    Args:
+        influences: Influences of consecutive pieces. (n, k)
     """
-    weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
-    order = np.argsort(x)
-    cumulative_weight = (np.cumsum(weight[order]) - 0.5 * weight[order]) / np.sum(weight)
-    center = float(np.interp(0.5, cumulative_weight, x[order]))
-    if len(x) < MIN_BLOCKS:
-        return center, math.nan
-    effective_count = np.sum(weight) ** 2 / np.sum(weight**2)
-    deviation = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (effective_count - 1))
-    return center, 1.2533 * deviation_factor(len(x)) * deviation  # ratio of deviations of median and mean (Gauss)
+    n = len(influences)
+    if n < MIN_PIECES:
+        return np.full(influences.shape[1], np.nan)
+    n_neighbours = round(n ** (1 / 3)) - 1
+    centred = influences - influences.mean(axis=0)
+    variance = np.sum(centred**2, axis=0)
+    for k in range(1, n_neighbours + 1):
+        variance += 2 * (1 - k / (n_neighbours + 1)) * np.sum(centred[k:] * centred[:-k], axis=0)
+    n_independent = n / (1 + n_neighbours / 2)
+    return deviation_factor(n_independent) * np.sqrt(np.maximum(variance, 0.0) * n / (n - 1))
 
 
-def deviation_factor(n: int) -> float:
+def deviation_factor(n: float) -> float:
     """Return the factor by which a standard deviation from n numbers must be larger for the same confidence.
 
     It is the ratio of the quantiles of Student's t distribution with n - 1 degrees of freedom and the normal
@@ -238,7 +256,7 @@ def _two_interval_integral(x: NDArray, dt: float) -> NDArray:
     return total
 
 
-def _band_pass(x: NDArray, dt: float, slow_width: float) -> NDArray:
+def _band_pass(x: NDArray, dt: float, fast_width: float, slow_width: float) -> NDArray:
     """Return the band-passed signal. (n, k)"""
 
     def smooth_columns(width: float) -> NDArray:
@@ -246,39 +264,85 @@ def _band_pass(x: NDArray, dt: float, slow_width: float) -> NDArray:
         kernel = np.hanning(size + 2)[1:-1]
         return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
-    return smooth_columns(FAST_WIDTH) - smooth_columns(slow_width)
+    return smooth_columns(fast_width) - smooth_columns(slow_width)
 
 
-def _solve_blocks(log_terms: _LogTerms, extra_delay: float = 0.0) -> NDArray:
-    """Return the solution of each block, about z with a delay that is longer by ``extra_delay`` samples.
+class _Block(NamedTuple):
+    """Solution of a block: the coefficients of torque about x and y, of drag torque and of reaction, and the delay."""
 
-    The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
-    variances of the four coefficients. (n_blocks, 9)
+    solution: NDArray
+    """Coefficients, and the delay, s. (5,)"""
+    variances: NDArray
+    """Variances of the coefficients, if residuals were independent. (4,)"""
+    influences: NDArray
+    """Influences of the residuals of each piece on the solution. (n_pieces, 5)"""
+
+
+def _solve_logs(logs: Sequence[_LogTerms], fast_width: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Return medians over all blocks, (5,), delays of the logs, (n_logs,), and influences of pieces. (n_pieces, 5)
+
+    The influences are those on the medians, and on the mean of the delays.
     """
-    n, margin = len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
+    blocks = [_solve_blocks(log, fast_width) for log in logs]
+    all_blocks = list(itertools.chain.from_iterable(blocks))
+    if not all_blocks:
+        raise ConfigError(f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
+    variances = np.array([[*b.variances, b.variances[0]] for b in all_blocks])
+    variances[:, 4] = 1.0
+    medians, shares = weighted_medians(np.array([b.solution for b in all_blocks]), variances)
+    delays, influences = [], []
+    for log_blocks in blocks:
+        delays.append(medians[4])
+        if log_blocks:
+            delays[-1] = weighted_medians(
+                np.array([b.solution[4:] for b in log_blocks]), np.array([b.variances[:1] for b in log_blocks])
+            )[0][0]
+        centre = np.array([*medians[:4], delays[-1]])
+        influences += [b.influences + (b.solution - centre) / len(b.influences) for b in log_blocks]
+    efficiency = MEDIAN_OVER_MEAN if len(all_blocks) >= 3 else 1.0
+    return (
+        medians,
+        np.array(delays),
+        np.concatenate([efficiency * w * x for w, x in zip(shares, influences, strict=True)]),
+    )
+
+
+def _solve_blocks(log_terms: _LogTerms, fast_width: float) -> list[_Block]:
+    """Return the solution of each block of a log that has a second or more outside of gaps."""
+    dt, n, margin = log_terms.dt, len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
     is_kept = np.ones(n, bool)
     for gap in (0, *log_terms.gaps, n):
         is_kept[max(0, gap - margin) : gap + margin] = False
-    size, blocks = max(1, round(BLOCK_DURATION / log_terms.dt)), []
+    size, blocks = max(1, round(BLOCK_DURATION / dt)), []
     for k in range(0, n, size):
         indices = np.flatnonzero(is_kept[k : k + size]) + k
-        if len(indices) * log_terms.dt < 1:
+        if len(indices) * dt < 1:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt_fits = [_solve_samples(log_terms, axis, delay, indices) for axis in (0, 1)]
+            tilt_fits = [_solve_samples(log_terms, axis, delay, indices, fast_width) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
-            delay -= float(np.mean([x[1] / x[0] for x, _ in tilt_fits]))
+            delay -= float(np.mean([fit[0][1] / fit[0][0] for fit in tilt_fits]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        yaw_fit, variance = _solve_samples(log_terms, 2, delay + extra_delay * log_terms.dt, indices)
+        (roll, roll_variance, roll_influences), (pitch, pitch_variance, pitch_influences) = tilt_fits
+        yaw, yaw_variance, yaw_influences = _solve_samples(log_terms, 2, delay, indices, fast_width)
+        late = -(roll_influences[:, 1] / roll[0] + pitch_influences[:, 1] / pitch[0]) / 2
+        samples = np.c_[roll_influences[:, 0], pitch_influences[:, 0], yaw_influences[:, :2], late]
+        pieces = np.array_split(samples, max(1, round(len(indices) * dt / PIECE_DURATION)))
         blocks.append(
-            [*(x[0] for x, _ in tilt_fits), *yaw_fit[:2], delay, *(v[0] for _, v in tilt_fits), *variance[:2]]
+            _Block(
+                np.array([roll[0], pitch[0], *yaw[:2], delay]),
+                np.array([roll_variance[0], pitch_variance[0], *yaw_variance[:2]]),
+                np.array([piece.sum(axis=0) for piece in pieces]),
+            )
         )
-    return np.reshape(blocks, (-1, 9))
+    return blocks
 
 
-def _solve_samples(log_terms: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the coefficients of the regressors and their variances, fitted at ``samples``.
+def _solve_samples(
+    log_terms: _LogTerms, axis: int, delay: float, samples: NDArray, fast_width: float
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the coefficients of the regressors, their variances, and the influences of ``samples``, (n, k).
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
     the drag torque and the reaction of the rotors; about each axis also the angular velocity, as the last regressor.
@@ -294,13 +358,14 @@ def _solve_samples(log_terms: _LogTerms, axis: int, delay: float, samples: NDArr
 
     slow_width = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, ang_vel_change = (
-        _band_pass(x, log_terms.dt, slow_width)[samples]
+        _band_pass(x, log_terms.dt, fast_width, slow_width)[samples]
         for x in (terms(log_terms.rotors), terms(log_terms.instruments), log_terms.ang_vel_change[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
     x = inverse @ instruments.T @ ang_vel_change[:, 0]
     residual = ang_vel_change[:, 0] - regressors @ x
-    return x, np.mean(residual**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
+    variances = np.mean(residual**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
+    return x, variances, residual[:, None] * (instruments @ inverse.T)
 
 
 def shift_series(x: NDArray, samples: float) -> NDArray:

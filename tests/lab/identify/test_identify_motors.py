@@ -9,6 +9,7 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Log, motor_lag, with_speeds
+from crazysim.lab.identify.motors import mean_motor_lag
 
 DT, N = 0.01, 1500
 AIRFRAME = "cf2x_L250"
@@ -79,3 +80,20 @@ def test_lag_is_found_behind_noise_and_delay(rate):
     assert result.shape == (1, 4)
     np.testing.assert_allclose(np.median(result), rate, rtol=0.04)
     assert np.all(np.isnan(motor_lag([replace(create_log(command, rotor_vel=1e4 * command))])))
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 40.0])
+def test_deviation_of_the_lag_contains_commands_that_change_between_samples(rate):
+    """Commands of a loop at 500 Hz, which jump at each tick of a loop at 100 Hz, and are logged at 100 Hz."""
+    for seed in range(3):
+        rng, n_steps = np.random.default_rng(seed), 5 * N
+        commands = np.roll(np.repeat(rng.uniform(8000, 12000, (n_steps // 100, 4)), 100, axis=0), seed, axis=0)
+        jumps = np.repeat(rng.normal(scale=600, size=(N, 4)), 5, axis=0)
+        commands += jumps * np.tile(np.exp(-np.arange(5) / 2.5), N)[:, None]
+        speeds, decay = commands + 0, np.exp(-0.002 * rate)
+        for k in range(n_steps - 1):
+            speeds[k + 1] = decay * speeds[k] + (1 - decay) * commands[k]
+        measured = speeds[4::5] + rng.normal(scale=10, size=(N, 4))
+        value, deviation = mean_motor_lag([create_log(commands[4::5], rotor_vel=measured)])
+        assert abs(value - rate) < 3 * deviation, (value, deviation)
+        assert deviation < 0.3 * rate, (value, deviation)
