@@ -160,7 +160,7 @@ def copy_library(library: str | Path) -> str:
     try:
         content = read_bytes(path, MAX_LIBRARY_BYTES)
     except ConfigError as error:
-        raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
+        raise ConfigError(f"expected a shared library at {path}: {str(error).rstrip('.')}. {remedy}") from error
     copy_path = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
     if not copy_path.exists():  # a library that is loaded must not be overwritten
         with open_replacement(copy_path) as file:

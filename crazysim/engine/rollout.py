@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from crazysim.arguments import check_array
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
@@ -111,6 +112,8 @@ def run_rollout(
 
     The caller's buffers are not donated. ``settings`` are the other arguments of ``rollout``.
     """
+    for leaf in jax.tree.leaves(params):
+        check_array("every leaf of params", leaf)
     zeros = step.zeros(data)
     if not progress:
         return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)

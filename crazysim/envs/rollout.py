@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.arguments import check_arguments
+from crazysim.core.data import MAX_STEPS
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
@@ -95,6 +96,8 @@ def rollout(
         The state and the memory after the last step, and the results of ``keep``, stacked over time, (n_steps, ...).
     """
     n_steps = positive_integer("n_steps", n_steps)
+    if n_steps > MAX_STEPS:
+        raise ConfigError(f"expected n_steps of at most {MAX_STEPS}, got {n_steps}. Use several rollouts.")
     check_key(key)
     for name, function in (("policy", policy), ("keep", keep)):
         if not callable(function):

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators import Estimator
 
 STATE_FIELDS = tuple(field.name for field in dataclasses.fields(SimState))  # type: ignore[arg-type]
-MAX_WORLDS = 2**31 - 1
+MAX_WORLDS = 2_147_483_647
 """Largest number of worlds; their indices are int32."""
 MAX_DRONES = 10_000
 """Largest number of drones in a world; each is a body of the scene."""

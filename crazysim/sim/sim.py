@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.arguments import check_arguments, check_array, check_flag
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
@@ -566,11 +566,10 @@ class Sim:
         for name, function in (("policy", policy), ("keep", keep)):
             if not callable(function):
                 raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
-        for leaf in jax.tree.leaves(params):
-            check_array("every leaf of params", leaf)
         n_substeps = self.freq // self.control_freq
         n_control_steps = positive_integer("n_control_steps", n_control_steps)
-        self._stepper.count_steps(n_substeps, n_control_steps + 1)  # with the steps to the next tick
+        self._stepper.count_steps(n_substeps)  # to the next tick
+        self._stepper.count_steps(n_substeps, n_control_steps)
         data, records = run_rollout(
             self.step_fn, self.data, policy, params, n_control_steps, check_flag("progress", progress), every,
             n_substeps=n_substeps, keep=keep, wait=True,

@@ -530,7 +530,7 @@ def test_a_rollout_has_a_gradient():
 
 @pytest.mark.parametrize("settings, words", [
     ({"n_control_steps": 0}, "n_control_steps is 0; it must be a positive whole number"),
-    ({"n_control_steps": 2.0}, "n_control_steps is 2.0; it must be a positive whole number"),
+    ({"n_control_steps": 2.0}, "n_control_steps as a whole number, got 2.0"),
     ({"n_control_steps": 10, "every": 3}, "every=3 does not divide n_control_steps=10"),
 ])  # fmt: skip
 def test_law_09_rollouts_refuse_wrong_input(settings, words):

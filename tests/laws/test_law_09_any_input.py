@@ -349,6 +349,7 @@ def test_any_argument_is_taken_or_refused_with_what_was_expected(label, data):
     assert fault is None, f"{label}({name}={value!r}): {fault}"
 
 
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of Python 3.12, beside JAX's own
 def test_a_process_that_was_forked_after_a_call_of_jax_refuses_with_the_remedy():
     """Its calls would hang; gymnasium.make_vec(..., vectorization_mode="async") starts such processes."""
     calls = (Sim, lambda: sim().step(), lambda: env().reset(jax.random.key(0)), lambda: adapter(DroneVectorEnv).reset())
