@@ -41,6 +41,10 @@ MAX_DELAY = 0.04
 SAMPLING_ERROR = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks. In simulated flights without noise, at
 100 and 500 Hz, it changed moments of inertia by 0.04 to 0.12%."""
+YAW_DELAY_STD = 0.02
+"""Standard deviation of the delay of yaw torques, samples. A first-order motor whose command changes at a sample has a
+corner there, which quadrature turns into a delay of dt^2 / (12 time constant): 0.04 samples for 0.01 s and a constant
+of 0.02 s."""
 MEDIAN_OVER_MEAN = 1.2533
 """Ratio of the standard deviations of median and mean of normal numbers, the root of pi / 2."""
 N_ITERATIONS = 3
@@ -99,7 +103,8 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     chance = deviation_of_sum(slow_influences - influences)
     # What exceeds chance is bias. It grows with the square of the frequency, so a quarter of it is in both bands.
     bias = 4 / 3 * np.sqrt(np.maximum(change**2 - np.nan_to_num(chance) ** 2, 0.0))
-    deviations = np.hypot(deviation_of_sum(influences), bias)
+    yaw_change = _solve_logs(log_terms, FAST_WIDTH, YAW_DELAY_STD)[0] - medians
+    deviations = np.sqrt(deviation_of_sum(influences) ** 2 + bias**2 + yaw_change**2)
     inertia = moments * values[:3]
     relative_deviations = deviations[:2] / [roll, pitch]
     mean_tilt_deviation = np.hypot(*(relative_deviations * inertia[:2])) / np.sum(inertia[:2])
@@ -278,12 +283,15 @@ class _Block(NamedTuple):
     """Influences of the residuals of each piece on the solution. (n_pieces, 5)"""
 
 
-def _solve_logs(logs: Sequence[_LogTerms], fast_width: float) -> tuple[NDArray, NDArray, NDArray]:
+def _solve_logs(
+    logs: Sequence[_LogTerms], fast_width: float, yaw_delay: float = 0.0
+) -> tuple[NDArray, NDArray, NDArray]:
     """Return medians over all blocks, (5,), delays of the logs, (n_logs,), and influences of pieces. (n_pieces, 5)
 
-    The influences are those on the medians, and on the mean of the delays.
+    The influences are those on the medians, and on the mean of the delays. ``yaw_delay`` is an additional delay of yaw
+    torques, samples.
     """
-    blocks = [_solve_blocks(log, fast_width) for log in logs]
+    blocks = [_solve_blocks(log, fast_width, yaw_delay) for log in logs]
     all_blocks = list(itertools.chain.from_iterable(blocks))
     if not all_blocks:
         raise ConfigError(f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
@@ -307,7 +315,7 @@ def _solve_logs(logs: Sequence[_LogTerms], fast_width: float) -> tuple[NDArray, 
     )
 
 
-def _solve_blocks(log_terms: _LogTerms, fast_width: float) -> list[_Block]:
+def _solve_blocks(log_terms: _LogTerms, fast_width: float, yaw_delay: float) -> list[_Block]:
     """Return the solution of each block of a log that has a second or more outside of gaps."""
     dt, n, margin = log_terms.dt, len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
     is_kept = np.ones(n, bool)
@@ -325,7 +333,7 @@ def _solve_blocks(log_terms: _LogTerms, fast_width: float) -> list[_Block]:
             delay -= float(np.mean([fit[0][1] / fit[0][0] for fit in tilt_fits]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
         (roll, roll_variance, roll_influences), (pitch, pitch_variance, pitch_influences) = tilt_fits
-        yaw, yaw_variance, yaw_influences = _solve_samples(log_terms, 2, delay, indices, fast_width)
+        yaw, yaw_variance, yaw_influences = _solve_samples(log_terms, 2, delay + yaw_delay * dt, indices, fast_width)
         late = -(roll_influences[:, 1] / roll[0] + pitch_influences[:, 1] / pitch[0]) / 2
         samples = np.c_[roll_influences[:, 0], pitch_influences[:, 0], yaw_influences[:, :2], late]
         pieces = np.array_split(samples, max(1, round(len(indices) * dt / PIECE_DURATION)))
