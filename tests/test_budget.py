@@ -1,0 +1,50 @@
+"""The size of the package: a number of statements for each folder, which only goes down."""
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+import crazysim
+
+PACKAGE = Path(crazysim.__file__).parent
+SLACK = 40
+"""Statements that a folder may fall below its number before the number has to follow."""
+BUDGET = {
+    "commands": 1249,
+    "control": 2035,
+    "core": 1759,
+    "crazysim": 1401,
+    "drones": 531,
+    "dynamics": 593,
+    "engine": 6082,
+    "envs": 3901,
+    "geometry": 1097,
+    "lab": 9874,
+    "media": 1010,
+    "plugins": 7462,
+    "scene": 3153,
+    "sim": 1023,
+    "train": 2497,
+    "trajectories": 1431,
+}
+"""Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
+
+
+def count_statements(path):
+    statements = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.stmt)]
+    return len(statements) - sum(
+        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        for node in statements
+    )
+
+
+def test_every_folder_keeps_its_budget():
+    counts = Counter()
+    for path in PACKAGE.rglob("*.py"):
+        folder, *rest = path.relative_to(PACKAGE).parts
+        counts[folder if rest else "crazysim"] += count_statements(path)
+    assert counts.keys() == BUDGET.keys()
+    above = {name: f"{counts[name]} > {BUDGET[name]}" for name in counts if counts[name] > BUDGET[name]}
+    assert not above, "folders above their budget: remove what the change makes unnecessary"
+    below = {name: f"{counts[name]} < {BUDGET[name]}" for name in counts if counts[name] < BUDGET[name] - SLACK}
+    assert not below, "folders that have become smaller: lower their numbers in BUDGET"
