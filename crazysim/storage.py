@@ -66,6 +66,10 @@ def is_file(path: str | Path) -> bool:
         return False
 
 
+PART_BYTES = 2**20
+"""Size of the parts in which ``read_bytes`` reads a file, bytes."""
+
+
 def read_bytes(path: str | Path, max_bytes: int) -> bytes:
     """Return the contents of a file.
 
@@ -77,8 +81,13 @@ def read_bytes(path: str | Path, max_bytes: int) -> bytes:
         ConfigError: If it does not exist, cannot be read, or is larger.
     """
     try:
+        parts, size = [], 0
         with open_file(path, max_bytes) as file:
-            content = file.read(max_bytes + 1)
+            # In parts, because a read reserves memory for all bytes that it may return.
+            while size <= max_bytes and (part := file.read(min(PART_BYTES, max_bytes + 1))):
+                parts.append(part)
+                size += len(part)
+        content = b"".join(parts)
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         raise ConfigError(f"expected an existing file, got {str(path)[:200]!r}") from None
     except OSError as error:

@@ -13,7 +13,7 @@ BUDGET = {
     "commands": 1249,
     "control": 2035,
     "core": 1759,
-    "crazysim": 1401,
+    "crazysim": 1406,
     "drones": 531,
     "dynamics": 593,
     "engine": 6082,

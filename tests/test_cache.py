@@ -277,7 +277,7 @@ def test_a_second_process_finds_programs_of_the_first_one_by_default(tmp_path):
     assert first == second
     assert first.splitlines()[-1] == "None", "JAX's own configuration is not changed"
     assert n_first == n_second >= 2, "nothing is compiled again"
-    assert {"jit_sync_sim2mjx", "jit__observations"} <= {path.name.split("-")[0] for path in programs}
+    assert {"jit_sync_poses", "jit__observations"} <= {path.name.split("-")[0] for path in programs}
     assert sorted((tmp_path / "crazysim").rglob("*-cache")) == programs
 
 

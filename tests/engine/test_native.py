@@ -209,7 +209,7 @@ def test_nothing_partial_is_ever_seen(source, cache_folder, monkeypatch, tmp_pat
 
     monkeypatch.setattr(Path, "replace", replace)
     native.register_kernel(source)
-    assert listed == [[".tmp"]]
+    assert listed == [[".part"]]
     assert [p.suffix for p in cache_folder.iterdir()] == [".so"]
 
     monkeypatch.setenv("CXXFLAGS", "-std=c++98")

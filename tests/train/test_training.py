@@ -377,8 +377,8 @@ INVALID_HYPERPARAMETERS = {
     "iterations": ({"iterations": -1}, "iterations is -1; it must be"),
     "hidden": ({"hidden": [0]}, r"hidden\[0\] is 0; it must be"),
     "hidden number": ({"hidden": 64}, r"expected hidden as the sizes .*, got 64. Use for example \[64, 64\]"),
-    "memory": ({"memory": -1}, "expected memory as a whole number of at least 0, got -1. Use for example 64"),
-    "memory of a fraction": ({"memory": 0.5}, "expected memory as a whole number of at least 0, got 0.5"),
+    "memory": ({"memory": -1}, "expected memory as a whole number from 0 to 16384, got -1. Use for example 64"),
+    "memory of a fraction": ({"memory": 0.5}, "expected memory as a whole number from 0 to 16384, got 0.5"),
     "critic": (
         {"critic": "all"},
         "expected critic as one of observations, privileged, all_drones, all_drones_privileged, got 'all'",

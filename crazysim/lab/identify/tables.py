@@ -57,6 +57,10 @@ def _read_source(
     if isinstance(source, Mapping):
         return "log", _convert_time("log", source, columns)
     path = Path(source)
+    if path.is_file() and not is_bag(path) and (size := path.stat().st_size) > MAX_LOG_BYTES:
+        raise ConfigError(
+            f"{path.name}: expected a log of at most {MAX_LOG_BYTES} bytes, got {size}. Cut it into flights."
+        )
     if path.exists() and not path.is_dir():
         check_file(path)
     if is_bag(path) and path.exists():
@@ -64,10 +68,6 @@ def _read_source(
             return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
-    if (size := path.stat().st_size) > MAX_LOG_BYTES:
-        raise ConfigError(
-            f"{path.name}: expected a log of at most {MAX_LOG_BYTES} bytes, got {size}. Cut it into flights."
-        )
     if path.suffix.lower() in (".bbl", ".bfl"):
         raise ConfigError(
             f"{path.name}: expected a blackbox log as .csv, got a raw log. Convert it with blackbox_decode, or "
