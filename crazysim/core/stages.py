@@ -23,9 +23,6 @@ from crazysim.pytree import Members, PyTree, has_members, n_batch_axes, scopes, 
 
 FLOOR_HEIGHT = -0.001
 """Height of the floor, at which drones stop, m. It is slightly below zero: a negative height means a landed drone."""
-START_HEIGHT = 0.0
-"""Height at which drones start, m. The floor carries a drone that stands there, so that it does not fall when it
-starts."""
 
 
 _UNWATCHED = "unwatched"
@@ -136,8 +133,7 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
 
     def derivative_on_floor(data: SimData) -> SimStateDeriv:
         s, deriv = data.states, deriv_fn(data)
-        is_at_rest = (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
-        is_standing = ((s.pos[..., 2:] == FLOOR_HEIGHT) | (s.pos[..., 2:] == START_HEIGHT)) & is_at_rest
+        is_standing = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
         return deriv.replace(
             acc=jnp.where(is_standing, 0.0, deriv.acc), ang_acc=jnp.where(is_standing, 0.0, deriv.ang_acc)
         )
@@ -163,10 +159,8 @@ def stop_at_surface(s: SimState, surface_height: Array | float) -> SimState:
 
 @_built_in_stage("drone")
 def clip_floor_pos(data: SimData) -> SimData:
-    """Stop drones at the floor, and carry those that stand at the height of their start."""
-    height = data.states.pos[..., 2:]
-    surface_height = jnp.where(height == START_HEIGHT, START_HEIGHT, FLOOR_HEIGHT)
-    return data.replace(states=stop_at_surface(data.states, surface_height))
+    """Stop drones at the floor."""
+    return data.replace(states=stop_at_surface(data.states, FLOOR_HEIGHT))
 
 
 @_built_in_stage("world")

@@ -254,14 +254,3 @@ def test_law_09_wrong_settings(imu, message):
 def test_vibration_needs_rotors():
     with pytest.raises(ConfigError, match="vibration acts on single rotors"):
         Sim(dynamics="so_rpy", control="attitude").add(IMU(imbalance=1e-8))
-
-
-@pytest.mark.parametrize("integrator", ["euler", "symplectic_euler"])
-def test_a_drone_at_its_start_stands_on_the_floor(integrator):
-    """The accelerometer shows that the floor carries it from the first step on, and the drone stays where it is."""
-    sim = Sim(integrator=integrator, plugins=[IMU(accel=Triad())])
-    for _ in range(10):
-        sim.step()
-        accel = sim.plugins.observations(sim.data)["imu.accel"]
-        np.testing.assert_allclose(accel[0, 0], [0, 0, STANDARD_GRAVITY], atol=0.01)  # gravity of an airframe: 9.81
-    np.testing.assert_array_equal(sim.data.states.pos, sim.default_data.states.pos)
