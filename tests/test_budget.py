@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 531,
     "dynamics": 593,
     "engine": 6082,
-    "envs": 3901,
+    "envs": 3899,
     "geometry": 1097,
     "lab": 9874,
     "media": 1010,

@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 
 from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed
+from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
@@ -90,9 +90,9 @@ class DroneParallelEnv(ParallelEnv):
 
         Args:
             seed: Seed of all random numbers; None to continue the earlier sequence, or start from the system's entropy.
-            options: Ignored; there are no options, and PettingZoo's own test passes one that no environment has.
+            options: None; ``options["options"]``, which PettingZoo's ``parallel_api_test`` passes, has no effect.
         """
-        del options
+        read_options(options, "options")
         seed = as_seed(seed)
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)

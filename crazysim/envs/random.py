@@ -33,10 +33,15 @@ def as_seed(seed: object) -> int | None:
     return int(seed)
 
 
-def refuse_options(options: object) -> None:
-    """Check that a reset without options gets none."""
-    if options is not None and not (isinstance(options, Mapping) and not options):
-        raise ConfigError(f"expected no options of reset, got {short_repr(options)}. Leave options out.")
+def read_options(options: object, *names: str) -> dict[str, Any]:
+    """Return the options of a reset, which may have only these names."""
+    given = {} if options is None else options
+    if not isinstance(given, Mapping) or not given.keys() <= {*names}:
+        allowed = (
+            f"options of reset as a dict with {' and '.join(map(repr, names))}" if names else "no options of reset"
+        )
+        raise ConfigError(f"expected {allowed}, got {short_repr(options)}. Leave options out.")
+    return dict(given)
 
 
 def check_key(key: object) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed, refuse_options
+from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.rendering import Renderer
 from crazysim.envs.state import EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
@@ -91,7 +91,7 @@ class DroneVecEnv(VecEnv):
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
         for options in self._options:
-            refuse_options(options)
+            read_options(options)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed, refuse_options
+from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES
 from crazysim.envs.vector import DroneVectorEnv
@@ -49,7 +49,7 @@ class DroneSingleEnv(gymnasium.Env):
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
-        refuse_options(options)
+        read_options(options)
         super().reset(seed=as_seed(seed))
         obs, info = self.vector.reset(seed=int(self.np_random.integers(2**31)) if seed is None else seed)
         return _squeeze_world(obs), _squeeze_world(info)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -16,7 +16,7 @@ from crazysim.arguments import check_arguments, check_flag
 from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_mask, enum_member, positive_integer
 from crazysim.envs.env import Env
-from crazysim.envs.random import as_seed
+from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, check_actions, read_action
@@ -92,12 +92,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
-        if not isinstance(options, (Mapping, type(None))):
-            raise ConfigError(f"expected options of reset as a dict, got {short_repr(options)}")
-        options = dict(options or {})
-        mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
-        if options:
-            raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
+        mask = as_mask(read_options(options, "reset_mask").get("reset_mask"), (self.num_envs,))
         seed = as_seed(seed)
         require_unforked_process()
         state_before = self.state

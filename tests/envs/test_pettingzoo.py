@@ -96,6 +96,12 @@ def test_wrong_seeds_are_refused(env, seed):
         env.reset(seed=seed)
 
 
+def test_options_that_pettingzoos_own_test_does_not_pass_are_refused(env):
+    for options in ({"colour": 1}, {"reset_mask": [True]}, "all"):
+        with pytest.raises(ConfigError, match="expected options of reset as a dict with 'options', got"):
+            env.reset(options=options)
+
+
 def test_wrong_actions_are_refused(env):
     env.reset(seed=0)
     good = np.zeros(4)
