@@ -115,17 +115,18 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     inputs = [names.index(command), *_parameter_leaves(program, parameters, command)]
     sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *inputs, *program.written_leaves}}
     symbols = {leaf: casadi.SX.sym(names[leaf], size) for leaf, size in sizes.items()}
-    constants: dict[int, Any] = {}
 
     def initial_value(slot: Slot) -> Any:
         leaf, k = slot
         if leaf in symbols:
             return symbols[leaf][k]
-        if leaf not in constants:
-            constants[leaf] = casadi.SX(
-                casadi.DM(_drone_numbers(program.leaves[leaf].scope, leaves[leaf], world, drone))
+        number = _drone_numbers(program.leaves[leaf].scope, leaves[leaf], world, drone)[k]
+        if np.isnan(number):
+            raise ConfigError(
+                f"expected numbers for the constants of the step, got NaN in {names[leaf]!r} of world {world} and "
+                f"drone {drone}. Set it, or use parameters=[{names[leaf]!r}]."
             )
-        return constants[leaf][k]
+        return casadi.SX(float(number))
 
     written_values = _step_expressions(program, initial_value)
     next_values = {

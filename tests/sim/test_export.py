@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import INTEGRATORS, PAIRS, build_stagewise_step, hover_command, hover_rotor_state
 
-from crazysim import Battery, Downwash, Sim
+from crazysim import Battery, ConfigError, Downwash, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Axes, stage
@@ -180,6 +180,27 @@ def test_constants_are_those_of_the_selected_drone():
     climbs = [to_casadi(sim, world=w, drone=d)(x, u)[9] for w, d in ((0, 0), (1, 1))]
     thrust = [(float(v) / to_casadi(sim).dt + 9.81) * m for v, m in zip(climbs, (0.03, 0.06), strict=True)]
     np.testing.assert_allclose(thrust[0], thrust[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy"])
+def test_every_constant_that_is_nan_is_named(dynamics):
+    """Numbers that the step does not read, and states, which are no constants, may be NaN."""
+    sim = Sim(1, 2, dynamics=dynamics)
+    usual, names, refused = sim.data, Axes(sim.data).names, []
+    constants = [x for x, a in zip(names, jax.tree.leaves(usual), strict=True) if x.startswith("params.") and a.size]
+    for name in constants:
+        (old,) = fields(usual, [name])
+        sim.data = with_fields(usual, {name: np.full(old.shape, np.nan, old.dtype)})
+        try:
+            step = to_casadi(sim)
+        except ConfigError as error:
+            refused.append(str(error).partition("got NaN in ")[2].partition(" of world 0 and drone 0.")[0])
+            step = to_casadi(sim, [name])
+            assert refused[-1] == repr(name)
+            assert list(step.p.sizes) == [name]
+        else:
+            assert np.isfinite(np.asarray(step(step.x.of(usual), step.u.of(usual)))).all()
+    assert "'params.mass'" in refused
 
 
 def test_stages_of_the_user_are_exported_with_their_memory():
