@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "crazysim").rglob("*.py"))
 
-QUESTION_WORDS = ("What", "Whether", "How", "Where", "Which", "Who", "Why")
+QUESTION_WORDS = ("What", "How", "Where", "Which", "Who", "Why")
 """Never the first word of a docstring, or of the description of an argument or a result."""
 
 REMEDY = re.compile(
@@ -72,8 +72,8 @@ def violations(source):
     for line, kind, text in docstrings(tree):
         if text.split()[0] in QUESTION_WORDS:
             result.append((line, f"a {kind} docstring begins with {text.split()[0]!r}"))
-        if kind == "flag" and not text.startswith("True "):
-            result.append((line, f"the docstring of a flag begins with {text.split()[0]!r}, not with 'True where'"))
+        if kind == "flag" and not text.startswith(("Whether ", "True ")):
+            result.append((line, f"the docstring of a flag begins with {text.split()[0]!r}, not with 'Whether'"))
         result += [
             (line, f"a description begins with {word!r}") for word in descriptions(text) if word in QUESTION_WORDS
         ]
@@ -97,7 +97,7 @@ def test_prose_of_the_package(path):
 BAD = '''
 class Record:
     done: bool
-    """Whether it is over."""
+    """If it is over."""
     obs: int
     """What a policy is told."""
 
@@ -115,12 +115,14 @@ def f(x):
 def test_the_check_finds_each_kind_of_violation():
     complaints = [complaint for _, complaint in violations(BAD)]
     for expected in (
-        "a flag docstring begins with 'Whether'",
         "a field docstring begins with 'What'",
-        "not with 'True where'",
+        "a flag begins with 'If', not with 'Whether'",
         "a description begins with 'How'",
         "assert:",
         "message without a remedy",
     ):
         assert any(expected in complaint for complaint in complaints), expected
+    good = BAD[: BAD.index("obs")].replace("If", "Whether")
+    assert not violations(good)
+    assert not violations(good.replace("Whether it", "True where it"))
     assert not violations('"""Module."""\n\n\ndef f(x):\n    """Return x."""\n    return x\n')
