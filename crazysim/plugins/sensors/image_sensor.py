@@ -24,7 +24,7 @@ from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, sampling_period
+from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
@@ -292,8 +292,7 @@ class ImageSensor(Plugin):
 
     def age(self, data: SimData) -> Array:
         """Return the time since the last images were taken, s; infinite before the first ones. (n_worlds, 1)"""
-        taken_step = self.read(data).taken_step
-        return jnp.where(taken_step >= 0, (data.core.steps - 1 - taken_step) / data.core.freq, jnp.inf)
+        return age_at(data, self.read(data).taken_step)
 
     def _drone_camera(self, sim: Simulation) -> DroneCamera:
         fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]

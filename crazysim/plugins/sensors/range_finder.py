@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import sampling_period
+from crazysim.plugins.sensors.sensor import age_at, sampling_period
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
@@ -44,6 +44,8 @@ class RangeFinderData(PyTree):
     """Unit directions of the rays, body frame. (n_rays, 3)"""
     max_range: Array = leaf("shared", 0)
     """Largest distance measured, m. ()"""
+    taken_step: Array = leaf("drone", 1)
+    """Step in which the distances were measured, negative before the first one. (n_worlds, n_drones, 1)"""
 
 
 class RangeFinder(Plugin):
@@ -73,11 +75,13 @@ class RangeFinder(Plugin):
         )
         if rays.ndim != 2 or rays.shape[1] != 3 or not rays.any(axis=-1).all():
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
-        sampling_period(self, sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        max_range = float(self.max_range)
-        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), max_range)
-        return RangeFinderData(device_array(distance), device_array(rays), device_array(max_range))
+        return RangeFinderData(
+            drone_array(sim, self.max_range, len(rays)),
+            device_array(rays),
+            device_array(float(self.max_range)),
+            device_array(np.full((sim.n_worlds, sim.n_drones, 1), -1), np.int32),
+        )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that measures.
@@ -126,6 +130,10 @@ class RangeFinder(Plugin):
         """Return the distances, m."""
         return {"distance": self.read(data).distance}
 
+    def age(self, data: SimData) -> Array:
+        """Return the time since the distances were measured, s; infinite before the first ones. (..., 1)"""
+        return age_at(data, self.read(data).taken_step)
+
     def draw(self, sim: Simulation, world: int) -> None:
         if not self.visible:
             return
@@ -150,5 +158,8 @@ class RangeFinder(Plugin):
         hits = cast_rays(
             model, data, origin, direction, ignored_drones, self.drones, kernels=kernels, limit=record.max_range
         )
-        distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
-        return record.replace(distance=distance[0] if is_single_drone else distance)
+        taken_step = jnp.broadcast_to(data.core.steps[..., None], (*pos.shape[:-1], 1))
+        return record.replace(
+            distance=jnp.minimum(hits.distance, record.max_range).reshape(record.distance.shape),
+            taken_step=taken_step.reshape(record.taken_step.shape),
+        )

@@ -154,10 +154,8 @@ class Sensor(Plugin):
         return self.split(self.latest(data))[channel]
 
     def age(self, data: SimData) -> Array:
-        """Return the time since the latest measurement was taken, s; zero before the first one arrives. (..., 1)"""
-        taken_step = self.read(data).samples.taken_step
-        steps = data.core.steps[..., None] if taken_step.ndim > data.core.steps.ndim else data.core.steps
-        return jnp.where(taken_step >= 0, (steps - 1 - taken_step) / data.core.freq, 0.0)
+        """Return the time since the latest measurement was taken, s; infinite before the first one arrives. (..., 1)"""
+        return age_at(data, self.read(data).samples.taken_step)
 
     def split(self, value: Array) -> dict[str, Array]:
         """Return the parts of a measurement by the names of ``channels``. (..., n) each"""
@@ -221,6 +219,12 @@ class Sensor(Plugin):
             value = jnp.where(has_arrived, samples.queue[row], value)
             taken_step = jnp.where(has_arrived, step - step % period - row * period, taken_step)
         return self.write(data, record.replace(samples=samples.replace(value=value, taken_step=taken_step)))
+
+
+def age_at(data: SimData, taken_step: Array) -> Array:
+    """Return the time since a step in which measurements were taken, s; infinite if it is negative. (..., 1)"""
+    steps = data.core.steps[..., None] if taken_step.ndim > data.core.steps.ndim else data.core.steps
+    return jnp.where(taken_step >= 0, (steps - 1 - taken_step) / data.core.freq, jnp.inf)
 
 
 def sampling_period(sensor: Any, sim: Simulation) -> int:

@@ -1,5 +1,7 @@
 """Every sensor: fused with the physics, with changing measurements, reproducible, and differentiable."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from sweep import REQUIRED_BY, SENSORS
 
 from crazysim import Sim
 from crazysim.plugins import sensors
-from crazysim.plugins.sensors import IMU
+from crazysim.plugins.sensors import IMU, Camera, Lidar
 
 
 def test_all_sensors_are_tested():
@@ -28,6 +30,10 @@ def test_all_sensors_are_tested():
     }
     assert {type(sensor()).__name__ for sensor in SENSORS.values()} == names
     assert all(sensor().name == name for name, sensor in SENSORS.items())
+
+
+def fields_of(kind):
+    return dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
 
 
 def build(n_worlds, names, **settings):
@@ -55,6 +61,31 @@ def measurements(sim, data):
 def sim():
     """Return a simulation with every sensor."""
     return build(3, SENSORS)
+
+
+@pytest.mark.long("compiles a step with every sensor")
+def test_the_age_of_every_sensor_is_infinite_until_it_has_measured():
+    names = {x for x in sensors.__all__ if "freq" in {field.name for field in fields_of(getattr(sensors, x))}}
+    sim = build(2, SENSORS)
+    for sensor in (Camera(2, 1), Lidar((0.0,), (0.0,))):
+        sim.add(sensor)
+    all_sensors = [x for x in sim.plugins.values() if type(x).__name__ in names]
+    assert {type(x).__name__ for x in all_sensors} == names - {"ImageSensor", "Sensor"}
+
+    def ages(world):
+        return {x.name: np.asarray(x.age(sim.data))[world].max() for x in all_sensors}
+
+    late = {x.name for x in all_sensors if getattr(x, "delay", 0) or getattr(x, "dropout", 0)}
+    assert set(ages(0).values()) == {np.inf}
+    sim.step()
+    first = ages(0)
+    assert {name for name in first if first[name] > 0} == late
+    sim.step(29)
+    last = ages(0)
+    assert max(last.values()) < 0.04
+    sim.reset(np.array([False, True]))
+    assert ages(0) == last
+    assert set(ages(1).values()) == {np.inf}
 
 
 def test_every_sensor_is_fused(sim):
