@@ -79,6 +79,9 @@ class PyTree:
             data_fields=[f.name for f in fields if not f.metadata.get("static")],
             meta_fields=[f.name for f in fields if f.metadata.get("static")],
         )
+        for f in fields:  # a class attribute would hide a leaf of a lazy record, which is made when it is first read
+            if CORE_NDIM_KEY in f.metadata and f.name in vars(cls):
+                delattr(cls, f.name)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with the given fields replaced."""

@@ -18,6 +18,7 @@ from crazysim import Sim, load_airframe, reduce_over_others, stage
 from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
+from crazysim.core.plugin import Plugin
 from crazysim.core.stage import as_stages
 from crazysim.core.stages import nonfinite_worlds
 from crazysim.dynamics import first_principles
@@ -282,10 +283,12 @@ def count_documented_arrays(record, **sizes):
 def _documented_shapes(record):
     """Return the shape that the docstring of every field of a record ends with, None where it has none."""
     (base,) = record.__bases__
-    shapes = {} if base is PyTree else _documented_shapes(base)
+    shapes = {} if base in (PyTree, Plugin) else _documented_shapes(base)
     body = ast.parse(inspect.getsource(record)).body[0].body
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign):
+            if field.target.id == "name":
+                continue
             assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"
             shape = re.search(r"\(([\w, ]*)\)$", text.value.value)
             shapes[field.target.id] = None if shape is None else shape[1]

@@ -12,8 +12,8 @@ SLACK = 40
 BUDGET = {
     "commands": 1249,
     "control": 2035,
-    "core": 1759,
-    "crazysim": 1406,
+    "core": 1866,
+    "crazysim": 1409,
     "drones": 531,
     "dynamics": 593,
     "engine": 6082,

@@ -26,7 +26,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     an effect, or the derivative would be evaluated at a state that the drone does not have.
     """
     title = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
-    changed_data = _call_method(title, plugin.influence, data)
+    changed_data = _call_method(title, plugin.bound(data).influence, data)
     if not isinstance(changed_data, SimData):
         raise ConfigError(f"expected {title} to return SimData, got {type(changed_data).__name__}. Use 'return data'.")
     paths, treedef = jax.tree_util.tree_flatten_with_path(data)
@@ -57,7 +57,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
 def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     """Return the time derivatives of a plugin's states, by field of its record, after checking them."""
     title = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
-    rates = _call_method(title, plugin.derivative, data, plugin.scope)
+    rates = _call_method(title, plugin.bound(data).derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):
         raise ConfigError(
             f"expected {title} to return a dict of fields of its record to rates, got {type(rates).__name__}. "
@@ -88,7 +88,9 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative with the constraint of a plugin applied."""
     title = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
-    return _call_method(title, lambda scope_data: plugin.constrain(scope_data, deriv, dt), data, plugin.coupling)
+    return _call_method(
+        title, lambda scope_data: plugin.bound(scope_data).constrain(scope_data, deriv, dt), data, plugin.coupling
+    )
 
 
 def _call_method(title: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:

@@ -7,9 +7,11 @@ compiling the step again, is in its record, ``data.plugins[plugin.name]``. Most 
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, dataclass_transform
 
 import numpy as np
 from jax import Array
@@ -18,13 +20,19 @@ from numpy.typing import ArrayLike, DTypeLike
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, collect_settings, setting
+from crazysim.core.stage import Stage
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
-from crazysim.pytree import PyTree, device_array
-from crazysim.tables import Shapes, range_between, read_numbers
+from crazysim.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
+from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
 R = TypeVar("R", bound=PyTree)
+
+Param = Any
+"""A number of a plugin: what a user writes, such as 0.1, a list or an array, and an array in ``data.plugins``."""
+CoreShape = tuple[int | Literal["rotors"], ...]
+"""Shape of an array of one drone, with ``"rotors"`` for the number of its rotors."""
 
 
 class Simulation(Protocol):
@@ -38,6 +46,7 @@ class Simulation(Protocol):
     integrator: Any
     n_worlds: int
     n_drones: int
+    plugins: Mapping[str, Plugin]
     lock: AbstractContextManager[object]
 
     @property
@@ -99,6 +108,99 @@ def parameter(
     return dataclasses.field(default=default, metadata={"setting": declaration})
 
 
+def param(
+    *,
+    default: Any = dataclasses.MISSING,
+    core: CoreShape = (1,),
+    scope: Scope = "parameter",
+    airframe: str | Callable[[Airframe], ArrayLike] | None = None,
+    low: float = -np.inf,
+    high: float = np.inf,
+    positive: bool = False,
+    per_axis: bool = False,
+    dtype: DTypeLike | None = None,
+    whole: bool = False,
+    shapes: Shapes | None = None,
+    sparse: bool = False,
+    keep: bool = True,
+) -> Any:
+    """Declare a number of a plugin, which is an array in ``data.plugins``; another value compiles nothing.
+
+    Args:
+        default: Default value; None for the airframe's value, or for none.
+        core: Shape of the number of one drone.
+        scope: ``"parameter"`` for a number for all drones or one per drone, ``"shared"`` for one for all drones, or
+            ``"drone"`` for a state that begins an episode with this number.
+        airframe: Dotted path or function of the airframe that gives the number if it is None.
+        low: Smallest value allowed.
+        high: Largest value allowed.
+        positive: True to refuse zero and negative values.
+        per_axis: True to accept one number for all axes of a vector.
+        dtype: Type; None for the type of the states.
+        whole: True for a whole number, of the type of the states unless ``dtype`` is another.
+        shapes: Shapes of a shared number, ``"any"`` for an axis of any length.
+        sparse: As in ``crazysim.pytree.leaf``.
+        keep: False for a number that only ``bind`` reads, to calculate others; it is None in ``data.plugins``.
+    """
+    number_type = np.int32 if whole and dtype is None else dtype
+    declaration = Setting(range_between(low, high, positive), True, per_axis, number_type, shapes)
+    metadata: dict[str, Any] = {"setting": declaration}
+    if keep:
+        metadata |= _leaf_metadata(scope, core, sparse=sparse, dtype=dtype, airframe=airframe)
+    return dataclasses.field(default=default, metadata=metadata | {"static": not keep, "keep": keep})
+
+
+def state(
+    core: CoreShape = (1,),
+    *,
+    scope: Scope = "drone",
+    dtype: DTypeLike | None = None,
+    optional: bool = False,
+    scratch: bool = False,
+    init: Literal[False] = False,  # noqa: ARG001
+) -> Any:
+    """Declare a state of a plugin: an array in ``data.plugins`` that the plugin changes, zero at first.
+
+    Args:
+        core: Shape of the state of one drone, or of one world.
+        scope: ``"drone"`` or ``"world"``.
+        dtype: Type; None for the type of the states.
+        optional: True for a state that is None unless ``bind`` gives it a value.
+        scratch: As in ``crazysim.pytree.leaf``.
+        init: For type checkers: users do not set states.
+    """
+    metadata = _leaf_metadata(scope, core, scratch=scratch, dtype=dtype, optional=optional)
+    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
+
+
+def part(default: PyTree) -> Any:
+    """Declare a record with numbers and states of its own, declared with ``param`` and ``state``."""
+    return dataclasses.field(default=default, metadata={"part": True})
+
+
+def _leaf_metadata(scope: Scope, core: CoreShape, **details: Any) -> dict[str, Any]:
+    fixed_core = None if "rotors" in core or scope == "shared" else core
+    metadata = {"scope": scope, CORE_NDIM_KEY: len(core), "core": fixed_core, "shape": core}
+    return {"sparse": False, "scratch": False, **metadata, **details}
+
+
+def _declare_static_fields(cls: type) -> None:
+    """Make every new field without a declaration static; a field of a base class keeps its declaration."""
+    inherited = {f.name: f.metadata for base in reversed(cls.__mro__[1:])
+                 for f in vars(base).get("__dataclass_fields__", {}).values()}  # fmt: skip
+    for name, hint in inspect.get_annotations(cls).items():
+        if "ClassVar" in str(hint) or name == "_":
+            continue
+        field = vars(cls).get(name, dataclasses.MISSING)
+        if not isinstance(field, dataclasses.Field):
+            field = dataclasses.field(default=field)
+            setattr(cls, name, field)
+        metadata = {**inherited.get(name, {}), **field.metadata}
+        if not metadata.keys() & {"scope", "part", "static"}:
+            metadata["static"] = True
+        field.metadata = MappingProxyType(metadata)
+
+
 def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
     """Return a quantity of the airframes for ``check_parameter``: one value for all drones, or one per drone.
 
@@ -146,7 +248,18 @@ def check_parameter(
     Returns:
         (*core) or (n_worlds, n_drones, *core)
     """
-    allowed_range = range_between(low, high, positive)
+    return _read_parameter(sim, name, value, core, range_between(low, high, positive), dtype, per_axis)
+
+
+def _read_parameter(
+    sim: Simulation,
+    name: str,
+    value: ArrayLike,
+    core: tuple[int, ...],
+    allowed: Range = ANY_NUMBER,
+    dtype: DTypeLike | None = None,
+    per_axis: bool = False,
+) -> Array:
     batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
     if core == (1,) and array.shape == batch:
         array = array[..., None]
@@ -158,7 +271,7 @@ def check_parameter(
             f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
             f"{array.dtype}"
         )
-    array = read_numbers(name, array, allowed_range, whole=array.dtype.kind != "f")
+    array = read_numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
 
@@ -169,17 +282,91 @@ def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, setting, dataclasses.field))
-class Plugin:
+def bind_fields(sim: Simulation, record: R, **values: Any) -> R:
+    """Return a plugin, or a part of one, with arrays for the numbers and states that have no value yet.
+
+    Args:
+        sim: The simulation.
+        record: The plugin or part as the user wrote it.
+        values: Values of fields. If a value is None, the user's number is still checked.
+    """
+    bound = dict(values)
+    for field in dataclasses.fields(record):  # type: ignore[arg-type]
+        name, value = field.name, getattr(record, field.name)
+        if field.metadata.get("part"):
+            bound.setdefault(name, value if value is None else bind_fields(sim, value))
+        elif "scope" in field.metadata and values.get(name) is None:
+            bound.setdefault(name, _bind_leaf(sim, name, value, field.metadata))
+        elif not field.metadata.get("keep", True):
+            bound.setdefault(name, None)
+    return record.replace(**bound)
+
+
+def _airframe_number(airframe: Airframe, source: Any, shape: CoreShape, core: tuple[int, ...]) -> np.ndarray:
+    """Return a number of an airframe, zero for rotors that it lacks beside the other drones. ``core`` or ()"""
+    value = np.asarray(source(airframe) if callable(source) else airframe.value(source))
+    if "rotors" not in shape:
+        return value
+    return np.pad(
+        value, [(0, n - k if axis == "rotors" else 0) for n, k, axis in zip(core, value.shape, shape, strict=True)]
+    )
+
+
+def _bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any]) -> Array | None:
+    """Return the array of a field for all worlds."""
+    shape, scope, dtype = metadata["shape"], metadata["scope"], metadata["dtype"] or sim.data.states.pos.dtype
+    n_rotors = sim.data.states.rotor_vel.shape[-1]
+    core = tuple([n_rotors if n == "rotors" else n for n in shape])
+    declaration = metadata.get("setting", Setting())
+    if value is None and (source := metadata.get("airframe")) is not None:
+        value = airframe_numbers(sim, lambda airframe: _airframe_number(airframe, source, shape, core))
+    if value is None and (metadata.get("optional") or "setting" in metadata):
+        return None
+    if scope == "shared":
+        return device_array(value, dtype)
+    batch = (sim.n_worlds, 1) if scope == "world" else sim.data.states.pos.shape[:2]
+    if value is None or scope == "world":
+        return device_array(np.broadcast_to(value or 0, (*batch, *core)), dtype)
+    array = _read_parameter(sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis)
+    return device_array(np.broadcast_to(array, (*batch, *core)), dtype) if scope == "drone" else array
+
+
+Requirement = type | Callable[[Simulation, Any], None]
+"""A class of plugins, one of which must be added too, or a function that raises an error."""
+
+
+def _is_kept(kind: type, name: str) -> bool:
+    return kind.__dataclass_fields__[name].metadata.get("keep", True)  # type: ignore[attr-defined]
+
+
+@dataclass_transform(
+    frozen_default=True, eq_default=False, field_specifiers=(param, state, part, parameter, setting, dataclasses.field)
+)
+class Plugin(PyTree):
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
-    A subclass lists its settings as annotated fields, including ``name``; it becomes a frozen dataclass. It
-    overrides some of the methods below. Methods that take ``data`` are written for one drone, unless they say
-    otherwise: leaves of drones and worlds have no batch axes, so ``data.states.pos`` is (3,).
+    A plugin is numbers, declared with ``param``, states, declared with ``state``, and stages. Other annotated fields,
+    including ``name``, are hashable settings; the class becomes a frozen dataclass. ``sim.add`` binds it:
+    ``data.plugins[plugin.name]`` is the same plugin with arrays, and the methods below are called on it. Methods that
+    take ``data`` are written for one drone, unless they say otherwise: leaves of drones and worlds have no batch axes,
+    so ``data.states.pos`` and ``self.noise`` are (3,).
     """
 
-    name: str
-    """Name of the plugin: the key of its record in ``data.plugins``, and the name of its stage."""
+    if TYPE_CHECKING:  # each class lists it among its own fields, with its default
+
+        @property
+        def name(self) -> str:
+            """Name of the plugin: its key in ``data.plugins``, and the name of its stage."""
+            ...
+
+    is_bound: bool = dataclasses.field(default=False, kw_only=True, repr=False, metadata={"static": True})
+    """True for a plugin in ``data.plugins``, with arrays."""
+    replaced_terms: ClassVar[tuple[str, ...]] = ()
+    """Terms of the dynamics model that the plugin replaces or adds, such as ``"drag"``, declared as
+    ``class Plugin(..., replaces=("drag",))``. Two plugins that replace the same term are refused."""
+    requires: ClassVar[tuple[Requirement, ...]] = ()
+    """Requirements on the simulation, declared as ``class Plugin(..., requires=Rotors)``: classes of other plugins, or
+    functions of the simulation and the plugin that raise an error."""
     order: ClassVar[int] = 0
     """Influences are applied in ascending order, and by name within the same order. Plugins that replace commands
     have a negative order, so that other plugins can limit the new commands."""
@@ -189,16 +376,67 @@ class Plugin:
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode, because it uses
     results of earlier stages. None to call it at resets, and again in the first step, before all other stages."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make every subclass a frozen dataclass."""
+    def __init_subclass__(
+        cls, replaces: tuple[str, ...] = (), requires: Requirement | tuple[Requirement, ...] = (), **kwargs: Any
+    ) -> None:
+        """Make every subclass a frozen dataclass, whose numbers and states are leaves for JAX."""
+        if replaces:
+            cls.replaced_terms = replaces
+        cls.requires = (*cls.requires, *(requires if isinstance(requires, tuple) else (requires,)))
+        _declare_static_fields(cls)
         super().__init_subclass__(**kwargs)
-        dataclasses.dataclass(frozen=True, eq=False)(cls)
         if "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
             raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
-        check_settings(self)
+        if not self.is_bound:
+            check_settings(self)
+
+    def bind(self, sim: Simulation) -> Self:
+        """Return the plugin with arrays, as it will be in ``data.plugins``; check it with the simulation.
+
+        Override it for numbers that follow from others: ``return self.with_arrays(sim, radius=...)``.
+        """
+        return self.with_arrays(sim)
+
+    def with_arrays(self, sim: Simulation, **values: Any) -> Self:
+        """Return the plugin with arrays for its numbers and states: the given values, the user's, the airframe's or 0.
+
+        Args:
+            sim: The simulation.
+            values: Values of fields. If a value is None, the user's number is still checked.
+        """
+        statics = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
+        for name, value in statics.items():
+            if isinstance(value, list) and name not in values:
+                values[name] = value = tuple(value)
+            try:
+                hash(values.get(name, value) if _is_kept(type(self), name) else None)
+            except TypeError:
+                raise ConfigError(
+                    f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "
+                    f"numbers with param(...), or use a tuple."
+                ) from None
+        return bind_fields(sim, self, is_bound=True, **values)
+
+    def bound(self, data: SimData) -> Self:
+        """Return the plugin with the arrays of data of any scope; the plugin itself if it has none."""
+        record = data.plugins.get(self.name)
+        return record if isinstance(record, type(self)) else self
+
+    def stage(
+        self, method: Callable[[SimData], SimData], scope: str | None = None, when: Any = None, **details: Any
+    ) -> Stage:
+        """Return a stage that calls a method of this class on the plugin in ``data.plugins``.
+
+        Args:
+            method: The method, such as ``self.discharge``.
+            scope: Scope that the method is written for; None for ``self.scope``.
+            when: As in ``crazysim.stage``.
+            details: Further arguments of ``Stage``.
+        """
+        return Stage(BoundMethod(self, method.__func__), scope or self.scope, when, **details)  # type: ignore[attr-defined]
 
     @property
     def is_dynamic(self) -> bool:
@@ -217,21 +455,18 @@ class Plugin:
         """Scope of the plugin's own states, and of the data that ``derivative`` and ``reset_episode`` take."""
         return "drone"
 
-    @property
-    def replaced_terms(self) -> tuple[str, ...]:
-        """Terms of the dynamics model that the plugin replaces or adds, such as ``"drag"``.
-
-        Two plugins that replace the same term are refused.
-        """
-        return ()
+    @classmethod
+    def has_arrays(cls) -> bool:
+        """True if the class declares numbers, states or parts."""
+        return any(f.metadata.keys() & {"scope", "part"} for f in dataclasses.fields(cls))
 
     def record(self, sim: Simulation) -> PyTree | None:
-        """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.
+        """Return what ``data.plugins`` has for all worlds: the plugin with arrays, or None if it needs none.
 
         Args:
             sim: The simulation that the plugin is being added to.
         """
-        return None
+        return self.bind(sim) if self.has_arrays() else None
 
     def default_record(self, sim: Simulation) -> PyTree | None:
         """Return the record that resets restore; by default the result of ``record``."""
@@ -279,6 +514,19 @@ class Plugin:
 
         A plugin on which the check depends cannot be removed.
         """
+        for companion in self.requires:
+            if isinstance(companion, type) and not any(isinstance(x, companion) for x in sim.plugins.values()):
+                raise ConfigError(
+                    f"expected a simulation with a {companion.__name__}, which {type(self).__name__} {self.name!r} "
+                    f"needs, got {', '.join(map(repr, sim.plugins)) or 'no plugin'}. Use sim.add({companion.__name__}"
+                    f"(...)) first."
+                )
+
+    def check_simulation(self, sim: Simulation) -> None:
+        """Check the requirements of the class on the simulation that the plugin is being added to."""
+        for requirement in self.requires:
+            if not isinstance(requirement, type):
+                requirement(sim, self)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""
@@ -366,7 +614,7 @@ class Plugin:
         """Draw overlays into the next image of a world, on ``sim.scene``."""
 
     def read(self, data: SimData) -> Any:
-        """Return the plugin's record in data of any scope.
+        """Return the plugin with the arrays of data of any scope, or its record.
 
         Raises:
             UnknownNameError: If the data has none: the plugin was not added, or was removed.
@@ -382,6 +630,24 @@ class Plugin:
     def write(self, data: SimData, record: PyTree) -> SimData:
         """Return data of any scope with another record of this plugin."""
         return data.replace(plugins=data.plugins | {self.name: record})
+
+
+@dataclasses.dataclass(frozen=True)
+class BoundMethod:
+    """Function of a stage: a method that is called on the plugin in ``data.plugins``."""
+
+    plugin: Plugin
+    """The plugin that was added."""
+    method: Callable[[Any, SimData], SimData]
+    """The method, a function of the plugin and the data."""
+
+    @property
+    def __name__(self) -> str:
+        return self.method.__name__
+
+    def __call__(self, data: SimData) -> SimData:
+        """Return the data after the stage."""
+        return self.method(self.plugin.bound(data), data)
 
 
 def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
@@ -408,7 +674,7 @@ def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
     """
     measured = {}
     for plugin in plugins:
-        measured |= plugin.measured_states(data)
+        measured |= plugin.bound(data).measured_states(data)
     return data.replace(states=data.states.replace(**measured))
 
 

@@ -141,6 +141,7 @@ def check_settings(settings: Any) -> None:
         if value is None and field.default is None:
             continue
         declared = collect_settings(settings_class)[field.name]
+        value_types = value_types or ((np.ndarray,) if declared.is_parameter else ())
         check_value(
             f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
             declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),

@@ -20,7 +20,7 @@ from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import collect_settings
-from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
+from crazysim.core.stage import Axes, is_first_step, vmap_drones, vmap_worlds
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.sensors.sensor import Sensor
@@ -110,7 +110,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
             resets = dict(self._sim.reset_pipeline)
             if _is_in_reset_pipeline(plugin):
-                append_fn(resets, Stage(plugin.reset_episode, plugin.scope), name)
+                append_fn(resets, plugin.stage(plugin.reset_episode), name)
             self._put_records(name, record, default)
             self._installed[name] = installed
             self._build(pipeline, resets)
@@ -265,6 +265,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def _make_records(self, plugin: Plugin) -> tuple[PyTree | None, PyTree | None, bool]:
         """Return record and default record of a plugin, and whether they depend on the scene."""
         n_reads = self._sim.scene.n_reads
+        plugin.check_simulation(self._sim)
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
         return record, default, self._sim.scene.n_reads != n_reads
 
@@ -308,7 +309,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
         if _is_in_reset_pipeline(plugin) and (name in resets or not _is_in_reset_pipeline(old_plugin)):
-            resets[name] = Stage(plugin.reset_episode, plugin.scope)
+            resets[name] = plugin.stage(plugin.reset_episode)
         elif _is_in_reset_pipeline(old_plugin):
             resets.pop(name, None)
         self._put_records(name, _carry_over(plugin, record, old_record), default)
@@ -421,7 +422,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def _moved_objects(self, name: str, data: SimData) -> Objects:
         plugin = self[name]
         if self._move_objects.get(name, (None, None))[0] is not plugin:
-            self._move_objects[name] = plugin, jax.jit(vmap_worlds(plugin.move_objects))
+            self._move_objects[name] = plugin, jax.jit(vmap_worlds(lambda data: plugin.bound(data).move_objects(data)))
         return self._move_objects[name][1](data)
 
     def draw(self, world: int) -> None:
@@ -467,7 +468,7 @@ def _stage_placements(plugin: Plugin, sim: Simulation) -> object:
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
-    episode_stage = Stage(plugin.reset_episode, plugin.scope, is_first_step)
+    episode_stage = plugin.stage(plugin.reset_episode, when=is_first_step)
     before = plugin.reset_before
     if before is None:  # after the stages that begin an episode for other plugins, before all other stages
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
@@ -648,7 +649,9 @@ def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> d
     def observe_drone(drone: SimData) -> dict[str, Array]:
         measured_drone = with_measured_states(plugins, drone) if measured else drone
         sources = [(p, drone if isinstance(p, Sensor) else measured_drone) for p in plugins]
-        return {f"{p.name}.{key}": x for p, values in sources for key, x in p.observations(values).items()}
+        return {
+            f"{p.name}.{key}": x for p, values in sources for key, x in p.bound(values).observations(values).items()
+        }
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     world_axes = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]

@@ -370,7 +370,10 @@ def test_all_parts_of_the_package_begin_episodes_by_one_method():
     sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
     begin_stages = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
     names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
-    assert begin_stages == {f"{name}_begin": sim.plugins[name].reset_episode for name in names}
+    assert {key: fn.plugin for key, fn in begin_stages.items()} == {
+        f"{name}_begin": sim.plugins[name] for name in names
+    }
+    assert all(fn.method is type(fn.plugin).reset_episode for fn in begin_stages.values())
     assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"
 
 

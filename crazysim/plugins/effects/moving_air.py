@@ -10,11 +10,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, airframe_numbers, check_parameter
+from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter
+from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, device_array, leaf
 
 
 class BodiesInAir(PyTree):
@@ -88,6 +89,27 @@ def require_rotors(sim: Simulation, effect: str) -> None:
     """Check that the model has rotors."""
     if not isinstance(sim.data.params, first_principles.Params):
         raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
+
+
+def needs_rotors(sim: Simulation, plugin: Plugin) -> None:
+    """Check that the model has rotors, as a requirement of a class of plugins."""
+    require_rotors(sim, type(plugin).__name__)
+
+
+def needs_drag(sim: Simulation, plugin: Plugin) -> None:
+    """Check that moving air would push the drones, as a requirement of a class of plugins."""
+    require_drag(sim, type(plugin).__name__)
+
+
+def rotor_positions(sim: Simulation) -> Array:
+    """Return the positions of the rotors, body frame, m; zero for rotors that a drone lacks. (..., n_rotors, 3)"""
+    n_rotors = sim.data.states.rotor_vel.shape[-1]
+
+    def read_airframe(airframe: Airframe) -> np.ndarray:
+        positions = airframe.value("rotors.position")
+        return np.pad(positions, [(0, n_rotors - len(positions)), (0, 0)])  # missing rotors have no thrust
+
+    return device_array(airframe_numbers(sim, read_airframe), sim.data.states.pos.dtype)
 
 
 def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:

@@ -16,7 +16,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
+from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
 from crazysim.plugins.effects.moving_air import MovingAir, has_drag, require_drag, require_rotors, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
@@ -178,7 +178,7 @@ class Randomize(Plugin):
     def check_plugins(self, sim: Simulation) -> None:
         records = sim.data.plugins.values()
         latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
-        has_battery = any(isinstance(x, BatteryData) for x in records)
+        has_battery = any(isinstance(x, Battery) for x in records)
         has_any_drag = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
         requirements = {
             "charge": (has_battery, "a battery", "sim.add(Battery())"),
@@ -255,7 +255,7 @@ class Randomize(Plugin):
 
         records = dict(data.plugins)
         for name, other in data.plugins.items():
-            if isinstance(other, BatteryData) and record.charge is not None:
+            if isinstance(other, Battery) and record.charge is not None:
                 charge = draw_in_range(record.charge, other_draws[3:4])
                 records[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:

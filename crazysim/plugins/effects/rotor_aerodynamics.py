@@ -19,8 +19,13 @@ from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_fac
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.ground_effect import rotor_positions
-from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, drag_factor, require_rotors
+from crazysim.plugins.effects.moving_air import (
+    air_velocity,
+    checked_propeller_radius,
+    drag_factor,
+    require_rotors,
+    rotor_positions,
+)
 from crazysim.pytree import PyTree, device_array, leaf
 
 

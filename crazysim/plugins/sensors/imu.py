@@ -19,8 +19,7 @@ from crazysim.core.plugin import Simulation, StagePlacement, drone_array, parame
 from crazysim.core.random import normal, uniform
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.plugins.effects.ground_effect import rotor_positions
-from crazysim.plugins.effects.moving_air import require_rotors
+from crazysim.plugins.effects.moving_air import require_rotors, rotor_positions
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting_quat
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf

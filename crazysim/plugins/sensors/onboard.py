@@ -16,7 +16,7 @@ from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.battery import BatteryData
+from crazysim.plugins.effects.battery import Battery
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.plugins.sensors.range_finder import RangeFinderData
 from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
@@ -110,7 +110,7 @@ class BatteryVoltage(NoisySensor):
         return super().record(sim)
 
     def check_plugins(self, sim: Simulation) -> None:
-        if not isinstance(sim.data.plugins.get(self.battery), BatteryData):
+        if not isinstance(sim.data.plugins.get(self.battery), Battery):
             raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
 
     def ideal(self, data: SimData) -> Array:
