@@ -133,20 +133,21 @@ def check_settings(settings: Any) -> None:
     with finite numbers in the range of ``setting`` or ``parameter``. Fields annotated with a class must have instances
     of the class, and fields of ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted if the
     annotation or the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked
-    later.
+    later. Single numbers of NumPy and JAX are replaced by Python's.
     """
     settings_class = type(settings)
     for field in dataclasses.fields(settings):
         value, value_types = getattr(settings, field.name), allowed_types(settings_class)[field.name]
-        if value is None and field.default is None:
-            continue
-        declared = collect_settings(settings_class)[field.name]
-        value_types = value_types or ((np.ndarray,) if declared.is_parameter else ())
-        check_value(
-            f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
-            declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),
-            whole=declared.dtype is not None, remedy=f"help({settings_class.__name__}) describes it.",
-        )  # fmt: skip
+        if value is not None or field.default is not None:
+            declared = collect_settings(settings_class)[field.name]
+            check_value(
+                f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
+                declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),
+                whole=declared.dtype is not None, remedy=f"help({settings_class.__name__}) describes it.",
+            )  # fmt: skip
+        # Numbers of small types would overflow, and JAX does not know all of them.
+        if isinstance(value, (np.generic, np.ndarray, Array)) and value.ndim == 0:
+            object.__setattr__(settings, field.name, float(value) if value.dtype.kind == "f" else value.item())
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import importlib
 import pkgutil
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -185,6 +186,27 @@ def test_impossible_numbers_are_refused_where_they_are_given(kind):
             result += [describe_unless_refused(lambda name=name: make_example(kind, **{name: None}), f"{name}=None")]
             result += [describe_unless_refused(lambda name=name: make_example(kind, **{name: np.nan}), f"{name}=nan")]
     assert not [text for text in result if text], "\n".join(text for text in result if text)
+
+
+def single_numbers(number):
+    """Yield a number as an array without axes, and in the types of NumPy and JAX that have it."""
+    types = (np.int8, np.uint16, np.int64, np.float16, np.float32, np.float64, np.longdouble)
+    kinds = "iu" if isinstance(number, int) else "f"
+    x = np.asarray(number)
+    yield from (x, jnp.asarray(x))
+    with np.errstate(all="ignore"):
+        yield from (x.astype(t)[()] for t in types if np.dtype(t).kind in kinds and x.astype(t) == x)
+
+
+@pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
+def test_single_numbers_of_any_type_are_numbers_of_python(kind):
+    """Steps of 500 Hz overflow the type of ``freq=np.int8(100)``, and JAX does not know long doubles."""
+    for name, _ in numeric_fields(kind):
+        number = getattr(make_example(kind), name)
+        for value in single_numbers(number) if type(number) in (int, float) else ():
+            kept = getattr(make_example(kind, **{name: value}), name)
+            assert type(kept) is type(number), f"{name}={value!r}"
+            assert kept == pytest.approx(number, rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", [*PLUGINS, *OTHER_CLASSES, *TASKS], ids=lambda kind: kind.__name__)
