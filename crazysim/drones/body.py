@@ -11,6 +11,8 @@ from crazysim.drones.airframe import Airframe
 
 LED_MATERIALS = ("led_top", "led_bot")
 """Materials that are copied for each drone, so that the LEDs of each drone can have their own colours."""
+MAX_LED_DRONES = 450
+"""Number of drones whose LEDs have their own colours: MuJoCo draws at most 998 materials (``mjMAXMATERIAL``)."""
 
 MATERIALS = {
     "drone_carbon": (0.10, 0.10, 0.11, 1.0),
@@ -37,7 +39,7 @@ class BodyGeom:
     pos: NDArray
     """Centre, or the near end of a capsule with ``end``, m. (3,)"""
     material: str = ""
-    """Name of the material; each drone has its own copy of the materials in ``LED_MATERIALS``."""
+    """Name of the material; the first ``MAX_LED_DRONES`` drones have their own copies of ``LED_MATERIALS``."""
     end: NDArray | None = None
     """Far end of a capsule that begins at ``pos``, m. (3,)"""
     name: str = ""
@@ -132,8 +134,10 @@ def body_geoms(airframe: Airframe) -> list[BodyGeom]:
             ),
             BodyGeom("cylinder", disc_size, hub, "drone_propeller"),
         ]
-    for material, z in zip(LED_MATERIALS, shape["led_heights"], strict=True):
-        geoms.append(BodyGeom("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material))
+    geoms += [
+        BodyGeom("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material)
+        for material, z in zip(LED_MATERIALS, shape["led_heights"], strict=True)
+    ]
     sphere, box = shape["collision_sphere"], shape["collision_box"]
     return [
         *geoms,

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from crazysim.drones.airframe import Airframe
-from crazysim.drones.body import LED_MATERIALS, MATERIALS, BodyGeom, body_cameras, body_geoms
+from crazysim.drones.body import LED_MATERIALS, MATERIALS, MAX_LED_DRONES, BodyGeom, body_cameras, body_geoms
 from crazysim.errors import ConfigError
 from crazysim.scene import mjx
 
@@ -82,11 +82,9 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     take 30 s one by one, and 2 s in chunks that are filled separately.
     """
     n_drones = len(airframes)
-    for name, rgba in MATERIALS.items():
+    leds = dict.fromkeys((_material_name(led, i) for i in range(n_drones) for led in LED_MATERIALS), (1, 1, 1, 0.15))
+    for name, rgba in (MATERIALS | leds).items():
         spec.add_material(name=name, rgba=rgba)
-    for i in range(n_drones):
-        for led in LED_MATERIALS:
-            spec.add_material(name=f"{led}:{i}", rgba=(1, 1, 1, 0.15))
     if n_drones <= DRONES_PER_CHUNK:
         _add_bodies(spec, airframes, range(n_drones))
         return
@@ -138,7 +136,11 @@ def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
         _set_collision_bits(spec_geom, geom.name == "col_sphere")
     else:
         spec_geom.group, spec_geom.contype, spec_geom.conaffinity = 2, 0, 0
-        spec_geom.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
+        spec_geom.material = _material_name(geom.material, i)
+
+
+def _material_name(material: str, i: int) -> str:
+    return f"{material}:{i}" if material in LED_MATERIALS and i < MAX_LED_DRONES else material
 
 
 def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:

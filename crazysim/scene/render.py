@@ -18,6 +18,8 @@ from crazysim.scene.overlays import Overlays
 from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
 
+MAX_MATERIALS = 998
+"""Largest number of materials of a scene that MuJoCo draws (``mjMAXMATERIAL``, 1000, less two)."""
 MAX_SIZES = 4
 """Largest number of image sizes for which OpenGL contexts are kept."""
 
@@ -51,6 +53,11 @@ class ModelRenderer:
         if mode not in RENDER_MODES:
             raise UnknownNameError(f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}")
         check_image_size(width, height)
+        if self._model.nmat > MAX_MATERIALS:
+            raise RenderError(
+                f"expected at most {MAX_MATERIALS} materials in a scene that is drawn, got {self._model.nmat}. Use "
+                f"rgba= instead of materials for objects of one colour, or fewer drones: the LEDs of a drone take two."
+            )
         cam = self._camera(camera, cam_config)
         if mode == "human":
             if not self._windows:
@@ -110,8 +117,10 @@ class ModelRenderer:
             except (TypeError, ValueError):
                 numbers = np.array(np.nan)
             if numbers.shape != FREE_CAMERA_SHAPES[key] or not np.isfinite(numbers).all():
-                n = "3" if FREE_CAMERA_SHAPES[key] else "1"
-                raise ConfigError(f"expected numbers for {key} of the camera, {n} and finite, got {short_repr(value)}")
+                raise ConfigError(
+                    f"expected numbers for {key} of the camera, {3 if FREE_CAMERA_SHAPES[key] else 1} and finite, got "
+                    f"{short_repr(value)}"
+                )
             setattr(cam, key, numbers if numbers.ndim else float(numbers))
         return cam
 
@@ -128,12 +137,11 @@ class ModelRenderer:
                 raise
             except Exception as error:  # OpenGL bindings raise errors of any type
                 buffers.offwidth, buffers.offheight = sizes_before
-                if "framebuffer" in str(error):
-                    raise RenderError(
-                        f"expected an image of a size that OpenGL can draw here, got {width} x {height} pixels: "
-                        f"{error}. Use a smaller one."
-                    ) from error
-                raise RenderError(_opengl_message(error)) from error
+                size_message = (
+                    f"expected an image of a size that OpenGL can draw here, got {width} x {height} pixels: {error}. "
+                    f"Use a smaller one."
+                )
+                raise RenderError(size_message if "framebuffer" in str(error) else _opengl_message(error)) from error
             self._renderers[width, height] = renderer
             if len(self._renderers) > MAX_SIZES:
                 self._renderers.pop(next(iter(self._renderers))).close()
@@ -142,8 +150,6 @@ class ModelRenderer:
 
 def _opengl_message(error: Exception) -> str:
     """Return why MuJoCo cannot draw; it chooses a way to draw when it is imported, from ``MUJOCO_GL``."""
-    from mujoco.rendering.classic import gl_context
-
     wanted = startup.refused_variables.get("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
     context = getattr(gl_context, "GLContext", None)
     if context is None or context.__module__ == gl_context.__name__:  # a placeholder

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_flag
 from crazysim.core.settings import as_rgba
+from crazysim.drones.body import MAX_LED_DRONES
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import DEFAULT_COLOR
 from crazysim.sim.sim import Sim
@@ -102,8 +103,11 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
         raise ConfigError(f"expected control='state', whose commands have positions, got control={str(sim.control)!r}")
     if not 0 <= world < sim.n_worlds:
         raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world}")
-    setpoints = np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float)
-    sim.overlays.points(setpoints, DEFAULT_COLOR if rgba is None else rgba, size)
+    sim.overlays.points(
+        np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float),
+        DEFAULT_COLOR if rgba is None else rgba,
+        size,
+    )
 
 
 def change_material(
@@ -129,7 +133,10 @@ def change_material(
         raise ValueError(f"drone_ids must be in range [0, {sim.n_drones - 1}], got {ids.tolist()}")
     materials = [mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids]
     if any(material < 0 for material in materials):
-        raise UnknownNameError(f"expected material 'led_top' or 'led_bot', got {mat_name!r}")
+        raise UnknownNameError(
+            f"expected material 'led_top' or 'led_bot' of the first {MAX_LED_DRONES} drones, whose LEDs have their own "
+            f"colours, got {mat_name!r} of drones up to {ids.max()}"
+        )
     if rgba is not None:
         sim.mj_model.mat_rgba[materials] = np.broadcast_to(as_rgba(rgba, len(ids)), (len(ids), 4))
     if emission is not None:

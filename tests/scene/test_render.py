@@ -15,9 +15,11 @@ from cases import BOX, CAMERA_HEIGHT, FOVY
 from pictures import HEIGHT, WIDTH, pixel
 from screens import screen_pixels, virtual_screen
 
-from crazysim.errors import RenderError
+from crazysim.drones.body import MAX_LED_DRONES
+from crazysim.errors import RenderError, UnknownNameError
 from crazysim.scene.build import SCENE_FILE
-from crazysim.sim import Sim
+from crazysim.scene.render import MAX_MATERIALS
+from crazysim.sim import Sim, change_material
 
 POSITIONS = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
 """Position of the drone of each world, m. (2, 1, 3)"""
@@ -472,6 +474,41 @@ def test_without_opengl_an_image_is_refused_in_one_line(monkeypatch):
     with pytest.raises(RenderError, match="MUJOCO_GL=egl and install libegl1") as caught:
         sim.render("rgb_array")
     assert "\n" not in str(caught.value)
+
+
+def test_more_drones_are_drawn_than_mujoco_draws_materials(opengl, plain_scene):
+    """1,100 drones would have 2,200 materials of LEDs; the first and the last drone are in the image."""
+    sim = Sim(n_drones=1100, xml_path=plain_scene, engine="plain")
+    pos = np.full((1, 1100, 3), 100.0)
+    far = np.float32(pos)
+    pos[0, [0, -1]] = [[0.3, 0, 1], [-0.3, 0, 1]]
+    shot = {"mode": "rgb_array", "camera": "down", "width": 64, "height": 48}
+    set_positions(sim, far)
+    empty = sim.render(**shot)
+    set_positions(sim, pos)
+    changed = difference(sim.render(**shot), empty)
+    assert changed[:, :32].any()
+    assert changed[:, 32:].any()
+    change_material(sim, "led_top", [MAX_LED_DRONES - 1], rgba=(1, 0, 0, 1))
+    with pytest.raises(UnknownNameError, match=r"of the first 450 drones, .* of drones up to 450"):
+        change_material(sim, "led_top", [0, MAX_LED_DRONES], rgba=(1, 0, 0, 1))
+    sim.close()
+
+
+@pytest.mark.parametrize(("n_materials", "is_drawn"), [(MAX_MATERIALS, True), (MAX_MATERIALS + 1, False)])
+def test_more_materials_than_mujoco_draws_are_refused_with_their_number(opengl, tmp_path, n_materials, is_drawn):
+    n_own = Sim(engine="plain").mj_model.nmat - mujoco.MjModel.from_xml_path(str(SCENE_FILE)).nmat
+    materials = "".join(f"<material name='m{i}'/>" for i in range(n_materials - n_own))
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f"<mujoco><asset>{materials}</asset></mujoco>")
+    sim = Sim(xml_path=scene, engine="plain")
+    assert sim.mj_model.nmat == n_materials
+    if is_drawn:
+        assert sim.render("rgb_array", width=8, height=8).shape == (8, 8, 3)
+    else:
+        with pytest.raises(RenderError, match=f"expected at most {MAX_MATERIALS} materials .*, got {n_materials}"):
+            sim.render("rgb_array", width=8, height=8)
+    sim.close()
 
 
 def test_an_image_that_is_too_large_for_opengl_leaves_other_sizes_as_they_were():
