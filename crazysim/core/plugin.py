@@ -390,7 +390,7 @@ class Plugin(PyTree):
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
-        if not self.is_bound:
+        if self.is_bound is not True:
             check_settings(self)
 
     def bind(self, sim: Simulation) -> Self:

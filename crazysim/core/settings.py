@@ -136,10 +136,10 @@ def check_settings(settings: Any) -> None:
     later. Single numbers of NumPy and JAX are replaced by Python's.
     """
     settings_class = type(settings)
-    for field in dataclasses.fields(settings):
+    for field, declared in zip(dataclasses.fields(settings), collect_settings(settings_class).values(), strict=True):
         value, value_types = getattr(settings, field.name), allowed_types(settings_class)[field.name]
         if value is not None or field.default is not None:
-            declared = collect_settings(settings_class)[field.name]
+            value_types = value_types or ((np.ndarray,) if declared.is_parameter else ())
             check_value(
                 f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
                 declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),
