@@ -1,5 +1,9 @@
-"""Stable-Baselines3 on our environments: contract, PPO, which must learn, and SAC. Run by .ci/sb3, not by pytest."""
+"""Stable-Baselines3 on our environments: contract, processes, PPO, which must learn, and SAC.
 
+Run by .ci/sb3, not by pytest.
+"""
+
+import functools
 import importlib.util
 import time
 from pathlib import Path
@@ -8,11 +12,12 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from crazysim import ConfigError
 from crazysim.envs import make
 from crazysim.envs.sb3 import DroneVecEnv
+from crazysim.envs.single import make_single
 
 N_ENVS, N_STEPS = 64, 4
 POS = slice(6, 9)
@@ -90,6 +95,20 @@ def check_named_observations():
     env.close()
 
 
+def check_processes():
+    """Check that SubprocVecEnv trains on worlds in processes of their own, with seeds of their own."""
+    make_env = functools.partial(make_single, "hover", seconds=N_STEPS / 50)
+    env = SubprocVecEnv([make_env] * 2, start_method="spawn")
+    PPO("MultiInputPolicy", env, n_steps=2 * N_STEPS, batch_size=8, device="cpu").learn(32)
+    env.seed(3)
+    first = env.reset()
+    assert all(np.isfinite(x).all() for x in first.values())
+    assert not np.allclose(first["pos"][0], first["pos"][1]), "each process has its own seed"
+    env.seed(3)
+    np.testing.assert_array_equal(env.reset()["pos"], first["pos"])
+    env.close()
+
+
 def check_training():
     """Check that PPO learns to hover: reward and distance from the goal, on starts that it has not seen."""
     env = VecNormalize(DroneVecEnv(make("hover", N_ENVS)), norm_reward=False)
@@ -140,6 +159,7 @@ if __name__ == "__main__":
     torch.set_num_threads(1)  # small networks: more threads only wait for each other
     check_contract()
     check_named_observations()
+    check_processes()
     check_training()
     check_example()
     print("sb3: passed")
