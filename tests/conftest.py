@@ -1,5 +1,6 @@
 """Shared by all tests: four host devices, a persistent compilation cache, and simulations built once."""
 
+import ctypes
 import gc
 import os
 
@@ -39,6 +40,16 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _drop_programs():
+    """Drop compiled programs after a file of tests if there are many, and return their memory, which glibc keeps."""
+    yield
+    if machine.process_memory() > machine.KEPT_MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)
 
 
 MAX_UNEXPLAINED_S = 5

@@ -4,7 +4,9 @@ import os
 from pathlib import Path
 
 WORKER_MEMORY = 4e9
-"""Memory for one process of tests, B; a process used 3.1 GB after a fifth of all tests."""
+"""Memory for one process of tests, B: ``KEPT_MEMORY`` and what a file of tests takes."""
+KEPT_MEMORY = 2e9
+"""Memory from which compiled programs are dropped after a file of tests, B; with all of them a process took 11 GB."""
 LIMITS = Path("/sys/fs/cgroup")
 """Folder of a Linux container's limits."""
 
@@ -26,6 +28,11 @@ def memory(limits: Path = LIMITS) -> float:
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     (limit,) = _words(limits / "memory.max", "max")
     return total if limit == "max" else min(total, int(limit))
+
+
+def process_memory() -> float:
+    """Return the memory that this process takes, B; zero where the system does not say it."""
+    return int(_words(Path("/proc/self/statm"), "0 0")[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _words(path: Path, default: str) -> list[str]:

@@ -1,9 +1,11 @@
 """How tests run: in as many processes as fit the machine or container; slow tests state a reason."""
 
+import sys
 from types import SimpleNamespace
 
 import conftest
 import machine
+import numpy as np
 import pytest
 
 
@@ -24,6 +26,16 @@ def test_processes_keep_the_limits_of_a_container(tmp_path):
     (tmp_path / "cpu.max").write_text("50000 100000\n")
     (tmp_path / "memory.max").write_text("1000000\n")
     assert (machine.cores(tmp_path), machine.memory(tmp_path)) == (0.5, 1e6)
+
+
+def test_a_process_knows_the_memory_that_it_takes():
+    if sys.platform != "linux":
+        assert machine.process_memory() == 0
+        return
+    before = machine.process_memory()
+    assert 5e7 < before < machine.memory()
+    block = np.ones(25_000_000)
+    assert machine.process_memory() - before == pytest.approx(block.nbytes, rel=0.1)
 
 
 def test_long_tests_are_listed_with_their_reason():
