@@ -282,12 +282,12 @@ def count_documented_arrays(record, **sizes):
 
 def _documented_shapes(record):
     """Return the shape that the docstring of every field of a record ends with, None where it has none."""
-    (base,) = record.__bases__
+    base = record.__bases__[-1]
     shapes = {} if base in (PyTree, Plugin) else _documented_shapes(base)
     body = ast.parse(inspect.getsource(record)).body[0].body
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign):
-            if field.target.id == "name":
+            if field.target.id == "name" or "ClassVar" in ast.unparse(field.annotation):
                 continue
             assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"
             shape = re.search(r"\(([\w, ]*)\)$", text.value.value)

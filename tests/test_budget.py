@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1249,
     "control": 2035,
-    "core": 1866,
+    "core": 1868,
     "crazysim": 1409,
     "drones": 531,
     "dynamics": 593,
@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1097,
     "lab": 9874,
     "media": 1010,
-    "plugins": 7462,
+    "plugins": 7355,
     "scene": 3153,
     "sim": 1023,
     "train": 2497,

@@ -31,8 +31,9 @@ R = TypeVar("R", bound=PyTree)
 
 Param = Any
 """A number of a plugin: what a user writes, such as 0.1, a list or an array, and an array in ``data.plugins``."""
-CoreShape = tuple[int | Literal["rotors"], ...]
-"""Shape of an array of one drone, with ``"rotors"`` for the number of its rotors."""
+CoreShape = tuple[int | str, ...]
+"""Shape of an array of one drone, with ``"rotors"`` for the number of its rotors, and any other name for a length that
+``bind`` decides."""
 
 
 class Simulation(Protocol):
@@ -173,13 +174,25 @@ def state(
     return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
 
 
+def derived(
+    core: CoreShape = (1,),
+    *,
+    scope: Scope = "parameter",
+    sparse: bool = False,
+    init: Literal[False] = False,  # noqa: ARG001
+) -> Any:
+    """Declare a parameter that ``bind`` calculates from others, None by default; ``init`` as for ``state``."""
+    metadata = _leaf_metadata(scope, core, sparse=sparse, dtype=None, optional=True)
+    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
+
+
 def part(default: PyTree) -> Any:
     """Declare a record with numbers and states of its own, declared with ``param`` and ``state``."""
     return dataclasses.field(default=default, metadata={"part": True})
 
 
 def _leaf_metadata(scope: Scope, core: CoreShape, **details: Any) -> dict[str, Any]:
-    fixed_core = None if "rotors" in core or scope == "shared" else core
+    fixed_core = None if any(isinstance(n, str) for n in core) or scope == "shared" else core
     metadata = {"scope": scope, CORE_NDIM_KEY: len(core), "core": fixed_core, "shape": core}
     return {"sparse": False, "scratch": False, **metadata, **details}
 
@@ -340,7 +353,9 @@ def _is_kept(kind: type, name: str) -> bool:
 
 
 @dataclass_transform(
-    frozen_default=True, eq_default=False, field_specifiers=(param, state, part, parameter, setting, dataclasses.field)
+    frozen_default=True,
+    eq_default=False,
+    field_specifiers=(param, state, derived, part, parameter, setting, dataclasses.field),
 )
 class Plugin(PyTree):
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.

@@ -139,7 +139,6 @@ def check_settings(settings: Any) -> None:
     for field, declared in zip(dataclasses.fields(settings), collect_settings(settings_class).values(), strict=True):
         value, value_types = getattr(settings, field.name), allowed_types(settings_class)[field.name]
         if value is not None or field.default is not None:
-            value_types = value_types or ((np.ndarray,) if declared.is_parameter else ())
             check_value(
                 f"{field.name} of {settings_class.__name__}", value, value_types, declared.range,
                 declared.shapes if np.ndarray in value_types or declared.is_parameter else ((),),
@@ -159,7 +158,7 @@ def allowed_types(kind: type) -> dict[str, tuple[type, ...]]:
     field_types = {}
     for base in reversed(kind.__mro__):
         module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
-        names = module | {"ArrayLike": Numbers}
+        names = module | {"ArrayLike": Numbers, "Param": Numbers}
         for name, hint in inspect.get_annotations(base).items():
             field_types[name] = annotated_types(hint, names)
     return {field.name: field_types.get(field.name, ()) for field in dataclasses.fields(kind)}

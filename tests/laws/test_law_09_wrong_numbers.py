@@ -142,7 +142,7 @@ def impossible_values(kind, name, declared, rng):
         [None],
         True,
     )
-    if type(None) not in kinds and example_value is not None:
+    if type(None) not in kinds and None not in (example_value, kind.__dataclass_fields__[name].default):
         yield None
     if is_whole:
         yield 1.5

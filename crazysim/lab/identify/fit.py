@@ -29,7 +29,7 @@ from crazysim.lab.identify.rotation import (
     deviation_of_sum,
     fast_rotation,
 )
-from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
+from crazysim.plugins.effects.residual import N_INPUTS, Residual
 from crazysim.rotation import rotate, rotate_inverse
 
 WINDOW_DURATION = 0.5
@@ -86,7 +86,7 @@ class Identification:
     changes: dict[str, NDArray]
     """Numbers that differ from the base airframe, by dotted path."""
 
-    def with_residual(self, residual: ResidualData) -> Identification:
+    def with_residual(self, residual: Residual) -> Identification:
         """Return the result with another residual, such as one from ``fit_residual``."""
         changes = {key: x for key, x in self.changes.items() if not key.startswith("residual.")}
         for key in ("linear", "hidden", "output"):

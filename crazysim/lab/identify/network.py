@@ -13,7 +13,7 @@ from jax import Array
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import Model, Windows, attitude_error, cut_windows, predict
-from crazysim.plugins.effects.residual import ResidualData, residual_inputs
+from crazysim.plugins.effects.residual import Residual, residual_inputs
 
 ERROR_SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
 """Scales of errors: m, rad, m/s, rad/s. Larger errors count linearly (Huber)."""
@@ -76,15 +76,16 @@ def fit_residual(
     weight = float(params.mass[0]) * float(jnp.linalg.norm(params.gravity_vec))
     scale = weight * jnp.repeat(jnp.array([FORCE_SCALE, TORQUE_SCALE * float(params.L[0])]), 3)
 
-    def make_residual(weights: dict[str, Array]) -> ResidualData:
+    def make_residual(weights: dict[str, Array]) -> Residual:
         """Return the residual from weights of order one."""
         linear = model.residual.linear + scale[:, None] * weights["linear"] / input_std
         if not n_hidden:
-            return ResidualData(linear, None, None)
-        return ResidualData(
+            return Residual(linear, is_bound=True)
+        return Residual(
             linear=linear,
             hidden=weights["hidden"] / input_std,
             output=scale[:, None] * weights["output"],
+            is_bound=True,
         )
 
     def loss(weights: dict[str, Array], batch: Windows) -> Array:

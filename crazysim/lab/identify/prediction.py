@@ -19,7 +19,7 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.identify.logs import Log
-from crazysim.plugins.effects.residual import N_INPUTS, ResidualData, residual_inputs, residual_wrench
+from crazysim.plugins.effects.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
 from crazysim.pytree import PyTree
 from crazysim.storage import write_figure
 
@@ -79,7 +79,7 @@ class Model(PyTree):
 
     params: first_principles.Params
     """Parameters of the first-principles model."""
-    residual: ResidualData
+    residual: Residual
     """Forces and torques that are added to the first-principles model."""
 
     @staticmethod
@@ -94,7 +94,7 @@ class Model(PyTree):
         if mass is not None:
             params = params.replace(mass=jnp.asarray([mass], jnp.float32))
         has_residual = "residual.linear" in airframe.values
-        residual = ResidualData.create(airframe) if has_residual else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
+        residual = Residual.create(airframe) if has_residual else Residual(jnp.zeros((6, N_INPUTS)), is_bound=True)
         return Model(params=params, residual=residual)
 
     def prepare_log(self, log: Log) -> Log:

@@ -15,8 +15,8 @@ from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
-from crazysim.plugins.effects.wind import WindData
-from crazysim.plugins.effects.wind_field import WindFieldData
+from crazysim.plugins.effects.wind import Wind
+from crazysim.plugins.effects.wind_field import WindField
 from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
 
@@ -132,9 +132,9 @@ class PictureSource:
         )
 
 
-def _find_winds(data: SimData) -> list[WindData | WindFieldData]:
+def _find_winds(data: SimData) -> list[Wind | WindField]:
     """Return the records of all wind plugins."""
-    return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
+    return [record for record in data.plugins.values() if isinstance(record, (Wind, WindField))]
 
 
 def _air_velocity(data: SimData) -> jax.Array:

@@ -9,78 +9,63 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import reduce_over_others
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, airframe_numbers, parameter
-from crazysim.core.stage import stage
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, airframe_numbers, derived, param, state
 from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.plugins.effects.moving_air import (
     BodiesInAir,
     MovingAir,
-    checked_propeller_radius,
-    require_drag,
+    needs_drag,
     with_moving_air,
 )
-from crazysim.pytree import device_array, leaf
+from crazysim.pytree import device_array
 
 JET_DECAY, JET_SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
 Turbulent Flows, 2000, table 5.1)."""
 
 
-class DownwashData(MovingAir):
-    """Velocity of the air at every drone in the jets of the other drones of its world."""
+class Downwash(MovingAir, Plugin, replaces=("downwash",), requires=needs_drag):
+    """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
 
-    diameter: Array = leaf("parameter", 1, (1,))
-    """Diameter of the fully contracted jet of a drone, m. (1,)"""
-    air_density: Array = leaf("parameter", 1, (1,))
+    propeller_radius: Param = param(default=None, airframe="shape.propeller_radius", positive=True)
+    """Radius of a propeller, m; None for the airframe's. (1,)"""
+    air_density: Param = param(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. (1,)"""
-    air_vel: Array = leaf("drone", 1, (3,))
+    diameter: Array = derived()
+    """Diameter of the fully contracted jet of a drone, m. (1,)"""
+    air_vel: Array = state((3,))
     """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
+    name: str = "downwash"
+
+    def bind(self, sim: Simulation) -> Downwash:
+        bound = self.with_arrays(sim)
+        return bound.replace(diameter=stream_diameter(sim, bound.propeller_radius))
 
     def velocity_at_drone(self, data: SimData) -> Array:
         return self.air_vel
 
-
-class Downwash(Plugin):
-    """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
-
-    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
-    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
-    air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
-    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
-    name: str = "downwash"
-
-    @property
-    def replaced_terms(self) -> tuple[str, ...]:
-        return ("downwash",)
-
-    def record(self, sim: Simulation) -> DownwashData:
-        require_drag(sim, "downwash")
-        radius = checked_propeller_radius(sim, self.propeller_radius)
-        return self.fill_record(sim, DownwashData, diameter=stream_diameter(sim, radius))
-
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        return [StagePlacement(stage("drone")(self.sum_jets))]
+        return [StagePlacement(self.stage(self.sum_jets))]
 
     def influence(self, data: SimData) -> SimData:
-        return with_moving_air(data, self.read(data).velocity_at_drone(data))
+        return with_moving_air(data, self.velocity_at_drone(data))
 
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all other drones of the world at one drone.
 
         The load of a drone is also in the jet of the drone that carries it.
         """
-        record, s = self.read(data), data.states
+        s = data.states
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
         positions = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
         axis = rotation.z_axis(s.quat)
-        sources = jet_source(collective_thrust(data), record.diameter, record.air_density)
+        sources = jet_source(collective_thrust(data), self.diameter, self.air_density)
 
         def opposite_jet_velocities(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
@@ -89,7 +74,7 @@ class Downwash(Plugin):
         opposite_velocity = reduce_over_others(opposite_jet_velocities, (s.pos, axis, sources))
         bodies_in_jets = {name: x.replace(air_vel=-opposite_velocity[name]) for name, x in bodies.items()}
         data = data.replace(plugins=data.plugins | bodies_in_jets)
-        return self.write(data, record.replace(air_vel=-opposite_velocity[self.name]))
+        return self.write(data, self.replace(air_vel=-opposite_velocity[self.name]))
 
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:

@@ -8,31 +8,18 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command, staged_leaves
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, param, state
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, as_stages, stage
+from crazysim.core.stage import Stage, as_stages
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 MAX_DELAY = 100_000
 """Upper limit of the delay, steps."""
-
-
-class LatencyData(PyTree):
-    """Commands in transit."""
-
-    delay: Array = leaf("parameter", 1, (1,))
-    """Steps from sending a command to its arrival. (1,)"""
-    queue: Array = leaf("drone", 2)
-    """Commands of the last steps; the command of step i is in row i modulo n_rows. n_rows is the largest possible delay
-    plus one. (n_worlds, n_drones, n_rows, k)"""
-    arrived: Array = leaf("drone", 1)
-    """Latest command that has arrived. (n_worlds, n_drones, k)"""
 
 
 class Latency(Plugin):
@@ -43,21 +30,26 @@ class Latency(Plugin):
     or after a reset the command of the default data.
     """
 
-    delay: ArrayLike = parameter(low=0, high=MAX_DELAY, dtype=np.int32)
-    """Delay, a whole number of steps. () or (n_worlds, n_drones)"""
+    delay: Param = param(low=0, high=MAX_DELAY, dtype=np.int32)
+    """Delay, a whole number of steps. (1,)"""
     max_delay: int | None = setting(default=None, low=0, high=MAX_DELAY)
     """Largest delay to which the record can be changed later, steps; None for the largest value of ``delay``."""
+    queue: Array = state(("rows", "command"))
+    """Commands of the last steps; the command of step i is in row i modulo n_rows. n_rows is the largest possible delay
+    plus one. (n_worlds, n_drones, n_rows, k)"""
+    arrived: Array = state(("command",))
+    """Latest command that has arrived. (n_worlds, n_drones, k)"""
     name: str = "latency"
     order: ClassVar[int] = -1  # before the effects that limit commands, so that they also limit late commands
 
-    def record(self, sim: Simulation) -> LatencyData:
-        return self._initial_record(sim, sim.data)
+    def bind(self, sim: Simulation) -> Latency:
+        return self._with_queue(sim, sim.data)
 
-    def default_record(self, sim: Simulation) -> LatencyData:
-        return self._initial_record(sim, sim.default_data)
+    def default_record(self, sim: Simulation) -> Latency:
+        return self._with_queue(sim, sim.default_data)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        queue_stage = stage("drone")(self.move_queue)
+        queue_stage = self.stage(self.move_queue)
         if sim.data.controls.mode == Control.rotor_vel:
             return [StagePlacement(queue_stage)]
         name = _controller_stage(sim)
@@ -68,15 +60,14 @@ class Latency(Plugin):
         ]
 
     def influence(self, data: SimData) -> SimData:
-        return _with_command(data, self.read(data).arrived) if data.controls.mode == Control.rotor_vel else data
+        return _with_command(data, self.arrived) if data.controls.mode == Control.rotor_vel else data
 
     def move_queue(self, data: SimData) -> SimData:
         """Put the staged command of one drone into its queue, and take the arriving command out."""
-        latency, step = self.read(data), data.core.steps
-        length = latency.queue.shape[0]
-        queue = latency.queue.at[step % length].set(_staged_command(data))
-        arrived = queue[(step - latency.delay[0]) % length]
-        return self.write(data, latency.replace(queue=queue, arrived=arrived))
+        step, length = data.core.steps, self.queue.shape[0]
+        queue = self.queue.at[step % length].set(_staged_command(data))
+        arrived = queue[(step - self.delay[0]) % length]
+        return self.write(data, self.replace(queue=queue, arrived=arrived))
 
     def _delayed_controller(self, controller: Stage) -> Stage:
         """Return a controller that uses the command that has arrived, and does not change the staged command."""
@@ -87,13 +78,13 @@ class Latency(Plugin):
 
         return Stage(run_on_delayed_command, scope, controller.when, controller.batched, controller.__name__)
 
-    def _initial_record(self, sim: Simulation, data: SimData) -> LatencyData:
-        """Return the record with the staged command of ``data`` in all rows of the queue."""
+    def _with_queue(self, sim: Simulation, data: SimData) -> Latency:
+        """Return the plugin with the staged command of ``data`` in all rows of the queue."""
         delay, max_delay = np.asarray(self.delay), self.max_delay
         max_delay = int(np.max(delay)) if max_delay is None else max_delay
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, max_delay, jnp.int32), _staged_command(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(max_delay) + 1, axis=-2)
-        return LatencyData(steps, device_array(queue, command.dtype), command)
+        return self.with_arrays(sim, delay=steps, queue=device_array(queue, command.dtype), arrived=command)
 
 
 def _controller_stage(sim: Simulation) -> str:

@@ -31,8 +31,8 @@ class BodiesInAir(PyTree):
     (n_worlds, n_drones, 3)"""
 
 
-class MovingAir(PyTree):
-    """Record of an effect that moves the air at the drones."""
+class MovingAir:
+    """Base class, beside ``Plugin``, of effects that move the air at the drones."""
 
     def velocity_at_drone(self, data: SimData) -> Array:
         """Return the velocity of the air at one drone, world frame, m/s. (3,)"""

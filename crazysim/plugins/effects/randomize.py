@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -13,60 +12,21 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, drone_array, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, drone_array, param, state
 from crazysim.core.random import drone_key, uniform
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
-from crazysim.plugins.effects.latency import LatencyData
-from crazysim.plugins.effects.moving_air import MovingAir, has_drag, require_drag, require_rotors, with_moving_air
-from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
-from crazysim.pytree import leaf
+from crazysim.plugins.effects.latency import Latency
+from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
+from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
 
 FACTOR_SETTINGS = ("mass", "inertia", "torque", "lag", "drag")
-"""Settings whose factors are the entries of ``RandomizeData.factors``, in this order."""
+"""Settings whose factors are the entries of ``Randomize.factors``, in this order."""
 RANGE_SETTINGS = (*FACTOR_SETTINGS, "thrust", "rotor_thrust", "wind", "charge", "delay")
 """Settings that are ranges (low, high)."""
 
 
-class RandomizeData(MovingAir):
-    """Factors of the parameters of every drone, and the ranges that they are drawn from."""
-
-    factors: Array = leaf("drone", 1)
-    """Factors of mass, inertia, drag torque, rates of the rotors' lag, and linear drag, 1. (n_worlds, n_drones, 5)"""
-    thrust_factors: Array = leaf("drone", 1)
-    """Factors of the thrust of the rotors, 1. (n_worlds, n_drones, n_rotors)"""
-    air_vel: Array | None = leaf("drone", 1, (3,))
-    """Mean wind, world frame, m/s; None without wind. (n_worlds, n_drones, 3)"""
-    mass: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the mass, 1; None for a factor of 1. (2,)"""
-    inertia: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the inertia, 1; None for a factor of 1. (2,)"""
-    thrust: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the thrust of all rotors, 1; None for a factor of 1. (2,)"""
-    rotor_thrust: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the thrust of each rotor, 1; None for a factor of 1. (2,)"""
-    torque: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the drag torque, 1; None for a factor of 1. (2,)"""
-    lag: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the rates of the rotors' lag, 1; None for a factor of 1. (2,)"""
-    drag: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the linear drag, 1; None for a factor of 1. (2,)"""
-    wind: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest speed of the mean wind, m/s; None without wind. (2,)"""
-    charge: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest state of charge of a battery, 1; None for the setting of ``Battery``. (2,)"""
-    delay: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest delay of commands, steps; None for the setting of ``Latency``. (2,)"""
-
-    def velocity_at_drone(self, data: SimData) -> Array:
-        return jnp.zeros_like(data.states.vel) if self.air_vel is None else self.air_vel
-
-    @property
-    def drag_factor(self) -> Array | float:
-        return 1.0 if self.drag is None else self.factors[..., FACTOR_SETTINGS.index("drag") :]
-
-
-class Randomize(Plugin):
+class Randomize(MovingAir, Plugin, requires=needs_rotors):
     """Random differences of the drones from their airframe, drawn anew for every episode; needs rotors.
 
     Each setting is a range (low, high): one for all drones, (2,), or one per drone, (n_worlds, n_drones, 2). A number
@@ -76,35 +36,43 @@ class Randomize(Plugin):
     have ranges from the literature.
     """
 
-    mass: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the mass."""
-    inertia: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the inertia, the same for all axes."""
-    thrust: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the thrust, the same for all rotors of a drone."""
-    rotor_thrust: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the thrust, drawn separately for each rotor; it multiplies the factor ``thrust``."""
-    torque: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the rotors' drag torque."""
-    lag: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the rates of the rotors' lag: their time constants are divided by it."""
-    drag: ArrayLike | None = parameter(default=None, low=0.0)
-    """Factor of the linear drag, or of the rotor drag and loss of thrust by inflow of ``RotorAerodynamics``."""
-    wind: ArrayLike | None = parameter(default=None, low=0.0)
-    """Speed of a mean wind of random horizontal direction, m/s; needs a model with drag."""
-    charge: ArrayLike | None = parameter(default=None, low=0.0, high=1.0)
-    """State of charge at the beginning of an episode; needs ``Battery``."""
-    delay: ArrayLike | None = parameter(default=None, low=0.0)
-    """Delay of commands, steps, rounded down; needs ``Latency`` with one delay per drone."""
+    mass: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the mass. (2,)"""
+    inertia: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the inertia, the same for all axes. (2,)"""
+    thrust: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the thrust, the same for all rotors of a drone. (2,)"""
+    rotor_thrust: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the thrust, drawn separately for each rotor; it multiplies the factor ``thrust``. (2,)"""
+    torque: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the rotors' drag torque. (2,)"""
+    lag: Param = param(default=None, core=(2,), positive=True)
+    """Factor of the rates of the rotors' lag: their time constants are divided by it. (2,)"""
+    drag: Param = param(default=None, core=(2,), low=0.0)
+    """Factor of the linear drag, or of the rotor drag and loss of thrust by inflow of ``RotorAerodynamics``. (2,)"""
+    wind: Param = param(default=None, core=(2,), low=0.0)
+    """Speed of a mean wind of random horizontal direction, m/s; needs a model with drag. (2,)"""
+    charge: Param = param(default=None, core=(2,), low=0.0, high=1.0)
+    """State of charge at the beginning of an episode; needs ``Battery``. (2,)"""
+    delay: Param = param(default=None, core=(2,), low=0.0)
+    """Delay of commands, steps, rounded down; needs ``Latency`` with one delay per drone. (2,)"""
     optional: Sequence[str] = ()
     """Settings, of ``charge``, ``drag``, ``wind`` and ``delay``, that are ignored if the simulation lacks what they act
     on; without this, they raise an error. The ranges of presets are optional."""
+    factors: Array = state((len(FACTOR_SETTINGS),))
+    """Factors of mass, inertia, drag torque, rates of the rotors' lag, and linear drag, 1. (n_worlds, n_drones, 5)"""
+    thrust_factors: Array = state(("rotors",))
+    """Factors of the thrust of the rotors, 1. (n_worlds, n_drones, n_rotors)"""
+    air_vel: Array = state((3,), optional=True)
+    """Mean wind, world frame, m/s; None without wind. (n_worlds, n_drones, 3)"""
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
         super().__post_init__()
+        if self.is_bound:
+            return
         if not isinstance(self.optional, (list, tuple)) or not all(name in RANGE_SETTINGS for name in self.optional):
             raise ConfigError(
                 f"expected optional as a list of {', '.join(RANGE_SETTINGS)}, got {short_repr(self.optional)}. Use "
@@ -150,36 +118,41 @@ class Randomize(Plugin):
         settings: dict[str, Any] = {"optional": tuple([name for name in ranges if name not in changes])}
         return cls(**(settings | ranges | changes))
 
-    def record(self, sim: Simulation) -> RandomizeData:
-        require_rotors(sim, "randomisation of motors")
+    def velocity_at_drone(self, data: SimData) -> Array:
+        return jnp.zeros_like(data.states.vel) if self.air_vel is None else self.air_vel
+
+    @property
+    def drag_factor(self) -> Array | float:
+        return 1.0 if self.drag is None else self.factors[..., FACTOR_SETTINGS.index("drag") :]
+
+    def bind(self, sim: Simulation) -> Randomize:
         has_wind = self.wind is not None
         if has_wind and "wind" in self.optional and not has_drag(sim):
             has_wind = False
         elif has_wind:
             require_drag(sim, "wind")
-        settings = self if has_wind or self.wind is None else dataclasses.replace(self, wind=None)
-        record = settings.fill_record(
+        bound = self.with_arrays(
             sim,
-            RandomizeData,
             factors=drone_array(sim, 1.0, len(FACTOR_SETTINGS)),
             thrust_factors=drone_array(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
             air_vel=drone_array(sim, 0.0, 3) if has_wind else None,
+            **({} if has_wind else {"wind": None}),
         )
         for name in RANGE_SETTINGS:
-            limits, values = getattr(record, name), getattr(self, name)
+            limits, values = getattr(bound, name), getattr(self, name)
             if limits is not None and np.ndim(values) == 0:
                 raise ConfigError(
                     f"expected {name} as (low, high), got {values!r}. Use ({values}, {values}) for a fixed number."
                 )
             if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
                 raise ConfigError(f"expected {name} as (low, high), got {values!r}. Use the smaller number first.")
-        return record
+        return bound
 
     def check_plugins(self, sim: Simulation) -> None:
         records = sim.data.plugins.values()
-        latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
+        latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, Latency)}
         has_battery = any(isinstance(x, Battery) for x in records)
-        has_any_drag = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
+        has_any_drag = has_drag(sim) or any(isinstance(x, RotorAerodynamics) for x in records)
         requirements = {
             "charge": (has_battery, "a battery", "sim.add(Battery())"),
             "drag": (has_any_drag, "an airframe with drag", "sim.add(RotorAerodynamics(...))"),
@@ -210,32 +183,30 @@ class Randomize(Plugin):
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
     def influence(self, data: SimData) -> SimData:
-        record, p = self.read(data), data.params
-        mass, inertia, torque, lag, drag = (record.factors[k : k + 1] for k in range(len(FACTOR_SETTINGS)))
+        p = data.params
+        mass, inertia, torque, lag, drag = (self.factors[k : k + 1] for k in range(len(FACTOR_SETTINGS)))
         changes = {}
-        if record.mass is not None:
+        if self.mass is not None:
             changes["mass"] = mass * p.mass
-        if record.inertia is not None:
+        if self.inertia is not None:
             changes |= {"J": inertia * p.J, "J_inv": p.J_inv / inertia}
-        if record.torque is not None:
+        if self.torque is not None:
             changes["rpm2torque"] = torque * p.rpm2torque
-        if record.lag is not None:
+        if self.lag is not None:
             changes["rotor_dyn_coef"] = lag * p.rotor_dyn_coef
-        if record.drag is not None:
+        if self.drag is not None:
             changes["drag_matrix"] = drag * p.drag_matrix
-        if record.thrust is not None or record.rotor_thrust is not None:
-            changes["rpm2thrust"] = record.thrust_factors[:, None] * p.rpm2thrust
+        if self.thrust is not None or self.rotor_thrust is not None:
+            changes["rpm2thrust"] = self.thrust_factors[:, None] * p.rpm2thrust
         data = data.replace(params=p.replace(**changes))
-        return data if record.air_vel is None else with_moving_air(data, record.air_vel)
+        return data if self.air_vel is None else with_moving_air(data, self.air_vel)
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        record = self.read(data)
-        observations = {"factors": record.factors, "thrust_factors": record.thrust_factors}
-        return observations if record.air_vel is None else observations | {"air_vel": record.air_vel}
+        observations = {"factors": self.factors, "thrust_factors": self.thrust_factors}
+        return observations if self.air_vel is None else observations | {"air_vel": self.air_vel}
 
     def reset_episode(self, data: SimData) -> SimData:
-        record = self.read(data)
-        n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
+        n_rotors, dtype = self.thrust_factors.shape[-1], self.factors.dtype
         u = uniform(drone_key(data, self.name), (len(FACTOR_SETTINGS) + 5 + n_rotors,), dtype)
 
         def draw_in_range(limits: Array | None, random_number: Array) -> Array:
@@ -243,22 +214,22 @@ class Randomize(Plugin):
                 jnp.ones_like(random_number) if limits is None else limits[0] + random_number * (limits[1] - limits[0])
             )
 
-        single_factors = [draw_in_range(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
+        single_factors = [draw_in_range(getattr(self, name), u[k : k + 1]) for k, name in enumerate(FACTOR_SETTINGS)]
         # Thrust, speed and direction of the wind, charge, delay, then the thrust of each rotor.
         other_draws = u[len(FACTOR_SETTINGS) :]
-        thrust = draw_in_range(record.thrust, other_draws[:1]) * draw_in_range(record.rotor_thrust, other_draws[5:])
+        thrust = draw_in_range(self.thrust, other_draws[:1]) * draw_in_range(self.rotor_thrust, other_draws[5:])
         changes = {"factors": jnp.concatenate(single_factors), "thrust_factors": thrust}
-        if record.wind is not None:
-            speed, angle = draw_in_range(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
+        if self.wind is not None:
+            speed, angle = draw_in_range(self.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
-        data = self.write(data, record.replace(**changes))
+        data = self.write(data, self.replace(**changes))
 
         records = dict(data.plugins)
         for name, other in data.plugins.items():
-            if isinstance(other, Battery) and record.charge is not None:
-                charge = draw_in_range(record.charge, other_draws[3:4])
+            if isinstance(other, Battery) and self.charge is not None:
+                charge = draw_in_range(self.charge, other_draws[3:4])
                 records[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
-            if isinstance(other, LatencyData) and record.delay is not None:
-                steps = jnp.floor(draw_in_range(record.delay, other_draws[4:5])).astype(other.delay.dtype)
+            if isinstance(other, Latency) and self.delay is not None:
+                steps = jnp.floor(draw_in_range(self.delay, other_draws[4:5])).astype(other.delay.dtype)
                 records[name] = other.replace(delay=steps)
         return data.replace(plugins=records)

@@ -7,45 +7,22 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, airframe_numbers, check_parameter, param
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import quadratic_curve, rotor_torque
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.plugins.effects.moving_air import needs_rotors
+from crazysim.pytree import device_array
 
 N_INPUTS = 14
 """Number of inputs: see ``residual_inputs``."""
 
 
-class ResidualData(PyTree):
-    """Coefficients of the force and torque, as in the airframe's table ``[residual]``."""
-
-    linear: Array = leaf("parameter", 2, (6, N_INPUTS))
-    """Force, N, and torque, N m, in the body frame, per input. (6, 14)"""
-    hidden: Array | None = leaf("parameter", 2)
-    """Weights of the network's hidden layer, 1 per input; None without a network. (n_hidden, 14)"""
-    output: Array | None = leaf("parameter", 2)
-    """Force, N, and torque, N m, in the body frame, per activation; None without a network. (6, n_hidden)"""
-
-    @staticmethod
-    def create(airframe: Airframe) -> ResidualData:
-        """Return the coefficients of an airframe, the same for all drones."""
-        dtype = jnp.result_type(float)
-        has_network = "residual.hidden" in airframe.values
-        return ResidualData(
-            linear=device_array(airframe.value("residual.linear"), dtype),
-            hidden=device_array(airframe.value("residual.hidden"), dtype) if has_network else None,
-            output=device_array(airframe.value("residual.output"), dtype) if has_network else None,
-        )
-
-
-class Residual(Plugin):
+class Residual(Plugin, requires=needs_rotors):
     """Identified force and torque that the model lacks: linear terms and an optional network; needs rotors.
 
     Force and torque depend on the velocity over ground, so that wind does not change them. Coefficients have the shapes
@@ -54,22 +31,29 @@ class Residual(Plugin):
     ``RotorAerodynamics``.
     """
 
-    linear: ArrayLike | None = parameter(default=None)
+    linear: Param = param(default=None, core=(6, N_INPUTS))
     """Force, N, and torque, N m, in the body frame, per input; None for the airframe's. (6, 14)"""
-    hidden: ArrayLike | None = parameter(default=None)
+    hidden: Param = param(default=None, core=("hidden", N_INPUTS))
     """Weights of the network's hidden layer, 1 per input; None for no network if ``linear`` is given, else the
     airframe's. (n_hidden, 14)"""
-    output: ArrayLike | None = parameter(default=None)
+    output: Param = param(default=None, core=(6, "hidden"))
     """Force, N, and torque, N m, in the body frame, per activation; None as for ``hidden``. (6, n_hidden)"""
     name: str = "residual"
+
+    @staticmethod
+    def create(airframe: Airframe) -> Residual:
+        """Return the coefficients of an airframe, the same for all drones, as arrays."""
+        values = {key: airframe.values.get(f"residual.{key}") for key in ("linear", "hidden", "output")}
+        return Residual(is_bound=True).replace(
+            **{key: x if x is None else device_array(x) for key, x in values.items()}
+        )
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
         """The drag, if the coefficients are the airframe's, which were fitted with its linear drag."""
         return ("drag",) if self.linear is None else ()
 
-    def record(self, sim: Simulation) -> ResidualData:
-        require_rotors(sim, "a residual")
+    def bind(self, sim: Simulation) -> Residual:
         coefficients = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
         if (self.hidden is None) != (self.output is None) or (self.linear is None and self.hidden is not None):
             names = ", ".join(key for key, value in coefficients.items() if value is not None)
@@ -81,19 +65,17 @@ class Residual(Plugin):
             coefficients = _airframe_coefficients(sim)
         n_hidden = 0 if coefficients["hidden"] is None else np.atleast_2d(coefficients["hidden"]).shape[-2]
 
-        def check_coefficients(key: str, shape: tuple[int, int]) -> Array | None:
-            value = coefficients[key]
-            return None if value is None else check_parameter(sim, key, value, shape)
-
-        linear = check_parameter(sim, "linear", coefficients["linear"], (6, N_INPUTS))
-        return ResidualData(
-            linear, check_coefficients("hidden", (n_hidden, N_INPUTS)), check_coefficients("output", (6, n_hidden))
-        )
+        shapes = {"linear": (6, N_INPUTS), "hidden": (n_hidden, N_INPUTS), "output": (6, n_hidden)}
+        arrays = {
+            key: None if coefficients[key] is None else check_parameter(sim, key, coefficients[key], shape)
+            for key, shape in shapes.items()
+        }
+        return self.replace(**arrays, is_bound=True)
 
     def influence(self, data: SimData) -> SimData:
         s = data.states
         inputs = residual_inputs(s.quat, s.vel, s.ang_vel, s.rotor_vel, data.params)
-        force, torque = residual_wrench(inputs, self.read(data))
+        force, torque = residual_wrench(inputs, self)
         force = rotation.rotate(s.quat, force, offset=s.force)
         torque = rotation.rotate(s.quat, torque, offset=s.torque)
         return data.replace(states=s.replace(force=force, torque=torque))
@@ -136,7 +118,7 @@ def residual_inputs(
     )
 
 
-def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array]:
+def residual_wrench(inputs: Array, residual: Residual) -> tuple[Array, Array]:
     """Return the force, N, and the torque, N m, of a residual in the body frame: linear terms plus the network.
 
     Args:

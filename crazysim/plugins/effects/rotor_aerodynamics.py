@@ -8,11 +8,10 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, airframe_numbers, check_parameter, derived, param
 from crazysim.drones import Airframe
 from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_factor, thrust_in_flight
@@ -21,35 +20,14 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import (
     air_velocity,
-    checked_propeller_radius,
     drag_factor,
-    require_rotors,
+    needs_rotors,
     rotor_positions,
 )
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 
-class RotorAerodynamicsData(PyTree):
-    """Parameters of rotors in moving air, constant in time."""
-
-    drag: Array = leaf("parameter", 1, (1,))
-    """Drag of a rotor across its axis per velocity and rotor speed, N s^2/(m rad). (1,)"""
-    blade: Array = leaf("parameter", 1, (1,))
-    """Coefficient of the blades (``dynamics.inflow``): loss of thrust per velocity of the air through the rotor and
-    rotor speed, N s^2/(m rad). (1,)"""
-    flapping: Array = leaf("parameter", 1, (1,))
-    """Moment at a hub per velocity across its axis and rotor speed, N s^2/rad. (1,)"""
-    propeller_radius: Array = leaf("parameter", 1, (1,))
-    """Radius of a propeller, m. (1,)"""
-    air_density: Array = leaf("parameter", 1, (1,))
-    """Density of air, kg/m^3. (1,)"""
-    hub_pos: Array = leaf("parameter", 2)
-    """Positions of the hubs, body frame, m. (n_rotors, 3)"""
-    ceiling: Array | None = leaf("parameter", 1, (1,))
-    """Height of the ceiling, world frame, m; None without a ceiling. (1,)"""
-
-
-class RotorAerodynamics(Plugin):
+class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
     """Forces of the air on every rotor, which replace the airframe's linear drag; needs rotors.
 
     The forces follow from the velocity of each hub relative to the air, including all winds and downwash. Across its
@@ -58,42 +36,38 @@ class RotorAerodynamics(Plugin):
     give the airframe's linear drag for small velocities around hover.
     """
 
-    drag: ArrayLike | None = parameter(default=None, low=0.0)
+    drag: Param = param(default=None, low=0.0)
     """Drag of a rotor per velocity across its axis and rotor speed (k_d of RotorPy), N s^2/(m rad) = kg/rad; None for
-    the value that matches the airframe's linear drag in hover, the mean of x and y; zero for no drag. () or
-    (n_worlds, n_drones)"""
-    inflow: ArrayLike | None = parameter(default=None, low=0.0)
+    the value that matches the airframe's linear drag in hover, the mean of x and y; zero for no drag. (1,)"""
+    inflow: Param = param(default=None, keep=False, low=0.0)
     """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
-    None for the value that matches the airframe's linear drag along z in hover; zero for the thrust of still air. () or
-    (n_worlds, n_drones)"""
-    flapping: ArrayLike = parameter(default=0.0, low=0.0)
+    None for the value that matches the airframe's linear drag along z in hover; zero for the thrust of still air."""
+    flapping: Param = param(default=0.0, low=0.0)
     """Moment of flapping blades at a hub per velocity across its axis and rotor speed, which tips the drone back,
-    N s^2/rad = kg m/rad. The default is zero because airframes do not contain the stiffness of blades and hubs. () or
-    (n_worlds, n_drones)"""
-    hub_height: ArrayLike | None = parameter(default=None)
+    N s^2/rad = kg m/rad. The default is zero because airframes do not contain the stiffness of blades and hubs. (1,)"""
+    hub_height: Param = param(default=None, keep=False)
     """Height of the hubs above the centre of mass, m, the lever arm of the drag; None for the airframe's
-    ``shape.propeller_height`` above ``rotors.position``. () or (n_worlds, n_drones)"""
-    ceiling: ArrayLike | None = parameter(default=None, positive=True)
+    ``shape.propeller_height`` above ``rotors.position``."""
+    ceiling: Param = param(default=None, positive=True)
     """Height of a flat ceiling, below which rotors give more thrust, world frame, m; rotors above it give the thrust of
-    free air. Needs ``inflow``; None for no ceiling. () or (n_worlds, n_drones)"""
-    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
-    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
-    air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
-    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
+    free air. Needs ``inflow``; None for no ceiling. (1,)"""
+    propeller_radius: Param = param(default=None, airframe="shape.propeller_radius", positive=True)
+    """Radius of a propeller, m; None for the airframe's. (1,)"""
+    air_density: Param = param(default=AIR_DENSITY, positive=True)
+    """Density of air, kg/m^3. (1,)"""
+    blade: Array = derived()
+    """Coefficient of the blades (``dynamics.inflow``): loss of thrust per velocity of the air through the rotor and
+    rotor speed, N s^2/(m rad). (1,)"""
+    hub_pos: Array = derived(("rotors", 3))
+    """Positions of the hubs, body frame, m. (n_rotors, 3)"""
     name: str = "rotor_aerodynamics"
     order: ClassVar[int] = 1  # after winds, whose drag it replaces, and after effects that change the thrust curves
 
-    @property
-    def replaced_terms(self) -> tuple[str, ...]:
-        return ("drag",)
-
-    def record(self, sim: Simulation) -> RotorAerodynamicsData:
-        require_rotors(sim, "rotor aerodynamics")
-        radius = checked_propeller_radius(sim, self.propeller_radius)
-        density = check_parameter(sim, "air_density", self.air_density, positive=True)
+    def bind(self, sim: Simulation) -> RotorAerodynamics:
+        bound = self.with_arrays(sim)
         inflow = np.asarray(self._setting_or_drag_value(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
         thrust, speed = airframe_numbers(sim, hover_thrust)[..., None], airframe_numbers(sim, hover_speed)[..., None]
-        disc = np.asarray(disc_factor(radius, density), np.float64)
+        disc = np.asarray(disc_factor(bound.propeller_radius, bound.air_density), np.float64)
         blade = blade_coefficient(inflow * speed, thrust, speed, disc)
         if self.ceiling is not None and not np.all(inflow > 0):
             raise ConfigError(
@@ -107,12 +81,9 @@ class RotorAerodynamics(Plugin):
                 f"radius and air density, got {np.max(inflow):.3g}. Use RotorAerodynamics(inflow=...) with a "
                 f"smaller number."
             )
-        return self.fill_record(
-            sim,
-            RotorAerodynamicsData,
+        return bound.replace(
             drag=self._setting_or_drag_value(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
             blade=check_parameter(sim, "blade", blade),
-            propeller_radius=radius,
             hub_pos=self._hub_positions(sim),
         )
 
@@ -142,34 +113,34 @@ class RotorAerodynamics(Plugin):
         return device_array(pos + hub_z * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
 
     def influence(self, data: SimData) -> SimData:
-        record, s, p = self.read(data), data.states, data.params
+        s, p = data.states, data.params
         vel = rotation.rotate_inverse(s.quat, s.vel - air_velocity(data))
-        hub_vel = vel + rotation.cross(s.ang_vel, record.hub_pos)
+        hub_vel = vel + rotation.cross(s.ang_vel, self.hub_pos)
         u, v, axial_vel = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
         speed = RPM_TO_RAD_S * s.rotor_vel
         static_thrust = quadratic_curve(s.rotor_vel, p.rpm2thrust)
-        blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
+        blade, drag = drag_factor(data) * self.blade, drag_factor(data) * self.drag
         ceiling_gain: Array | float = 1.0
-        if record.ceiling is not None:
-            height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
-            ceiling_gain = ceiling_factor(record.ceiling - height, record.propeller_radius)
+        if self.ceiling is not None:
+            height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], self.hub_pos)[..., 2]
+            ceiling_gain = ceiling_factor(self.ceiling - height, self.propeller_radius)
         thrust = thrust_in_flight(
             static_thrust,
             speed,
             axial_vel,
             u * u + v * v,
             blade,
-            record.propeller_radius,
-            record.air_density,
+            self.propeller_radius,
+            self.air_density,
             ceiling_gain,
         )
         thrust_change = jnp.where(blade > 0, thrust - jnp.where(static_thrust > 0, static_thrust, 0.0), 0.0)
 
-        drag_per_vel, moment_per_vel = drag * speed, record.flapping * speed
+        drag_per_vel, moment_per_vel = drag * speed, self.flapping * speed
         forces = jnp.stack([-drag_per_vel * u, -drag_per_vel * v, thrust_change], axis=-1)
         moments = jnp.stack([moment_per_vel * v, -moment_per_vel * u, jnp.zeros_like(moment_per_vel)], axis=-1)
         force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)
-        torque = jnp.sum(rotation.cross(record.hub_pos, forces) + moments, axis=-2)
+        torque = jnp.sum(rotation.cross(self.hub_pos, forces) + moments, axis=-2)
         return data.replace(
             states=s.replace(
                 force=rotation.rotate(s.quat, force, offset=s.force),

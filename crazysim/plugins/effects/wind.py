@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, drone_array, param, state
 from crazysim.core.random import drone_key, normal
-from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.effects.moving_air import MovingAir, require_drag, with_moving_air
-from crazysim.pytree import leaf
+from crazysim.plugins.effects.moving_air import MovingAir, needs_drag, with_moving_air
 from crazysim.rotation import clip, dot, safe_normalize
 
 METRES_PER_FOOT = 0.3048
@@ -30,23 +28,60 @@ MIN_AIRSPEED = 1.0
 field the gust at such a drone would never change."""
 
 
-class WindData(MovingAir):
-    """Parameters of the wind, and the gust at every drone."""
+class Wind(MovingAir, Plugin, requires=needs_drag):
+    """Wind that acts through the drag of the velocity relative to the air; needs a model with drag.
 
-    velocity: Array = leaf("parameter", 1, (3,))
-    """Mean wind (with a profile, its value at the reference height), world frame, m/s. (3,)"""
-    roughness: Array | None = leaf("parameter", 1, (1,))
-    """Roughness length of the logarithmic profile, m; None for other profiles. (1,)"""
-    exponent: Array | None = leaf("parameter", 1, (1,))
-    """Exponent of the power-law profile, 1; None for other profiles. (1,)"""
-    reference_height: Array | None = leaf("parameter", 1, (1,))
-    """Height at which the mean wind is ``velocity``, m; None for the same wind at all heights. (1,)"""
-    speed_20ft: Array | None = leaf("parameter", 1, (1,))
-    """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
-    filters: Array | None = leaf("drone", 1, (5,))
+    The gusts have the Dryden spectra of MIL-F-8785C (3.7.1.2): white noise through filters, ``1 / (1 + t s)`` along the
+    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, with ``t = L / V``, the scale length by the
+    airspeed. MIL-HDBK-1797 writes 2 L for L across and vertically and halves these lengths, which is equivalent at low
+    altitude. An episode begins with gusts at full strength, not with calm air.
+    """
+
+    velocity: Param = param(default=(0.0, 0.0, 0.0), core=(3,))
+    """Mean wind (with a profile, its value at ``reference_height``), world frame, m/s. (3,)"""
+    speed_20ft: Param = param(default=None, low=0.0)
+    """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
+    moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. (1,)"""
+    roughness: Param = param(default=None, positive=True)
+    """Roughness length of the ground, m, for a mean that grows with the logarithm of the height: 0.15 ft (0.046 m) in
+    MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for no such growth. (1,)"""
+    exponent: Param = param(default=None, low=0.0)
+    """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
+    the sea (IEC 61400-3). None for no such growth. (1,)"""
+    reference_height: Param = param(default=20 * METRES_PER_FOOT, positive=True)
+    """Height at which a mean that grows with height equals ``velocity``, m; in the data None for the same wind
+    at all heights. (1,)"""
+    filters: Array = state((5,), optional=True)
     """States of the shaping filters at unit variance, 1; None without gusts. (n_worlds, n_drones, 5)"""
-    gust: Array | None = leaf("drone", 1, (3,))
+    gust: Array = state((3,), optional=True)
     """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
+    name: str = "wind"
+
+    def bind(self, sim: Simulation) -> Wind:
+        if self.roughness is not None and self.exponent is not None:
+            raise ConfigError(
+                "expected a roughness or an exponent of the wind's profile, got both. Use roughness for the "
+                "logarithmic profile, exponent for the power law."
+            )
+
+        values: dict[str, Any] = {}
+        if self.speed_20ft is not None:
+            values = {"filters": drone_array(sim, 0.0, 5), "gust": drone_array(sim, 0.0, 3)}
+        if self.roughness is None and self.exponent is None:
+            values["reference_height"] = None
+        bound = self.with_arrays(sim, **values)
+        if self.roughness is not None and np.any(np.asarray(bound.roughness) >= np.asarray(bound.reference_height)):
+            raise ConfigError(
+                f"expected a roughness below the reference height, got {self.roughness} m and "
+                f"{self.reference_height} m. The roughness length is about a tenth of the height of grass or bushes."
+            )
+        return bound
+
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [] if self.speed_20ft is None else [StagePlacement(self.stage(self.advance_gust))]
+
+    def influence(self, data: SimData) -> SimData:
+        return with_moving_air(data, self.velocity_at_drone(data))
 
     def velocity_at_drone(self, data: SimData) -> Array:
         return self.velocity_at(data.states.pos, ground_below(data))
@@ -63,77 +98,26 @@ class WindData(MovingAir):
         height = pos[..., 2:] - ground
         if self.roughness is not None:
             return log_profile(height, self.reference_height, self.roughness) * self.velocity
-        return power_profile(height, self.reference_height, self.exponent) * self.velocity  # type: ignore[arg-type]
+        return power_profile(height, self.reference_height, self.exponent) * self.velocity
 
     def velocity_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
         """Return the velocity of the air at a position, with the drone's gust, world frame, m/s. (..., 3)"""
         mean = self.mean_at(pos, ground)
         return mean if self.gust is None else mean + self.gust
 
-
-class Wind(Plugin):
-    """Wind that acts through the drag of the velocity relative to the air; needs a model with drag.
-
-    The gusts have the Dryden spectra of MIL-F-8785C (3.7.1.2): white noise through filters, ``1 / (1 + t s)`` along the
-    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, with ``t = L / V``, the scale length by the
-    airspeed. MIL-HDBK-1797 writes 2 L for L across and vertically and halves these lengths, which is equivalent at low
-    altitude. An episode begins with gusts at full strength, not with calm air.
-    """
-
-    velocity: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Mean wind (with a profile, its value at ``reference_height``), world frame, m/s.
-    (3,) or (n_worlds, n_drones, 3)"""
-    speed_20ft: ArrayLike | None = parameter(default=None, low=0.0)
-    """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
-    moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""
-    roughness: ArrayLike | None = parameter(default=None, positive=True)
-    """Roughness length of the ground, m, for a mean that grows with the logarithm of the height: 0.15 ft (0.046 m) in
-    MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for no such growth. () or (n_worlds, n_drones)"""
-    exponent: ArrayLike | None = parameter(default=None, low=0.0)
-    """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
-    the sea (IEC 61400-3). None for no such growth. () or (n_worlds, n_drones)"""
-    reference_height: ArrayLike = parameter(default=20 * METRES_PER_FOOT, positive=True)
-    """Height at which a mean that grows with height equals ``velocity``, m. () or (n_worlds, n_drones)"""
-    name: str = "wind"
-
-    def record(self, sim: Simulation) -> WindData:
-        require_drag(sim, "wind")
-        if self.roughness is not None and self.exponent is not None:
-            raise ConfigError(
-                "expected a roughness or an exponent of the wind's profile, got both. Use roughness for the "
-                "logarithmic profile, exponent for the power law."
-            )
-
-        unused_fields = [] if self.speed_20ft is not None else ["filters", "gust"]
-        if self.roughness is None and self.exponent is None:
-            unused_fields.append("reference_height")
-        record = self.fill_record(sim, WindData, **dict.fromkeys(unused_fields))
-        if record.roughness is not None and np.any(np.asarray(record.roughness) >= np.asarray(record.reference_height)):
-            raise ConfigError(
-                f"expected a roughness below the reference height, got {self.roughness} m and "
-                f"{self.reference_height} m. The roughness length is about a tenth of the height of grass or bushes."
-            )
-        return record
-
-    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        return [] if self.speed_20ft is None else [StagePlacement(stage("drone")(self.advance_gust))]
-
-    def influence(self, data: SimData) -> SimData:
-        return with_moving_air(data, self.read(data).velocity_at_drone(data))
-
     def advance_gust(self, data: SimData) -> SimData:
         """Advance the gust at one drone by a step."""
-        wind, s = self.read(data), data.states
+        s = data.states
         ground = ground_below(data)
-        mean = wind.mean_at(s.pos, ground)
-        length, deviation = low_altitude_gusts(s.pos[..., 2:] - ground, wind.speed_20ft)
+        mean = self.mean_at(s.pos, ground)
+        length, deviation = low_altitude_gusts(s.pos[..., 2:] - ground, self.speed_20ft)
         relative_vel = s.vel - mean
         airspeed = jnp.sqrt(dot(relative_vel, relative_vel) + MIN_AIRSPEED**2)
         step_ratio = airspeed / (data.core.freq * length)  # duration of the step per time constant of the filters
 
         noise = normal(drone_key(data, self.name), (6,), s.vel.dtype)
         is_first_step = data.core.steps == 0
-        x1, x2 = wind.filters[:3], wind.filters[3:]
+        x1, x2 = self.filters[:3], self.filters[3:]
         x1 = jnp.where(is_first_step, noise[3:], x1)
         loss = jnp.where(is_first_step, 1.0, step_ratio / (1 + step_ratio / 2))
         filters = shape_noise(x1, x2, noise[:3], loss)
@@ -141,14 +125,14 @@ class Wind(Plugin):
         x1, x2 = filters[:3], filters[3:]
         transverse = (3**0.5 * x1[1:] + (1 - 3**0.5) * x2) / 2**0.5
         gust = wind_axes_to_world(deviation * jnp.concatenate([x1[:1], transverse]), mean)
-        return self.write(data, wind.replace(filters=filters, gust=gust))
+        return self.write(data, self.replace(filters=filters, gust=gust))
 
 
 def wind_at(data: SimData, pos: Array) -> Array:
     """Return the velocity of the air at a position near one drone, the sum over all ``Wind``, world frame, m/s. (3,)"""
     total = jnp.zeros_like(pos)
     for record in data.plugins.values():
-        if isinstance(record, WindData):
+        if isinstance(record, Wind):
             total = total + record.velocity_at(pos, ground_below(data))
     return total
 

@@ -19,7 +19,7 @@ from crazysim.eager import jit_eager_calls
 from crazysim.plugins.effects.ground import ground_height
 from crazysim.plugins.effects.moving_air import BodiesInAir
 from crazysim.plugins.effects.wind import wind_at
-from crazysim.plugins.effects.wind_field import WindFieldData
+from crazysim.plugins.effects.wind_field import WindField
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.link import drag_rate, link_geometry
 from crazysim.plugins.payloads.rotor_jet import jet_force
@@ -120,7 +120,7 @@ def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None
     if load.air_vel is None or load.drag is None:
         return acc
     air_vel = wind_at(data, load.pos) + load.air_vel
-    if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
+    if any(isinstance(record, WindField) for record in data.plugins.values()):
         air_vel = air_vel + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
     return acc + drag_rate(load.drag, load.mass, dt, data.core.freq) * (air_vel - load.vel)
 

@@ -163,5 +163,5 @@ def test_law_09_wrong_radii_and_models_without_drag_are_errors():
     sim = Sim()
     with pytest.raises(ConfigError, match=r"propeller_radius.*positive"):
         sim.add(Downwash(propeller_radius=0.0))
-    with pytest.raises(ConfigError, match="downwash acts through drag"):
+    with pytest.raises(ConfigError, match="Downwash acts through drag"):
         Sim(dynamics="so_rpy").add(Downwash())

@@ -9,7 +9,7 @@ import pytest
 from cases import build_stagewise_step, hover_rotor_state, vectors, with_states
 from hypothesis import given
 
-from crazysim import ConfigError, RotorAerodynamics, Sim, Wind, load_airframe, stage
+from crazysim import ConfigError, RotorAerodynamics, Sim, Wind, load_airframe
 from crazysim.dynamics import inflow
 
 R, RHO = 0.0275, 1.225
@@ -30,7 +30,7 @@ def hover(n_worlds=1, drone="cf21B_500", **settings):
 
 def wrench(sim, plugin, **states):
     """Return force, N, and torque, N m, that the plugin adds to each drone, world frame. (n_worlds, 3) each"""
-    return wrench_of(stage("drone")(plugin.influence)(with_states(sim.data, **states)).states)
+    return wrench_of(plugin.stage(plugin.influence)(with_states(sim.data, **states)).states)
 
 
 def wrench_of(states):
@@ -47,7 +47,7 @@ def quad():
 def compiled_wrench(quad):
     """Return the wrench of that plugin as a compiled function of states."""
     sim, plugin = quad
-    influence = jax.jit(stage("drone")(plugin.influence))
+    influence = jax.jit(plugin.stage(plugin.influence))
     return lambda **states: wrench_of(influence(with_states(sim.data, **states)).states)
 
 

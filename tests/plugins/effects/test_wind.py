@@ -149,8 +149,8 @@ def test_law_10_gusts_do_not_depend_on_the_number_of_worlds():
 
 
 @pytest.mark.parametrize("dynamics, drone, velocity, message", [
-    ("so_rpy", "cf21B_500", (1, 0, 0), "wind acts through drag"),
-    ("first_principles", "bumblebee", (1, 0, 0), "wind acts through drag"),
+    ("so_rpy", "cf21B_500", (1, 0, 0), "Wind acts through drag"),
+    ("first_principles", "bumblebee", (1, 0, 0), "Wind acts through drag"),
     ("first_principles", "cf21B_500", 3.0, r"expected velocity as real numbers of shape \(3,\).*got shape \(\)"),
     ("first_principles", "cf21B_500", np.zeros((2, 1, 2)), "expected velocity"),
     ("first_principles", "cf21B_500", (np.nan, 0, 0), "finite"),

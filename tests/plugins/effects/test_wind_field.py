@@ -139,7 +139,7 @@ def test_other_velocities_compile_nothing():
 
 
 @pytest.mark.parametrize("kwargs, message", [
-    ({"field": np.zeros((2, 2, 2, 3))}, "expected field of WindField as Grid"),
+    ({"field": np.zeros((2, 2, 2, 3))}, "expected field as a Grid"),
     ({"field": Grid(np.zeros((2, 2, 2)))}, "expected field as values of shape"),
     ({"field": SHEAR, "spread": -1.0}, "spread"),
     ({"field": SHEAR, "scale": np.nan}, "scale"),
@@ -150,5 +150,5 @@ def test_law_09_wrong_settings(kwargs, message):
     with pytest.raises(ConfigError, match=message):
         sim.add(WindField(**kwargs))
     assert sim.data.plugins == {}
-    with pytest.raises(ConfigError, match="wind acts through drag"):
+    with pytest.raises(ConfigError, match="WindField acts through drag"):
         Sim(dynamics="so_rpy").add(WindField(SHEAR))
