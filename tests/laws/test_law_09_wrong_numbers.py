@@ -142,7 +142,8 @@ def impossible_values(kind, name, declared, rng):
         [None],
         True,
     )
-    if type(None) not in kinds and None not in (example_value, kind.__dataclass_fields__[name].default):
+    allows_none = type(None) in kinds or kind.__dataclass_fields__[name].default is None
+    if not allows_none and example_value is not None:
         yield None
     if is_whole:
         yield 1.5
