@@ -235,9 +235,12 @@ def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> 
 
     (n_steps, n_worlds, n_drones, 3) and (n_steps, 3)
     """
-    step, takes_feedforward = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
-    # Elements of parameters that are zero: a traced step leaves their terms out.
-    zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
+    # A traced step leaves out terms of zero parameters only if it is told of them.
+    step, takes_feedforward = (
+        sim.build_step_fn().with_zeros_of(sim.data),
+        sim.data.controls.state.staged_feedforward is not None,
+    )
+    command = np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 
     def fly_step(data: Any, k: jax.Array) -> Any:
@@ -246,7 +249,7 @@ def fly_positions(sim: Sim, path: Any, target: np.ndarray, force: jax.Array) -> 
         commands = jnp.asarray(command).at[TRACKING_WORLD].set(setpoint.command())
         data = F.state_control(data, commands, feedforward=feedforward if takes_feedforward else None)
         data = data.replace(states=data.states.replace(force=jnp.where(k < 2 * sim.freq, 0.0, force)))
-        data = step(data, 1, zeros)
+        data = step(data, 1)
         return data, (data.states.pos, path.evaluate((k + 1) / sim.freq).pos)
 
     steps = jnp.arange(15 * sim.freq)

@@ -294,10 +294,10 @@ def gradient_case(n_worlds: int, device_options: dict[str, Any], small_size: int
     n_steps = small_size or 100
     sim = Sim(n_worlds, control="attitude", **device_options)
     start_hovering(sim, "attitude")
-    step, zeros = sim.build_step_fn(), sim.step_fn.zeros(sim.data)
+    step = sim.build_step_fn().with_zeros_of(sim.data)
 
     def squared_distance(cmd: Any, start: Any) -> Any:
-        end = step(functional.attitude_control(start, cmd), n_steps, zeros)
+        end = step(functional.attitude_control(start, cmd), n_steps)
         return jnp.sum((end.states.pos - start.states.pos) ** 2)
 
     cmd = 1.01 * sim.data.controls.attitude.staged_cmd

@@ -43,13 +43,13 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
     """Print the line of one case."""
     sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
     start_hovering(sim, control)
-    step, initial_data = sim.build_step_fn(), sim.data
-    stage_command, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
+    step, initial_data = sim.build_step_fn().with_zeros_of(sim.data), sim.data
+    stage_command = getattr(functional, f"{control}_control")
     hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
     cmd = jax.device_put(jnp.broadcast_to(1.01 * hover, (n_worlds, 1, hover.size)), sim.device)
 
     def squared_distance(cmd: jax.Array) -> jax.Array:
-        final_data = step(stage_command(initial_data, cmd), n_steps, zeros)
+        final_data = step(stage_command(initial_data, cmd), n_steps)
         return jnp.sum((final_data.states.pos - initial_data.states.pos) ** 2)
 
     functions = {

@@ -214,7 +214,7 @@ def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
 def watched_flags(tree: Any) -> Any:
     """Return a tree of the same structure, True for leaves of drones, members and worlds except parameters and scratch.
 
-    Such leaves of plugins must be finite; see ``crazysim.core.stages.watched_leaves``.
+    Such leaves of plugins must be finite; see ``crazysim.core.data.SimData.roles``.
     """
     declared = ("drone", "member", "world")
     return _map_leaves(

@@ -19,8 +19,8 @@ from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
 from crazysim.core.plugin import Plugin
+from crazysim.core.record import nonfinite_worlds
 from crazysim.core.stage import as_stages
-from crazysim.core.stages import nonfinite_worlds
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import native
 from crazysim.pytree import PyTree

@@ -16,16 +16,29 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control, Controller, command_size
 from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.core.controls import SimControls
+from crazysim.core.record import Record, Roles, require_arrays
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import PyTree, float_dtype, host_array, leaf, static
+from crazysim.pytree import (
+    Members,
+    PyTree,
+    check_axes,
+    float_dtype,
+    has_members,
+    host_array,
+    leaf,
+    leaf_indices,
+    scopes,
+    static,
+    watched_flags,
+)
 
 SimParams = first_principles.Params | fitted.Params
 """Parameters of a dynamics model."""
 
-MAX_STEPS = 2**31 - 1
-"""Largest number of steps since a reset, the largest int32: 24.9 days at 1000 Hz."""
+_UNWATCHED = "unwatched"
+"""Mark of leaves that are not watched."""
 
 
 class SimState(PyTree):
@@ -108,7 +121,7 @@ class SimCore(PyTree):
     episode: Array = leaf("world")
     """Number of resets of the world. Its random numbers depend on it. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """True where the world has become non-finite in ``crazysim.core.stages.watched_leaves``, or has taken more than
+    """True where the world has become non-finite in a leaf that ``SimData.roles`` watches, or has taken more than
     ``MAX_STEPS`` steps, since its last reset. (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
@@ -175,7 +188,7 @@ class Objects(PyTree):
         return self.replace(pos=pos, quat=quat)
 
 
-class SimData(PyTree):
+class SimData(Record):
     """Complete data of a simulation: the argument and the result of a step."""
 
     states: SimState
@@ -217,6 +230,48 @@ class SimData(PyTree):
             params=create_params(dynamics, airframes, n_worlds),
             core=SimCore.create(freq, n_worlds, n_drones, drone_mocap_ids, rng_key),
         )
+
+    def roles(self) -> Roles:
+        """Return the leaves with a role in a step.
+
+        NaN and infinity flag a world in states, controls and populations. NaN alone flags it in what other records of
+        plugins hold for drones and worlds, except parameters and scratch; infinity may mean "none so far" there.
+        Records with ``watched = False`` are left out. What a user passes to compiled code ends up in one of these
+        leaves.
+        """
+        indices: Any = leaf_indices(self)
+        records = {name: x for name, x in self.plugins.items() if getattr(x, "watched", isinstance(x, PyTree))}
+        populations = {name: x for name, x in records.items() if isinstance(x, Members)}
+
+        def finite_flags(tree: Any) -> Any:
+            return jax.tree.map(lambda scope: True if has_members(scope) else _UNWATCHED, scopes(tree))
+
+        flags = jax.tree.map(lambda _: _UNWATCHED, self)
+        nan_flags = jax.tree.map(
+            lambda x: False if x else _UNWATCHED, {k: watched_flags(x) for k, x in records.items()}
+        )
+        flags = flags.replace(
+            states=finite_flags(self.states), controls=finite_flags(self.controls),
+            plugins=flags.plugins | nan_flags | {name: finite_flags(x) for name, x in populations.items()},
+        )  # fmt: skip
+        return Roles(
+            population="drone",
+            clock=indices.core.steps,
+            nonfinite=indices.core.nonfinite,
+            watched={i: flag for i, flag in enumerate(jax.tree.leaves(flags)) if flag is not _UNWATCHED},
+            parameters=frozenset(jax.tree.leaves((indices.params, indices.controls))),
+            cleared=indices.core.mjx_synced,
+        )
+
+    def check(self) -> None:
+        """Check shapes and types of the states, and the axes of every leaf."""
+        require_states(self)
+        require_arrays(self)
+        check_axes(self, self.core.n_worlds, self.core.n_drones)
+
+    def without_sizes(self) -> SimData:
+        """Return the data with 0 as its numbers of worlds and drones."""
+        return self.replace(core=self.core.replace(n_worlds=0, n_drones=0))
 
 
 def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) -> SimParams:

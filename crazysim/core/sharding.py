@@ -10,7 +10,6 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
-from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
 from crazysim.jaxcompat import gather_from_hosts, is_key
 from crazysim.pytree import n_batch_axes, replace_leaves, scopes
@@ -96,7 +95,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
     return jax.make_mesh((len(devices),), (WORLD_AXIS,), axis_types=(AxisType.Auto,), devices=list(devices))
 
 
-def shardings_of(data: SimData, mesh: Mesh) -> SimData:
+def shardings_of(data: Any, mesh: Mesh) -> Any:
     """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated."""
     if not isinstance(mesh, Mesh):
         raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices()), or --devices of a training")
@@ -115,13 +114,13 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
     return jax.tree.map(lambda scope: split_sharding if n_batch_axes(scope) else replicated_sharding, scopes(data))
 
 
-def shard(data: SimData, mesh: Mesh) -> SimData:
+def shard(data: Any, mesh: Mesh) -> Any:
     """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
     distribute_fn = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else distribute
     return distribute_fn(data, shardings_of(data, mesh))
 
 
-def map_devices(fn: Callable[[SimData], R], data: SimData, mesh: Mesh) -> R:
+def map_devices(fn: Callable[[T], R], data: T, mesh: Mesh) -> R:
     """Return the results of a function for all worlds; each device of a mesh computes the results of its worlds.
 
     Args:

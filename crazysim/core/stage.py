@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.arguments import check_arguments
-from crazysim.core.data import SimData
 from crazysim.core.pair_reductions import MEMBER_AXIS
+from crazysim.core.record import Record
 from crazysim.eager import explain_traced_values
 from crazysim.errors import ConfigError
 from crazysim.pytree import (
@@ -45,7 +45,7 @@ RESERVED_SCOPES = ("batch", "batched", "shared", "opaque", "parameter", "member"
 
 
 class Stage:
-    """A function ``SimData -> SimData``, with the scope that the function is written for.
+    """A function from a record such as ``SimData`` to one alike, with the scope that the function is written for.
 
     When the stage is called with the data of a simulation, it applies the function to every drone, to every member of a
     population, or to every world. With the scope ``"batch"``, it applies the function to the data of all worlds at
@@ -76,13 +76,13 @@ class Stage:
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
 
-    def __call__(self, data: SimData) -> SimData:
+    def __call__(self, data: Record) -> Any:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
             return self.apply_unmapped(data)
         return vmap_worlds(world_function(self, Axes(data)), 2)(data)
 
-    def apply_unmapped(self, data: SimData) -> SimData:
+    def apply_unmapped(self, data: Record) -> Any:
         """Return the data after the stage, from one call of its function that is not mapped over worlds or members.
 
         Args:
@@ -99,7 +99,7 @@ class Stage:
 
         return jax.tree.map(select, data_after, data)
 
-    def apply_in_worlds(self, data: SimData, mask: Array | None) -> SimData:
+    def apply_in_worlds(self, data: Record, mask: Array | None) -> Any:
         """Return the data after the stage, with changes only in some worlds.
 
         Args:
@@ -152,7 +152,7 @@ def stage(
     return lambda fn: Stage(fn, scope, when, phase=phase)
 
 
-def is_tick(data: SimData, freq: int) -> Array | None:
+def is_tick(data: Any, freq: int) -> Array | None:
     """Return True in worlds in which a stage with a rate, Hz, acts at this step; None if it acts at every step.
 
     Returns:
@@ -162,7 +162,7 @@ def is_tick(data: SimData, freq: int) -> Array | None:
     return None if period == 1 else data.core.steps % period == 0
 
 
-def is_first_step(data: SimData) -> Array:
+def is_first_step(data: Any) -> Array:
     """Return True in the first step of an episode. (n_worlds, 1), or () for data of one world
 
     An engine may evaluate stages with this condition at the beginning of a step pipeline only once per call of the step
@@ -187,14 +187,14 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
 class Axes:
     """Names, indices and scopes of all leaves of a simulation's data. The scopes give the batch axes."""
 
-    def __init__(self, data: SimData):
+    def __init__(self, data: Record):
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
         self.leaf_indices = leaf_indices(data)
         """Record with the index of every leaf in place of the leaf."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
-    def written_leaves(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
+    def written_leaves(self, before: list[Array], after: Record, stage: Stage) -> list[int]:
         """Return the indices of the leaves that a stage wrote, and check that it may write them.
 
         Args:
@@ -314,14 +314,14 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
     return apply_to_worlds
 
 
-def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
+def vmap_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Transform a function of the data of one drone to a function of the data of one world.
 
     Args:
         fn: Function that returns any tree of arrays. In the result each array has a first axis over drones.
     """
 
-    def apply_to_drones(data: SimData) -> Any:
+    def apply_to_drones(data: Any) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
         return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=MEMBER_AXIS)(leaves)
@@ -338,10 +338,10 @@ def _leaf_scopes(tree: object) -> list[str]:
     return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
 
 
-def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
+def world_function(stage: Stage, axes: Axes) -> Callable[[Any], Any]:
     """Return a stage as a function from the data of one world to the data after it, for all drones or members."""
 
-    def apply_in_world(world: SimData) -> SimData:
+    def apply_in_world(world: Any) -> Any:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 

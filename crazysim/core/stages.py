@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,10 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage, StageScope, is_tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import Members, PyTree, has_members, n_batch_axes, scopes, select_worlds, watched_flags
+from crazysim.pytree import n_batch_axes, scopes, select_worlds
 
 FLOOR_HEIGHT = -0.001
 """Height of the floor, at which drones stop, m. It is slightly below zero: a negative height means a landed drone."""
-
-
-_UNWATCHED = "unwatched"
-"""Mark of leaves that ``watched_leaves`` leaves out."""
 
 
 def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
@@ -167,51 +162,6 @@ def clip_floor_pos(data: SimData) -> SimData:
 def increment_steps(data: SimData) -> SimData:
     """Count the step."""
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
-
-
-def watched_leaves(data: SimData) -> dict[int, bool]:
-    """Return the indices of the leaves in which NaN flags a world, each with True if infinity does so, too.
-
-    NaN and infinity flag a world in states, controls and populations. NaN alone flags it in what other records of
-    plugins hold for drones and worlds, except parameters and scratch; infinity may mean "none so far" there. Records
-    with ``watched = False`` are left out. What a user passes to compiled code ends up in one of these leaves.
-    """
-    records = {name: x for name, x in data.plugins.items() if getattr(x, "watched", isinstance(x, PyTree))}
-    populations = {name: x for name, x in records.items() if isinstance(x, Members)}
-
-    def finite_flags(tree: Any) -> Any:
-        return jax.tree.map(lambda scope: True if has_members(scope) else _UNWATCHED, scopes(tree))
-
-    flags = jax.tree.map(lambda _: _UNWATCHED, data)
-    nan_flags = jax.tree.map(lambda x: False if x else _UNWATCHED, {k: watched_flags(x) for k, x in records.items()})
-    flags = flags.replace(
-        states=finite_flags(data.states), controls=finite_flags(data.controls),
-        plugins=flags.plugins | nan_flags | {name: finite_flags(x) for name, x in populations.items()},
-    )  # fmt: skip
-    return {i: flag for i, flag in enumerate(jax.tree.leaves(flags)) if flag is not _UNWATCHED}
-
-
-def nonfinite_worlds(data: SimData) -> Array:
-    """Return True for worlds that are flagged, hold NaN or infinity in ``watched_leaves``, or exceed ``MAX_STEPS``.
-
-    The step counter overflows to a negative number after ``MAX_STEPS``, and one call takes too few steps for it to
-    become positive again. The data may be of all worlds or of one world.
-
-    Returns:
-        (n_worlds, 1), or () in one world
-    """
-    leaves, core = jax.tree.leaves(data), data.core
-    n_axes = max(core.steps.ndim - 1, 0)
-    floats = [
-        (leaves[i], must_be_finite)
-        for i, must_be_finite in watched_leaves(data).items()
-        if jnp.issubdtype(leaves[i].dtype, jnp.floating)
-    ]
-    is_valid = [
-        jnp.all(jnp.isfinite(x) if must_be_finite else ~jnp.isnan(x), axis=tuple(range(n_axes, x.ndim)))
-        for x, must_be_finite in floats
-    ]
-    return core.nonfinite | ~jnp.all(jnp.stack(is_valid), axis=0).reshape(core.steps.shape) | (core.steps < 0)
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:

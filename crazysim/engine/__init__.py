@@ -1,11 +1,8 @@
 """Execution of a step: one description of the physics, several ways to run it."""
 
-from crazysim.engine.backends.plain import Reset
 from crazysim.engine.plan import ENGINES
-from crazysim.engine.rollout import rollout
 from crazysim.engine.step import Step
-from crazysim.engine.stepper import Stepper
 from crazysim.engine.tools.compare import Difference, first_difference
 from crazysim.engine.tools.explain import explain
 
-__all__ = ["ENGINES", "Difference", "Reset", "Step", "Stepper", "explain", "first_difference", "rollout"]
+__all__ = ["ENGINES", "Difference", "Step", "explain", "first_difference"]

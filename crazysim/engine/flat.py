@@ -1,4 +1,4 @@
-"""Caches that make flattening ``SimData`` to a list of arrays cheap."""
+"""Caches that make flattening a record to a list of arrays cheap."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.core.data import SimData
 from crazysim.engine.ir.program import Zeros
-from crazysim.pytree import leaf_flags, leaf_indices, scopes
 
 
 class PackCache:
@@ -62,23 +60,20 @@ _compiled_concatenate = jax.jit(_concatenate)
 class ZerosCache:
     """Elements of shared parameters that are zero, such as the products of inertia.
 
-    Only parameters of drones and controllers, and parameters of plugins that are declared sparse, are examined.
-
-    Values are read again only after one of the arrays was replaced. Under a trace the values are unknown, and the
-    result is empty.
+    Values are read again only after one of the arrays was replaced. Under a trace, and in shapes, the values are
+    unknown, and the result is empty.
     """
 
     def __init__(self) -> None:
         self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one tuple: threads replace both at once
-        self._indices_by_structure: dict[Any, list[int]] = {}
 
-    def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
-        indices = self._find_parameters(data, leaves, treedef)
+    def __call__(self, indices: Sequence[int], leaves: Sequence[Any]) -> Zeros:
+        """Return the zeros of some leaves."""
         arrays = [leaves[i] for i in indices]
         cached_arrays, zeros = self._cached
         if _are_same(arrays, cached_arrays):
             return zeros
-        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+        if any(isinstance(x, jax.core.Tracer | jax.ShapeDtypeStruct) for x in arrays):
             return ()
         zeros_by_leaf = [
             (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
@@ -86,20 +81,6 @@ class ZerosCache:
         zeros = tuple([(i, indices_of_zeros) for i, indices_of_zeros in zeros_by_leaf if indices_of_zeros])
         self._cached = _without_numpy(arrays), zeros
         return zeros
-
-    def _find_parameters(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
-        """Return the indices of the leaves to examine."""
-        key = (treedef, *[x.ndim for x in leaves])
-        if key not in self._indices_by_structure:
-            indices = leaf_indices(data)
-            parameters = set(jax.tree.leaves((indices.params, indices.controls)))
-            leaf_scopes, sparse_flags = jax.tree.leaves(scopes(data)), jax.tree.leaves(leaf_flags(data, "sparse"))
-            self._indices_by_structure[key] = [
-                i
-                for i, (scope, is_sparse, x) in enumerate(zip(leaf_scopes, sparse_flags, leaves, strict=True))
-                if scope == "shared" and (is_sparse or i in parameters) and jnp.issubdtype(x.dtype, jnp.floating)
-            ]
-        return self._indices_by_structure[key]
 
 
 def _without_numpy(arrays: list[Any]) -> list[Any]:

@@ -166,7 +166,7 @@ class HostCall:
             kernels: Kernels of the programs; ``is_host_call_possible`` must be True for them.
             owned: For each program the indices of the leaves that it updates; None for all leaves that it writes.
             leaves: Leaves of the data, for their shapes and types.
-            nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.
+            nonfinite: Index of the leaf with the flags of worlds that are not valid.
         """
         self.was_called = False
         """True after the first call."""

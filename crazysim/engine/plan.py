@@ -27,10 +27,9 @@ import jax
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from crazysim.core.data import SimData
+from crazysim.core.record import Record, Roles
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage
-from crazysim.core.stages import watched_leaves
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.host_call import HostCall, is_host_call_possible
@@ -66,7 +65,7 @@ class Plan:
     """Reason why no faster engine was chosen; empty for ``fused``."""
     programs: tuple[Program, ...]
     """Programs that the engine runs, one for each group of populations that depend on each other. The group of the
-    drones comes first. Empty for ``plain``."""
+    main population comes first. Empty for ``plain``."""
     location: Location
     """Devices that the step runs on."""
     inputs: tuple[int, ...]
@@ -78,7 +77,9 @@ class Plan:
     """Leaves that hold other leaves as rows; they follow the packed leaf. Empty if no leaf is stored as rows."""
     written_leaves: tuple[int, ...]
     """Indices of the leaves that the compiled step returns."""
-    leaf_indices: SimData
+    roles: Roles
+    """Leaves with a role in the step."""
+    leaf_indices: Any
     """Record with the index of every leaf in place of the leaf, as ``leaf_indices`` returns it."""
     traced_count_step: Callable[..., Any]
     """Compiled step that takes the number of steps as an array."""
@@ -108,17 +109,19 @@ class Planner(NamedTuple):
     """Devices that hold the data."""
     reported: set[str]
     """Texts of the warnings so far, for data of any structure; no warning is repeated."""
+    zeros: Zeros
+    """Elements of shared parameters that are zero."""
+    separate: SeparateLeaves
+    """Leaves that stay separate arrays. If one kernel runs the whole step, all other leaves that it writes are stored
+    as rows. None to store no leaf as rows."""
 
-    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], separate: SeparateLeaves = None) -> Plan:
+    def plan(self, data: Record, trace: Callable[[Plan], None]) -> Plan:
         """Return the plan that steps data of one structure.
 
         Args:
             data: The data, or its shapes and types.
-            zeros: Elements of shared parameters that are zero.
             trace: Function that traces the compiled step of a plan, as its first call would, so that planning raises
                 the errors of the trace.
-            separate: Leaves that stay separate arrays. If one kernel runs the whole step, all other leaves that it
-                writes are stored as rows. None to store no leaf as rows.
 
         Raises:
             ConfigError: If ``fused`` was chosen and has no kernel; with ``strict``, if something is unsupported.
@@ -126,7 +129,7 @@ class Planner(NamedTuple):
         if self.engine == "plain":
             return self._plan_plain(data, "it was chosen")
         try:
-            plan, problems = self._plan_programs(data, zeros, separate)
+            plan, problems = self._plan_programs(data)
             if plan.numpy_step is None:
                 trace(plan)
         except (ConfigError, MemoryError):
@@ -149,7 +152,7 @@ class Planner(NamedTuple):
         )
         return plan
 
-    def _plan_programs(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
+    def _plan_programs(self, data: Record) -> tuple[Plan, list[str]]:
         """Return a plan that runs programs, and messages on what its engine does not support.
 
         If programs cannot step data on several devices, the plan runs ``plain``.
@@ -159,16 +162,15 @@ class Planner(NamedTuple):
             return self._plan_plain(data, distribution_limit), []
         leaf_scopes = jax.tree.leaves(scopes(data))
         # ``zeros`` may be older than ``data``: a parameter that was shared may have one value per drone in ``data``.
-        shared_zeros = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
+        zeros = tuple([(i, indices) for i, indices in self.zeros if leaf_scopes[i] == "shared"])
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
         lowered_programs = [
-            lower_stages(g.stages, data, shared_zeros, watched_leaves(data), population=g.population, tracer=tracer)
-            for g in groups
+            lower_stages(g.stages, data, zeros, check=True, population=g.population, tracer=tracer) for g in groups
         ]
         has_one_kernel = self._has_kernels and [x.fused for x in lowered_programs] == [True]
         select_rows = None
-        if separate is not None and has_one_kernel:
+        if (separate := self.separate) is not None and has_one_kernel:
             select_rows = lambda written_leaves: [i for i in written_leaves if i not in separate]  # noqa: E731
         programs = tuple([optimise(program, select_rows, pack=k == 0) for k, program in enumerate(lowered_programs)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
@@ -197,22 +199,23 @@ class Planner(NamedTuple):
         is_on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if is_on_host and is_host_call_possible(kernels):
             owned_by_group = [group.owned_leaves for group in groups]
-            host_call = HostCall(kernels, owned_by_group, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
+            host_call = HostCall(kernels, owned_by_group, jax.tree.leaves(data), plan.roles.nonfinite)
             plan = dataclasses.replace(plan, host_call=host_call)
         return plan, problems
 
-    def _distribution_limit(self, data: SimData) -> str:
+    def _distribution_limit(self, data: Record) -> str:
         """Return the reason why data on several devices must be stepped by ``plain``; empty if there is none."""
         if not self.location.is_distributed:
             return ""
         if self.location.mesh is None:
-            return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"
+            clock = jax.tree.leaves(data)[data.roles().clock]
+            return f"the data is spread over devices by a {type(clock.sharding).__name__}, not over a mesh"
         stage = next((s for s in self.stages if s.scope == "batch"), None)
         if stage is None:
             return ""
         return f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.unfused_reason}"
 
-    def _plan_plain(self, data: SimData, reason: str) -> Plan:
+    def _plan_plain(self, data: Record, reason: str) -> Plan:
         run, written_leaves = plain.build(self.stages, data)
         all_leaves = tuple(range(len(jax.tree.leaves(data))))
         # XLA itself distributes the computation of ``plain`` over the devices.
@@ -226,7 +229,7 @@ class Planner(NamedTuple):
         self,
         engine: str,
         reason: str,
-        data: SimData,
+        data: Record,
         programs: tuple[Program, ...],
         read_leaves: Collection[int],
         written_leaves: tuple[int, ...],
@@ -234,14 +237,12 @@ class Planner(NamedTuple):
         n_leaves: int,
     ) -> Plan:
         """Return a plan. Its step passes ``n_leaves`` leaves to ``run_programs``: None if not in ``read_leaves``."""
-        indices, inputs = leaf_indices(data), tuple(sorted(read_leaves))
+        roles, inputs = data.roles(), tuple(sorted(read_leaves))
         # If a stage writes the flags itself, no check is added.
         has_check = (
-            any(p.check_segment is not None for p in programs)
-            if programs
-            else indices.core.nonfinite not in written_leaves
+            any(p.check_segment is not None for p in programs) if programs else roles.nonfinite not in written_leaves
         )
-        flag_leaves = (indices.core.nonfinite,) if has_check else ()
+        flag_leaves = (roles.nonfinite,) if has_check else ()
         written_leaves = (*written_leaves, *flag_leaves)
         drone_program = programs[0] if programs else None
         packed = drone_program.packed if drone_program is not None else ()
@@ -258,7 +259,17 @@ class Planner(NamedTuple):
             advance = self._shard_over_mesh(advance, data, programs[0].leaves, inputs, written_leaves)
         advance = _check_inputs(advance, [formats[i] for i in inputs])
         plan = Plan(
-            engine, reason, programs, self.location, inputs, packed, rows, written_leaves, indices, *_jit_steps(advance)
+            engine,
+            reason,
+            programs,
+            self.location,
+            inputs,
+            packed,
+            rows,
+            written_leaves,
+            roles,
+            leaf_indices(data),
+            *_jit_steps(advance),
         )
         in_numpy = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
         return dataclasses.replace(plan, numpy_step=_put_results_on_device(advance)) if in_numpy else plan
@@ -266,7 +277,7 @@ class Planner(NamedTuple):
     def _shard_over_mesh(
         self,
         advance: Callable[..., Any],
-        data: SimData,
+        data: Record,
         program_leaves: Sequence[Leaf],
         inputs: Sequence[int],
         outputs: Sequence[int],
@@ -300,7 +311,7 @@ class Planner(NamedTuple):
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
-    def _error_of_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
+    def _error_of_stage(self, error: UnsupportedError, data: Record) -> UnsupportedError:
         """Return the error of the first stage for which no kernel can be written.
 
         If there is none, return the error of the kernel of all stages.
@@ -316,7 +327,7 @@ class Planner(NamedTuple):
                 return stage_error
         return error
 
-    def _failing_stage(self, data: SimData) -> str:
+    def _failing_stage(self, data: Record) -> str:
         """Return the end of a message that names the first stage that cannot be lowered; empty if there is none."""
         for stage in self.stages:
             try:
@@ -326,7 +337,7 @@ class Planner(NamedTuple):
         return ""
 
 
-def _leaf_formats(data: SimData, program_leaves: Sequence[Leaf]) -> list[tuple[str, tuple[int, ...], Any]]:
+def _leaf_formats(data: Record, program_leaves: Sequence[Leaf]) -> list[tuple[str, tuple[int, ...], Any]]:
     """Return name, shape and type of each leaf of the data, followed by those of the leaves that passes add."""
     paths = jax.tree_util.tree_leaves_with_path(data)
     formats = [(f"data{jax.tree_util.keystr(path)}", x.shape, x.dtype) for path, x in paths]

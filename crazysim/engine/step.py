@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import functools
-from collections.abc import Callable, Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +15,7 @@ from jax.sharding import Mesh
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.data import MAX_STEPS, SimData, require_data, require_states
-from crazysim.core.functional import put_command, staged_fields, staged_leaves
-from crazysim.core.pipeline import Pipeline
+from crazysim.core.record import MAX_STEPS, Record, Roles
 from crazysim.core.sharding import WORLD_AXIS, Location, find_location
 from crazysim.core.stage import Axes, Stage, as_stages
 from crazysim.engine.backends import fused
@@ -26,11 +25,13 @@ from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.lowering.relative import view_leaves
 from crazysim.engine.plan import ENGINES, Plan, Planner, SeparateLeaves
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import check_axes, lazy_record, replace_leaves
+from crazysim.pytree import lazy_record, leaf_flags, replace_leaves
+
+T = TypeVar("T", bound=Record)
 
 
 class FlatData:
-    """``SimData`` as a list of arrays, with the plan that steps it. No record is made between successive steps."""
+    """A record as a list of arrays, with the plan that steps it. No record is made between successive steps."""
 
     __slots__ = ("_record", "leaves", "plan")
 
@@ -38,13 +39,13 @@ class FlatData:
         """Store the leaves of the data, followed by the leaves that passes add. Leaves stored as rows are None."""
         self.leaves: Any = leaves
         self.plan = plan
-        self._record: SimData | None = None
+        self._record: Any = None
 
-    def is_record(self, data: SimData) -> bool:
+    def is_record(self, data: object) -> bool:
         """Return whether a record is the record that ``data`` returned."""
         return data is self._record
 
-    def data(self) -> SimData:
+    def data(self) -> Any:
         """Return the data as a record, always the same one. Its fields are computed when they are read."""
         record = self._record
         if record is None:
@@ -62,19 +63,6 @@ class FlatData:
         if isinstance(self.leaves, HostLeaves):
             return FlatData(self.leaves.replace(indices, values), self.plan)
         return FlatData(replace_leaves(self.leaves, indices, values), self.plan)
-
-    def stage_command(self, reference: SimData, command: Any, feedforward: Any = None) -> FlatData:
-        """Return the data with a checked command, as ``crazysim.core.functional.stage_command`` does.
-
-        Args:
-            reference: The data, or its shapes and devices.
-            command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
-            feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
-        """
-        leaf_indices = self.plan.leaf_indices
-        indices, values = staged_leaves(leaf_indices), staged_fields(leaf_indices, command, feedforward)
-        is_on_host = isinstance(self.leaves, HostLeaves)
-        return self.replace(indices, [x if is_on_host else put_command(reference, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step other than the number of steps."""
@@ -96,6 +84,19 @@ jax.tree_util.register_pytree_node(
 )
 
 
+class _Structure(NamedTuple):
+    """What a step knows of records of one structure, shapes and types."""
+
+    treedef: Any
+    roles: Roles
+    located: int
+    """Leaf whose devices are those of the data."""
+    parameters: tuple[int, ...]
+    """Shared leaves in which zeros remove terms."""
+    plans: dict[Any, Plan]
+    """Plans by zeros, devices, and leaves that stay separate."""
+
+
 class Step:
     """``step(data, n_steps=1) -> data``, pure: usable inside jit, vmap, grad and scan.
 
@@ -104,18 +105,21 @@ class Step:
 
     Data is stepped on the devices that hold it. Under a trace its devices are unknown, and the step runs on the devices
     that it was built for.
+
+    Terms that shared parameters multiply by zero are left out. Under a trace the values are unknown, and all terms are
+    computed; ``step.with_zeros_of(data)`` leaves out those that vanish for the parameters of ``data``.
     """
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        pipeline: Mapping[str, Callable[..., Any]],
         engine: str = "auto",
         platform: str = "cpu",
         mesh: Mesh | None = None,
         *,
         device: jax.Device | None = None,
         strict: bool = False,
-        check_data: Callable[[SimData], None] | None = None,
+        check_data: Callable[[Any], None] | None = None,
     ):
         """Create the step of the stages that the pipeline has now.
 
@@ -140,7 +144,9 @@ class Step:
         devices = tuple(mesh.devices.flat) if mesh is not None else None if device is None else (device,)
         self.location = Location(platform, devices, mesh, WORLD_AXIS)
         self.stages = as_stages(pipeline)
-        self._plans: dict[Any, Plan] = {}
+        self._structures: dict[Any, _Structure] = {}
+        self._zeros: Zeros | None = None
+        """Zeros from ``with_zeros_of``; None to look for them in the data."""
         self._reported: set[str] = set()
         self._called: set[tuple[int, int | None]] = set()
         """Calls so far: id of the plan, and the number of steps, or None for an array."""
@@ -149,7 +155,7 @@ class Step:
         self._home_sharding: Any = None
         """Last sharding that was found to be at ``location``."""
         self._false_flag: Any = None
-        """Value of ``core.mjx_synced`` in the data of the last call."""
+        """Value of ``Roles.cleared`` in the data of the last call."""
 
     def without_stages(self, names: Collection[str]) -> Step:
         """Return a step without the stages of some names."""
@@ -162,64 +168,64 @@ class Step:
             raise ConfigError(f"expected stages of different names, got {', '.join(repeated)} twice. Rename yours.")
         devices = self.location.devices
         device = devices[0] if self.mesh is None and devices is not None else None
-        pipeline: Pipeline = {stage.__name__: stage for stage in stages}
+        pipeline = {stage.__name__: stage for stage in stages}
         return Step(
             pipeline, self.engine, self.platform, self.mesh, device=device, strict=self.strict,
             check_data=self._check_data,
         )  # fmt: skip
 
-    def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
+    def with_zeros_of(self, data: Record | None) -> Step:
+        """Return this step for data with the zeros that shared parameters have in ``data``, traced or not.
+
+        Args:
+            data: The data, not traced; None for data in which no number is known to be zero.
+        """
+        step = copy.copy(self)  # both share their plans
+        step._zeros = ()
+        if data is not None:
+            structure, leaves = self._flat_structure(data)
+            step._zeros = self._zeros_cache(structure.parameters, leaves)
+        return step
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the other is this step for data with the same zeros, so that JAX compiles its callers once."""
+        return isinstance(other, Step) and (self._structures is other._structures and self._zeros == other._zeros)
+
+    def __hash__(self) -> int:
+        return hash((id(self._structures), self._zeros))
+
+    def __call__(self, data: T, n_steps: int | Array = 1) -> T:
         """Return the data some steps later.
 
         Args:
-            data: The simulation.
+            data: The record, such as ``sim.data``.
             n_steps: Number of steps, at least 0: an integer, or an array of integer type. ()
-            zeros: Result of the method ``zeros`` for this data from before it was traced. Without it, the values of
-                parameters are unknown under a trace, and terms that are multiplied by zero are not left out.
         """
         _check_steps(n_steps)
-        require_data(data)
-        leaves, treedef = jax.tree.flatten(data)
-        flat = self._flatten(data, leaves, treedef, zeros, n_steps)
-        leaves_after = self.advance(flat, n_steps).leaves[: len(leaves)]
-        flag = int(flat.plan.leaf_indices.core.mjx_synced)
-        leaves_after[flag] = self._make_false_flag(leaves_after[flag])
-        return treedef.unflatten(leaves_after)
+        structure, leaves = self._flat_structure(data)
+        plan = self._plan(data, structure, leaves, n_steps)
+        leaves_after = self.advance(FlatData(self._all_leaves(plan, leaves), plan), n_steps).leaves[: len(leaves)]
+        if (cleared := structure.roles.cleared) is not None:
+            leaves_after[cleared] = self._make_false_flag(leaves_after[cleared])
+        return structure.treedef.unflatten(leaves_after)
 
-    def flatten(
-        self,
-        data: SimData,
-        zeros: Zeros | None = None,
-        n_steps: int | Array | None = None,
-        separate: SeparateLeaves = None,
-    ) -> FlatData:
+    def flatten(self, data: Record, n_steps: int | Array | None = None, separate: SeparateLeaves = None) -> FlatData:
         """Return the data flattened for ``advance``.
 
         Args:
-            data: The simulation.
-            zeros: As in ``__call__``.
+            data: The record, such as ``sim.data``.
             n_steps: Number of steps of the type that will be passed to ``advance``, of any value; None means an array.
             separate: Leaves that stay separate arrays. If one kernel runs the whole step, the other leaves that it
                 writes, except random keys, are stored as rows of a few arrays, one for each scope and type. This makes
                 loops over calls faster. None to store no leaf as rows.
         """
-        return self._flatten(data, *jax.tree.flatten(data), zeros, n_steps, separate)
-
-    def _flatten(
-        self,
-        data: SimData,
-        leaves: list[Any],
-        treedef: Any,
-        zeros: Zeros | None,
-        n_steps: int | Array | None,
-        separate: SeparateLeaves = None,
-    ) -> FlatData:
-        plan = self._plan(data, leaves, treedef, zeros, n_steps, separate)
+        structure, leaves = self._flat_structure(data)
+        plan = self._plan(data, structure, leaves, n_steps, separate)
         return FlatData(self._all_leaves(plan, leaves), plan)
 
     def require_own(self, flat: object) -> None:
         """Check that flat data is the result of ``flatten`` or ``advance`` of this step."""
-        if not isinstance(flat, FlatData) or flat.plan not in self._plans.values():
+        if not isinstance(flat, FlatData) or flat.plan not in self._plans:
             raise ConfigError(
                 f"expected flat data of this step, got "
                 f"{'that of another' if isinstance(flat, FlatData) else short_repr(flat)}. Use the result of flatten "
@@ -244,40 +250,39 @@ class Step:
         plan, leaves = flat.plan, flat.leaves
         host_call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
-            leaves = host_call.make_host_leaves(leaves, leaves[int(plan.leaf_indices.core.nonfinite)].sharding)
+            leaves = host_call.make_host_leaves(leaves, leaves[plan.roles.nonfinite].sharding)
         return FlatData(host_call(leaves, n_steps), plan)
 
-    def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
+    def plan(self, data: Record) -> Plan:
         """Return the plan that steps this data."""
-        leaves, treedef = jax.tree.flatten(data)
-        return self._plan(data, leaves, treedef, zeros)
+        return self._plan(data, *self._flat_structure(data))
 
-    def zeros(self, data: SimData) -> Zeros:
-        """Return the elements of shared parameters that are zero, for ``__call__``."""
-        return self._zeros_cache(data, *jax.tree.flatten(data))
-
-    def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
+    def lower(self, data: Record, n_steps: int | Array = 1) -> Any:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does, to inspect or to compile it."""
         _check_steps(n_steps)
-        flat = self.flatten(data, None, n_steps)
+        flat = self.flatten(data, n_steps)
         step = flat.plan.static_count_step if isinstance(n_steps, int) else flat.plan.traced_count_step
         return step.lower(flat.inputs(), n_steps)
 
     @property
+    def _plans(self) -> list[Plan]:
+        return [plan for structure in self._structures.values() for plan in structure.plans.values()]
+
+    @property
     def programs(self) -> list[Program]:
         """Programs of all plans so far, for data of any structure."""
-        return [program for plan in self._plans.values() for program in plan.programs]
+        return [program for plan in self._plans for program in plan.programs]
 
     @property
     def engines(self) -> list[str]:
         """Engines of all plans so far, sorted and without repetition."""
-        return sorted({plan.engine for plan in self._plans.values()})
+        return sorted({plan.engine for plan in self._plans})
 
     def _cache_size(self) -> int:
         """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
         count = jaxcompat.n_compilations
-        called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans.values()]
-        steps = [step for plan in self._plans.values() for step in (plan.traced_count_step, plan.static_count_step)]
+        called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans]
+        steps = [step for plan in self._plans for step in (plan.traced_count_step, plan.static_count_step)]
         return sum(called) + sum(map(count, steps))
 
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
@@ -297,39 +302,50 @@ class Step:
             self._false_flag = flag
         return flag
 
+    def _flat_structure(self, data: Record) -> tuple[_Structure, list[Any]]:
+        """Return what is known of records like the data, from the cache if possible, and the leaves of the data."""
+        if not isinstance(data, Record):
+            raise ConfigError(f"expected the data of a simulation, got {short_repr(data)}. Use sim.data.")
+        leaves, treedef = jax.tree.flatten(data)
+        try:
+            key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
+        except AttributeError:
+            data.check()
+            raise
+        structure = self._structures.get(key)
+        if structure is None:
+            data.check()
+            axes, roles = Axes(data), data.roles()
+            for stage in self.stages:
+                axes.writable_scopes(stage)  # raises ConfigError for a population that does not exist
+            is_sparse = jax.tree.leaves(leaf_flags(data, "sparse"))
+            parameters = [
+                i for i, x in enumerate(leaves)
+                if axes.scopes[i] == "shared" and (is_sparse[i] or i in roles.parameters)
+                and jnp.issubdtype(x.dtype, jnp.floating)
+            ]  # fmt: skip
+            located = axes.scopes.index(roles.population)
+            structure = self._structures[key] = _Structure(treedef, roles, located, tuple(parameters), {})
+        return structure, leaves
+
     def _plan(
         self,
-        data: SimData,
+        data: Record,
+        structure: _Structure,
         leaves: list[Any],
-        treedef: Any,
-        zeros: Zeros | None,
         n_steps: int | Array | None = None,
         separate: SeparateLeaves = None,
     ) -> Plan:
         """Return the plan for data of this structure, from the cache if possible."""
-        try:
-            zeros = self._zeros_cache(data, leaves, treedef) if zeros is None else zeros
-            other_location = self._find_other_location(data.states.pos)
-            key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, other_location, separate)
-        except AttributeError:
-            require_states(data)
-            paths = jax.tree_util.tree_leaves_with_path(data)
-            for path, x in [(path, x) for path, x in paths if not hasattr(x, "dtype")]:
-                raise ConfigError(
-                    f"expected an array as data{jax.tree_util.keystr(path)}, got {short_repr(x)}. Use jnp.full_like of "
-                    f"the array that it replaces."
-                ) from None
-            raise
+        zeros = self._zeros_cache(structure.parameters, leaves) if self._zeros is None else self._zeros
+        other_location = self._find_other_location(leaves[structure.located])
+        key = (zeros, other_location, separate)
         if self._check_data is not None:
             self._check_data(data)
-        plan = self._plans.get(key)
+        plan = structure.plans.get(key)
         if plan is None:
-            require_states(data)
-            check_axes(data, data.core.n_worlds, data.core.n_drones)
-            for stage in self.stages:
-                Axes(data).writable_scopes(stage)  # raises ConfigError for a population that does not exist
             location = self.location if other_location is None else other_location
-            planner = Planner(self.stages, self.engine, self.strict, location, self._reported)
+            planner = Planner(self.stages, self.engine, self.strict, location, self._reported, zeros, separate)
 
             def trace(plan: Plan) -> None:
                 flat = FlatData(jax.eval_shape(lambda leaves: self._all_leaves(plan, leaves), leaves), plan)
@@ -337,7 +353,7 @@ class Step:
                 step = plan.static_count_step if is_static else plan.traced_count_step
                 step.trace(flat.inputs(), n_steps if is_static else jnp.int32(1))
 
-            plan = self._plans[key] = planner.plan(data, zeros, trace, separate)
+            plan = structure.plans[key] = planner.plan(data, trace)
         return plan
 
     def _find_other_location(self, x: Any) -> Location | None:

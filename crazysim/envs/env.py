@@ -119,8 +119,9 @@ class Env(ABC):
         batched_reason = f"{', '.join(batched_parts)} is declared to need all worlds at once" if batched_parts else None
         if self.base.episode_reset.has_foreign_record:
             batched_reason = "a record in data.plugins is of another library and is not divided among worlds"
-        physics = self.base.physics
-        return physics.with_stages(self.phases.stages(physics.stages, batched_reason))
+        # No parameter is known to be zero: a later episode may have other parameters.
+        stages = self.phases.stages(self.base.physics.stages, batched_reason)
+        return self.base.physics.with_stages(stages).with_zeros_of(None)
 
     def reset(self, key: Array) -> EnvState:
         """Return the state of all worlds at the start of an episode; the same key gives the same episodes.
@@ -195,7 +196,7 @@ class Env(ABC):
         self._check_state(state)
         with use_device_of(state.full_data.core.steps):
             action = validate_action(action, self._action_format, self.actions)
-            data = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps, ())
+            data = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps)
             return EnvState(data).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
@@ -203,7 +204,7 @@ class Env(ABC):
         self._check_state(state)
         record = leaf_indices(state.full_data).plugins[ENV_RECORD_NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS])
-        return self.step_fn.flatten(state.full_data, (), self.n_substeps, frozenset(outputs))
+        return self.step_fn.flatten(state.full_data, self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
         """Return flat data one environment step later; ``EnvState(flat.data())`` is the state of flat data.
@@ -274,7 +275,7 @@ class Env(ABC):
     def explain(self) -> str:
         """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
         state = jax.eval_shape(self.reset, jax.random.key(0))
-        step, rays = explain(self.step_fn, state.full_data, zeros=()), self.sim.scene.ray_kernels.last_used
+        step, rays = explain(self.step_fn, state.full_data), self.sim.scene.ray_kernels.last_used
         return f"{step}\nrays: {rays}" if rays else step
 
     def target(self, state: EnvState) -> Array | None:

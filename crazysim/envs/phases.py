@@ -19,8 +19,8 @@ from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
+from crazysim.core.record import nonfinite_worlds
 from crazysim.core.stage import Phase, Stage, vmap_worlds
-from crazysim.core.stages import nonfinite_worlds
 from crazysim.envs.actions import Actions
 from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.arguments import check_arguments
-from crazysim.core.data import MAX_STEPS
+from crazysim.core.record import MAX_STEPS
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key

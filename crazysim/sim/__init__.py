@@ -4,6 +4,8 @@ from crazysim.control import Control
 from crazysim.core.integration import Integrator
 from crazysim.drones import Drone
 from crazysim.dynamics import Dynamics
+from crazysim.sim.reset import Reset
+from crazysim.sim.rollout import rollout
 from crazysim.sim.sim import Sim, sync_sim2mjx, use_box_collision
 from crazysim.sim.visualize import (
     change_material,
@@ -20,6 +22,7 @@ __all__ = [
     "Drone",
     "Dynamics",
     "Integrator",
+    "Reset",
     "Sim",
     "change_material",
     "draw_capsule",
@@ -28,6 +31,7 @@ __all__ = [
     "draw_points",
     "draw_setpoints",
     "draw_text",
+    "rollout",
     "sync_sim2mjx",
     "use_box_collision",
 ]

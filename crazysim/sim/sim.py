@@ -31,8 +31,7 @@ from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
-from crazysim.engine import Reset, Step, Stepper, explain
-from crazysim.engine.rollout import KeepFunction, Policy, get_states, run_rollout
+from crazysim.engine import Step, explain
 from crazysim.errors import ConfigError, short_repr
 from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import P, PluginRegistry
@@ -51,6 +50,9 @@ from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.adopt import VehicleKind, read_vehicles, vehicle_poses
 from crazysim.sim.configuration import Configuration, initial_plugins
 from crazysim.sim.members import Member, find_member, locked
+from crazysim.sim.reset import Reset
+from crazysim.sim.rollout import KeepFunction, Policy, get_states, run_rollout
+from crazysim.sim.stepper import Stepper
 
 if TYPE_CHECKING:
     from crazysim.plugins.estimators import Estimator
@@ -526,7 +528,7 @@ class Sim:
         """Advance every world by a number of physics steps; any number uses the same compilation.
 
         Raises:
-            ConfigError: If a world would have taken more than ``crazysim.core.data.MAX_STEPS`` since its last reset.
+            ConfigError: If a world would have taken more than ``crazysim.core.record.MAX_STEPS`` since its last reset.
         """
         n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()

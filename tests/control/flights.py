@@ -49,9 +49,8 @@ def fly(sim, law, path, seconds, memory=None, change=None):
     The law runs at every tick of the commands of ``sim``; its outputs are such commands. ``change(data, t)``
     changes the data before each tick.
     """
-    step, n_substeps = sim.build_step_fn(), sim.freq // sim.control_freq
-    zeros, command = step.zeros(sim.data), {"force_torque": F.force_torque_control, "rotor_vel": F.rotor_vel_control,
-                                            "body_rate": F.body_rate_control}[sim.control.value]  # fmt: skip
+    step, n_substeps = sim.build_step_fn().with_zeros_of(sim.data), sim.freq // sim.control_freq
+    command = getattr(F, f"{sim.control.value}_control")
 
     @jax.jit
     def run(data, memory):
@@ -61,7 +60,7 @@ def fly(sim, law, path, seconds, memory=None, change=None):
             data = data if change is None else change(data, t)
             setpoint = path_setpoint(path, t)
             outputs, memory = law(data, setpoint, memory)
-            data = step(command(data, outputs.reshape(1, 1, -1)), n_substeps, zeros)
+            data = step(command(data, outputs.reshape(1, 1, -1)), n_substeps)
             return (data, memory), (data.states, path_setpoint(path, t + n_substeps / sim.freq), outputs)
 
         times = jnp.arange(round(seconds * sim.control_freq), dtype=jnp.float32)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cases import send, shared_sim, trees_equal, with_states
 
-from crazysim.engine import Reset, Step
+from crazysim.engine import Step
+from crazysim.sim import Reset
 
 
 @pytest.fixture(scope="module")

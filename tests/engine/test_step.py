@@ -25,10 +25,11 @@ from crazysim.core.random import drone_key
 from crazysim.core.sharding import put_on_device
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
-from crazysim.engine import Step, explain, rollout
+from crazysim.engine import Step, explain
 from crazysim.engine.backends import cuda, kernel, lanes, native
 from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
 from crazysim.pytree import PyTree, leaf
+from crazysim.sim import rollout
 
 SLOW_CONTROL_SETTINGS = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
 DYNAMICS_AND_CONTROL = [("first_principles", c.value) for c in Control] + [

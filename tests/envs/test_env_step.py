@@ -13,11 +13,11 @@ from crazysim.core.pipeline import append_fn
 from crazysim.core.sharding import world_mesh
 from crazysim.core.stage import vmap_worlds
 from crazysim.engine.backends import fused
-from crazysim.engine.rollout import rollout
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, EngineWarning
 from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
+from crazysim.sim import rollout
 
 pytestmark = pytest.mark.skipif(fused.unavailable_reason("cpu") is not None, reason="there is no C++ compiler")
 N_WORLDS = 6

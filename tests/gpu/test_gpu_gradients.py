@@ -25,8 +25,8 @@ def value_and_gradient(sim, n_steps=50, of_params=False):
     unless ``of_params``.
     """
     start, step = sim.data, sim.build_step_fn()
-    # With (), the step keeps the terms of parameters that are zero in ``start``, because the parameters vary.
-    zeros = () if of_params else sim.step_fn.zeros(start)
+    # The terms of parameters that are zero in ``start`` are kept where the parameters vary.
+    step = step.with_zeros_of(None if of_params else start)
     level = sim.control.value
     send = getattr(F, f"{level}_control")
 
@@ -34,7 +34,7 @@ def value_and_gradient(sim, n_steps=50, of_params=False):
         states, commands, params = x
         data = start.replace(states=states, params=start.params if params is None else params)
         for cmd in commands:  # a different command each time
-            data = step(send(data, cmd), n_steps // len(commands), zeros)
+            data = step(send(data, cmd), n_steps // len(commands))
         after = data.states
         return jnp.sum(after.pos**2) + jnp.sum(after.vel * jnp.array([1.0, -2.0, 3.0])) + jnp.sum(after.ang_vel**2)
 

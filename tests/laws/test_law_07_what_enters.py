@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from crazysim import IMU, Battery, Cars, ConfigError, MotionCapture, RangeFinder, Sim, SlungLoad, Wind
 from crazysim.core.plugin import Plugin
-from crazysim.core.stages import watched_leaves
 from crazysim.envs import ActionDelay, AutoReset, EpisodeStatistics, FrameStack, ObservationNoise, make
 from crazysim.pytree import PyTree, host_array, leaf, scopes
 
@@ -67,7 +66,7 @@ def test_a_bad_value_in_the_data_flags_its_world_or_vanishes(draw, value):
     i = floats[draw % len(floats)]
     after = fly(poison(data, i, value))
     assert_others_equal(after, clean)
-    leaves, watched = jax.tree.leaves(after), watched_leaves(after)
+    leaves, watched = jax.tree.leaves(after), after.roles().watched
     paths = jax.tree_util.tree_leaves_with_path(after)
     tests = {k: np.isfinite if watched.get(k) else lambda x: ~np.isnan(x) for k in batched_floats(after)}
     bad = [jax.tree_util.keystr(paths[k][0]) for k, is_valid in tests.items() if not is_valid(leaves[k])[1].all()]

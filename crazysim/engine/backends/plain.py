@@ -6,22 +6,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.cache import keep_programs
-from crazysim.core.data import SimData, require_data, require_states
-from crazysim.core.pipeline import Pipeline
-from crazysim.core.settings import as_mask
+from crazysim.core.record import Record, nonfinite_worlds
 from crazysim.core.stage import PHASES, Axes, Phase, Stage
-from crazysim.core.stages import nonfinite_worlds
 from crazysim.engine.backends import Run
-from crazysim.errors import ConfigError
-from crazysim.pytree import check_axes, leaf_flags, replace_leaves
+from crazysim.pytree import leaf_flags, replace_leaves
 
 
-def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
+def build(stages: Sequence[Stage], data: Record) -> tuple[Run, list[int]]:
     """Return a function that runs the stages and the loop over steps on leaves, and the leaves that it writes.
 
     The loop carries only the leaves that a stage of the phase ``each`` writes. All others, mainly parameters, are
@@ -79,61 +73,3 @@ def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
     """Return the indices of the leaves that a function of leaves does not return unchanged."""
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
     return [i for i, (before, after) in enumerate(pairs) if before is not after]
-
-
-class Reset:
-    """``reset(data, default_data, mask=None) -> data``, pure and compiled.
-
-    The compiled call copies the arrays that it returns unchanged. ``plain`` is the same function without compilation,
-    for use inside another compiled function.
-    """
-
-    def __init__(self, pipeline: Pipeline):
-        self._stages = tuple(pipeline.items())
-        self._compiled = jax.jit(self.plain)
-
-    def __call__(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
-        """Return the data after a reset.
-
-        Args:
-            data: The simulation.
-            default_data: The data to return to.
-            mask: True in the worlds to reset; None for all. (n_worlds,)
-        """
-        require_data(data)
-        require_data(default_data)
-        shared_records = data.plugins.keys() & default_data.plugins.keys()
-        layout, default_layout = (
-            (
-                x.core.n_worlds, x.core.n_drones, x.controls.mode, jax.tree.structure(x.objects),
-                [(jax.tree.structure(x.plugins[name]), [*map(jnp.shape, jax.tree.leaves(x.plugins[name]))])
-                 for name in sorted(shared_records)],
-            )
-            for x in (data, default_data)
-        )  # fmt: skip
-        if layout != default_layout:
-            raise ConfigError(
-                "expected data and default_data of one simulation, got those of two, or of two scenes. Use its "
-                "default_data, read after sim.scene.add."
-            )
-        mask = as_mask(mask, data.core.steps.shape[:1])
-        with keep_programs(enabled=not self._cache_size()):
-            return self._compiled(data, default_data, mask)
-
-    def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
-        """Return the data after a reset, without a compiled call."""
-        for x in (data, default_data):
-            require_states(x)
-            check_axes(x, x.core.n_worlds, x.core.n_drones)
-        for name, fn in self._stages:
-            with jax.named_scope(name):
-                data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
-        return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
-
-    def lower(self, data: SimData, default_data: SimData, mask: Any = None) -> Any:
-        """Return the reset lowered for this data, as ``jax.jit(...).lower`` does."""
-        return self._compiled.lower(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
-
-    def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
-        return jaxcompat.n_compilations(self._compiled)

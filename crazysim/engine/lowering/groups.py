@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
+from crazysim.core.record import Record
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.pytree import has_members
@@ -36,8 +37,9 @@ class _Access(NamedTuple):
         return self.read_leaves | self.written_leaves
 
 
-def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
-    """Return the groups of populations that do not depend on each other. The group of the drones comes first.
+def independent_groups(stages: Sequence[Stage], data: Record, tracer: Tracer) -> list[Group]:
+    """Return the groups of populations that do not depend on each other. The first group is that of the
+    record's population, whose members are called drones here.
 
     Two stages depend on each other if they act on the same population, or if one reads or writes a leaf that the other
     writes. Stages that only use leaves of worlds, called clocks here, are repeated in every group that reads their
@@ -48,24 +50,24 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
         data: Data of the simulation, or its shapes and types.
         tracer: Cache of traced stages.
     """
-    axes, leaves = Axes(data), jax.tree.leaves(data)
-    if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):
-        return [Group("drone", tuple(stages), None)]
+    axes, leaves, drones = Axes(data), jax.tree.leaves(data), data.roles().population
+    if all(scope == drones or not has_members(scope) for scope in axes.scopes):
+        return [Group(drones, tuple(stages), None)]
     accesses = [_find_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
     clocks = _find_clocks(accesses, axes)
     n_members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
-    components = _find_components([k for k in range(len(stages)) if k not in clocks], accesses)
+    components = _find_components([k for k in range(len(stages)) if k not in clocks], accesses, drones)
     components = [(indices, frozenset().union(*(accesses[k].populations for k in indices))) for indices in components]
-    components.sort(key=lambda component: "drone" not in component[1])
-    if not components or "drone" not in components[0][1]:
-        components.insert(0, (set(), frozenset({"drone"})))
+    components.sort(key=lambda component: drones not in component[1])
+    if not components or drones not in components[0][1]:
+        components.insert(0, (set(), frozenset({drones})))
     components = [(_add_clocks(indices, clocks, accesses), populations) for indices, populations in components]
     (drone_stages, drone_populations), *other_components = components
     components = [(drone_stages | clocks, drone_populations), *other_components]  # the drones run all clocks
     groups, owned_leaves = [], frozenset()
     for indices, populations in components:
         written_leaves = frozenset().union(*(accesses[k].written_leaves for k in indices))
-        main_population = "drone" if "drone" in populations else max(sorted(populations), key=n_members.__getitem__)
+        main_population = drones if drones in populations else max(sorted(populations), key=n_members.__getitem__)
         groups.append(
             Group(main_population, tuple([stages[k] for k in sorted(indices)]), written_leaves - owned_leaves)
         )
@@ -90,13 +92,16 @@ def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
         clocks -= dependent_stages
 
 
-def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list[set[int]]:
-    """Return sets of stages that depend on each other, directly or through other stages."""
+def _find_components(stages: Iterable[int], accesses: Sequence[_Access], drones: str) -> list[set[int]]:
+    """Return sets of stages that depend on each other, directly or through other stages.
+
+    A stage without a population is treated as a stage of the drones.
+    """
     components: list[set[int]] = []
     for k in stages:
         joined_component, other_components = {k}, []
         for component in components:
-            if any(_are_dependent(accesses[k], accesses[j]) for j in component):
+            if any(_are_dependent(accesses[k], accesses[j], drones) for j in component):
                 joined_component |= component
             else:
                 other_components.append(component)
@@ -104,9 +109,8 @@ def _find_components(stages: Iterable[int], accesses: Sequence[_Access]) -> list
     return components
 
 
-def _are_dependent(a: _Access, b: _Access) -> bool:
-    # A stage without a population is treated as a stage of the drones.
-    populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
+def _are_dependent(a: _Access, b: _Access, drones: str) -> bool:
+    populations = (a.populations or {drones}) & (b.populations or {drones})
     return bool(populations or a.written_leaves & b.used_leaves or b.written_leaves & a.used_leaves)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.pair_reductions import reduce_over_others_p
+from crazysim.core.record import Record
 from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
@@ -28,10 +29,10 @@ also the maximum number of members of other populations that a stage uses. Block
 
 def lower_stages(
     stages: Sequence[Stage],
-    data: Any,
+    data: Record,
     zeros: Zeros = (),
-    watched: Mapping[int, bool] | None = None,
-    population: str = "drone",
+    check: bool = False,
+    population: str | None = None,
     tracer: Tracer | None = None,
 ) -> Program:
     """Return the program of a step, with one segment per stage.
@@ -43,12 +44,12 @@ def lower_stages(
         data: Data of the simulation, or its shapes and types.
         zeros: Leaves with the elements that are known to be zero. Terms with them are left out, unless a stage writes
             the leaf.
-        watched: Leaves to check after the last step, as ``watched_leaves`` returns them. None for no check. There is no
-            check either if a stage writes ``core.nonfinite`` itself.
-        population: Population whose members are the lanes. The members are called drones below.
+        check: True to check the watched leaves after the last step, unless a stage writes the flag of worlds itself.
+        population: Population whose members are the lanes; None for that of the record. They are called drones below.
         tracer: Cache of traced stages; None for a new one.
     """
-    tracer = tracer or Tracer()
+    tracer, roles = tracer or Tracer(), data.roles()
+    population = population or roles.population
     axes = RelativeAxes(data, population)
     leaves = view_leaves(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
     known_zeros = dict(zeros)
@@ -60,7 +61,7 @@ def lower_stages(
             _lower_stage(axes.stage(x), phase, axes, leaves, known_zeros, n_drones, tracer) for x in phase_stages
         ]
         if phase == "each":
-            phase_segments = _move_before_steps(phase_segments, phase_stages, axes.leaf_indices.core.steps)
+            phase_segments = _move_before_steps(phase_segments, phase_stages, roles.clock)
         segments += phase_segments
     program_leaves = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
@@ -71,16 +72,15 @@ def lower_stages(
     changed_leaves = known_zeros.keys() & set(program.written_leaves)
     if changed_leaves:  # an element is only known to be zero while no stage writes it
         zeros = tuple([(i, indices) for i, indices in zeros if i not in changed_leaves])
-        return lower_stages(stages, data, zeros, watched, population, tracer)
-    core = axes.leaf_indices.core
-    if watched is None or core.nonfinite in program.written_leaves:
+        return lower_stages(stages, data, zeros, check, population, tracer)
+    if not check or roles.nonfinite in program.written_leaves:
         return program
     lane_leaves = {i for i, scope in enumerate(axes.scopes) if scope in ("drone", "world")} - axes.views
-    checked_leaves = (lane_leaves | axes.views & set(program.written_leaves)) & watched.keys()
+    checked_leaves = (lane_leaves | axes.views & set(program.written_leaves)) & roles.watched.keys()
     return dataclasses.replace(
         program,
         check_segment=_make_finite_check(
-            axes, leaves, core.nonfinite, core.steps, {i: watched[i] for i in sorted(checked_leaves)}
+            axes, leaves, roles.nonfinite, roles.clock, {i: roles.watched[i] for i in sorted(checked_leaves)}
         ),
     )
 

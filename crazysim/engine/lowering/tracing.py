@@ -89,10 +89,10 @@ MAX_TRACED_STAGES = 256
 def _get_shared_trace(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
     """Return a traced stage with ``trace_once``, from the cache of this process if possible.
 
-    The stage must not read ``n_worlds`` and ``n_drones``.
+    The stage must not read what ``Record.without_sizes`` leaves out.
     """
     data = axes.treedef.unflatten(leaves)
-    structure = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
+    structure = jax.tree.structure(data.without_sizes())
     key = (stage.fn, stage.when, structure, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
     traced = _TRACED_STAGES.get(key)
     if traced is None:

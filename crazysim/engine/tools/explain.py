@@ -7,23 +7,22 @@ import time
 import jax
 import jax.numpy as jnp
 
-from crazysim.core.data import SimData
+from crazysim.core.record import Record
 from crazysim.engine.backends import fused
-from crazysim.engine.ir.program import UnfusedStage, Zeros
+from crazysim.engine.ir.program import UnfusedStage
 from crazysim.engine.step import Step
 
 
-def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | None = None) -> str:
+def explain(step: Step, data: Record, measure: bool = False) -> str:
     """Return a few lines about a step: its engine, the stages that are fused, and why other stages are not.
 
     Args:
         step: The step.
-        data: Data to step.
+        data: Data to step, or its shapes and types.
         measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
             and takes 256 steps.
-        zeros: As in ``Step.__call__``; with it, ``data`` may be shapes and types.
     """
-    plan = step.plan(data, zeros)
+    plan = step.plan(data)
     lines = [f"engine: {plan.engine}" + (f" ({plan.engine_reason})" if plan.engine_reason else "")]
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
@@ -51,7 +50,7 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
     return "\n".join(lines)
 
 
-def _measure_split_cost(step: Step, data: SimData, unfused_names: list[str]) -> str:
+def _measure_split_cost(step: Step, data: Record, unfused_names: list[str]) -> str:
     """Return the cost of the stages that split a step, measured against the same step without them."""
 
     def measure_seconds(step: Step, n: int = 64) -> float:

@@ -130,10 +130,10 @@ def _recording_rate(freq: int, seconds: float, n_drones: int) -> int:
 
 def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
     """Return a compiled function that advances data by ``CHUNK_SAMPLES`` samples, and also returns their poses."""
-    step, zeros = sim.step_fn, sim.step_fn.zeros(sim.data)
+    step = sim.step_fn.with_zeros_of(sim.data)
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
-        data = step(data, n_steps, zeros)
+        data = step(data, n_steps)
         return data, _get_poses(data)
 
     return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK_SAMPLES)).lower(sim.data).compile()

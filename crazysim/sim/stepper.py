@@ -13,14 +13,16 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim.cache import announce_if_slow
-from crazysim.core.data import MAX_STEPS, SimData
+from crazysim.core.data import SimData
 from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.record import MAX_STEPS
 from crazysim.core.sharding import put_on_device, shard
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
+from crazysim.sim.rollout import stage_flat
 
 ANNOUNCEMENT_DELAY = 5.0
 """Time after which the compilation of a step is announced, s: most take less, filters with many states take more."""
@@ -93,7 +95,7 @@ class Stepper:
         """
         traced = isinstance(command, jax.core.Tracer) or isinstance(feedforward, jax.core.Tracer)
         if isinstance(self._data, FlatData) and not traced:
-            self._data = self._data.stage_command(self.data_or_shapes, command, feedforward)
+            self._data = stage_flat(self._data, self.data_or_shapes, command, feedforward)
             return
         data = self.data
         feedforward = None if feedforward is None else put_command(data, feedforward)

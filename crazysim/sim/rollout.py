@@ -13,8 +13,8 @@ from crazysim.arguments import check_array
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
-from crazysim.engine.ir.program import Zeros
-from crazysim.engine.step import Step
+from crazysim.engine.host_call import HostLeaves
+from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
 from crazysim.progress import progress_bar
 from crazysim.pytree import leaf_indices
@@ -30,6 +30,20 @@ def get_states(data: SimData) -> Any:
     return data.states
 
 
+def stage_flat(flat: FlatData, reference: SimData, command: Any, feedforward: Any = None) -> FlatData:
+    """Return flat data with a checked command, as ``crazysim.core.functional.stage_command`` does.
+
+    Args:
+        flat: The data.
+        reference: The data, or its shapes and devices.
+        command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
+        feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
+    """
+    leaf_indices, is_on_host = flat.plan.leaf_indices, isinstance(flat.leaves, HostLeaves)
+    indices, values = F.staged_leaves(leaf_indices), F.staged_fields(leaf_indices, command, feedforward)
+    return flat.replace(indices, [x if is_on_host else F.put_command(reference, x) for x in values.values()])
+
+
 def rollout(
     step: Step,
     data: SimData,
@@ -39,7 +53,6 @@ def rollout(
     n_substeps: int,
     keep: KeepFunction = get_states,
     every: int = 1,
-    zeros: Zeros | None = None,
     wait: bool = False,
 ) -> tuple[SimData, Any]:
     """Return the data after some control steps, and the arrays that were recorded after these steps.
@@ -57,7 +70,6 @@ def rollout(
         n_substeps: Physics steps of a control step.
         keep: ``keep(data)`` returns the arrays to record after a control step.
         every: Number of control steps from one recording to the next.
-        zeros: Result of ``step.zeros(data)`` from before ``data`` was traced.
         wait: True to step to the next multiple of ``n_substeps`` first, if it is equally far in all worlds.
 
     Returns:
@@ -67,9 +79,8 @@ def rollout(
     n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
-    zeros = step.zeros(data) if zeros is None else zeros
     staged = F.staged_leaves(leaf_indices(data))
-    flat = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
+    flat = step.flatten(data, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
     if wait and n_substeps > 1:
         n_waits = -data.core.steps % n_substeps
         n_waits = jnp.where(jnp.all(n_waits == n_waits[0]), n_waits[0, 0], 0)
@@ -79,7 +90,7 @@ def rollout(
     def control_step(carry: list[Any]) -> list[Any]:
         flat_before = flat.replace(carried, carry)
         command = F.check_command(data, data.controls.mode, policy(params, flat_before.data()))
-        flat_after = step.advance(flat_before.stage_command(data, command), n_substeps)
+        flat_after = step.advance(stage_flat(flat_before, data, command), n_substeps)
         return [flat_after.leaves[i] for i in carried]
 
     def advance_and_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
@@ -92,7 +103,7 @@ def rollout(
     return flat.replace(carried, carry).data(), recordings
 
 
-STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros", "wait")
+STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "wait")
 
 compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
 """``rollout`` in one compiled call, which does not donate the buffers of its arguments."""
@@ -114,15 +125,15 @@ def run_rollout(
     """
     for leaf in jax.tree.leaves(params):
         check_array("every leaf of params", leaf)
-    zeros = step.zeros(data)
+    step = step.with_zeros_of(data)
     if not progress:
-        return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
+        return compiled_rollout(step, data, policy, params, n_control_steps, every=every, **settings)
     steps_per_piece = max(n_control_steps // every // 100, 1) * every
     n_pieces, remainder = divmod(n_control_steps, steps_per_piece)
     recordings_by_piece = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
         for n in [steps_per_piece] * n_pieces + [remainder] * (remainder > 0):
-            data, recordings = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
+            data, recordings = compiled_rollout(step, data, policy, params, n, every=every, **settings)
             jax.block_until_ready(recordings)
             recordings_by_piece.append(recordings)
             bar.update(n)

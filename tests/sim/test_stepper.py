@@ -11,8 +11,8 @@ from cases import shared_sim, trees_equal
 from crazysim import Sim
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
-from crazysim.engine import Stepper
-from crazysim.engine import stepper as stepper_module
+from crazysim.sim import stepper as stepper_module
+from crazysim.sim.stepper import Stepper
 
 
 @pytest.fixture

@@ -1,0 +1,149 @@
+"""The engine steps any record that says which leaves are its clock, its flags and its watched leaves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim.core.record import Record, Roles, nonfinite_worlds
+from crazysim.core.stage import Stage, stage
+from crazysim.engine import Step, explain
+from crazysim.errors import ConfigError
+from crazysim.pytree import Members, check_axes, leaf, leaf_indices
+
+DT, GRAVITY = 0.01, 9.81
+ENGINES = ("plain", "lanes", "fused", "interpret")
+ROUNDING = 1e-6
+"""Some roundings in float32 of angles and rates of order 1."""
+
+
+class Pendulums(Members):
+    angle: jax.Array = leaf("member")
+    rate: jax.Array = leaf("member")
+    length: jax.Array = leaf("parameter", 0)
+    drag: jax.Array = leaf("parameter", 2, sparse=True)
+
+
+class Sparks(Members):
+    heat: jax.Array = leaf("member")
+
+
+class Workshop(Record):
+    pendulums: Pendulums
+    sparks: Sparks
+    ticks: jax.Array = leaf("world")
+    is_broken: jax.Array = leaf("world")
+
+    def roles(self):
+        indices = leaf_indices(self)
+        watched = {indices.pendulums.angle: True, indices.pendulums.rate: True, indices.sparks.heat: False}
+        return Roles("pendulums", indices.ticks, indices.is_broken, watched)
+
+    def check(self):
+        check_axes(self, len(self.ticks), 0)
+
+    def without_sizes(self):
+        return self
+
+
+def make_workshop(n_worlds=3, n_pendulums=2, n_sparks=3):
+    def ids(n):
+        return jnp.broadcast_to(jnp.arange(n), (n_worlds, n))
+
+    shape = n_worlds, n_pendulums
+    angle = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, shape), np.float32)
+    return Workshop(
+        Pendulums(
+            "pendulums", n_pendulums, ids(n_pendulums), angle, jnp.zeros(shape), jnp.float32(0.5),
+            jnp.array([[0.1, 0.0], [0.0, 0.0]]),
+        ),
+        Sparks("sparks", n_sparks, ids(n_sparks), jnp.ones((n_worlds, n_sparks))),
+        jnp.zeros((n_worlds, 1), jnp.int32), jnp.zeros((n_worlds, 1), bool),
+    )  # fmt: skip
+
+
+@stage("pendulums")
+def swing(data):
+    p = data.pendulums
+    slowing = (p.drag @ jnp.stack([p.rate, p.angle]))[0]
+    rate = p.rate - DT * (GRAVITY / p.length * jnp.sin(p.angle) + slowing)
+    return data.replace(pendulums=p.replace(angle=p.angle + DT * rate, rate=rate))
+
+
+@stage("sparks")
+def cool(data):
+    return data.replace(sparks=data.sparks.replace(heat=0.9 * data.sparks.heat))
+
+
+@stage("world")
+def tick(data):
+    return data.replace(ticks=data.ticks + 1)
+
+
+PIPELINE = {"swing": swing, "cool": cool, "tick": tick}
+
+
+def swing_alone(angle, n_steps):
+    rate = np.zeros_like(angle)
+    for _ in range(n_steps):
+        rate = rate - DT * (GRAVITY / 0.5 * np.sin(angle) + 0.1 * rate)
+        angle = angle + DT * rate
+    return angle
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_every_engine_steps_a_record_without_drones(engine):
+    data = make_workshop()
+    step = Step(PIPELINE, engine, strict=True)
+    after = step(data, jnp.int32(20))
+    assert step.engines == [engine]
+    expected = swing_alone(np.asarray(data.pendulums.angle, np.float64), 20)
+    np.testing.assert_allclose(after.pendulums.angle, expected, atol=20 * ROUNDING)
+    np.testing.assert_allclose(after.sparks.heat, 0.9**20, rtol=20 * ROUNDING)
+    assert after.ticks.tolist() == [[20]] * 3
+    assert not after.is_broken.any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("value", "flags"), [(np.nan, [1, 0, 1]), (np.inf, [1, 0, 0])])
+def test_watched_leaves_and_the_clock_flag_their_world(engine, value, flags):
+    """The record watches its angles for both values, and its heat for NaN alone."""
+    data = make_workshop()
+    data = data.replace(
+        pendulums=data.pendulums.replace(angle=data.pendulums.angle.at[0, 1].set(value)),
+        sparks=data.sparks.replace(heat=data.sparks.heat.at[2, 0].set(value)),
+    )
+    after = Step(PIPELINE, engine)(data, jnp.int32(1))
+    assert after.is_broken[:, 0].tolist() == [bool(x) for x in flags]
+    assert nonfinite_worlds(after).tolist() == after.is_broken.tolist()
+    late = make_workshop().replace(ticks=jnp.array([[0], [2**31 - 1], [0]], jnp.int32))
+    assert Step(PIPELINE, engine)(late, jnp.int32(1)).is_broken.tolist() == [[False], [True], [False]]
+
+
+def test_a_step_can_be_told_of_zeros_that_a_trace_hides():
+    """Only shared parameters that are declared sparse are examined here: of the drag, one of four numbers."""
+    data, step = make_workshop(), Step(PIPELINE, "lanes")
+    told = step.with_zeros_of(data)
+    assert told == step.with_zeros_of(data) != step.with_zeros_of(None)
+    programs = [s.plan(data).program for s in (told, step.with_zeros_of(None))]
+    few, many = (sum(segment.n_operations for segment in program.segments) for program in programs)
+    assert few < many
+    assert explain(step, data) == explain(told, jax.eval_shape(lambda: data))
+    results = [jax.jit(lambda data, s=s: s(data, 5))(data) for s in (told, step)]
+    np.testing.assert_allclose(results[0].pendulums.angle, results[1].pendulums.angle, atol=5 * ROUNDING)
+
+
+def test_the_gradient_of_a_record_is_that_of_differences():
+    data, step = make_workshop(1, 1), Step(PIPELINE)
+
+    def loss(angle):
+        return step(data.replace(pendulums=data.pendulums.replace(angle=angle)), 10).pendulums.angle.sum()
+
+    angle, h = data.pendulums.angle, 1e-2  # float32: the error is of order h^2, and 1e-7 / h from rounding
+    slope = (loss(angle + h) - loss(angle - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(loss)(angle).sum(), slope, rtol=1e-3)
+
+
+def test_only_records_are_stepped():
+    with pytest.raises(ConfigError, match=r"Use sim\.data"):
+        Step({"tick": Stage(lambda data: data, "world", name="tick")})((jnp.zeros(3),))
