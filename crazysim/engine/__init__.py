@@ -2,7 +2,6 @@
 
 from crazysim.engine.plan import ENGINES
 from crazysim.engine.step import Step
-from crazysim.engine.tools.compare import Difference, first_difference
 from crazysim.engine.tools.explain import explain
 
-__all__ = ["ENGINES", "Difference", "Step", "explain", "first_difference"]
+__all__ = ["ENGINES", "Step", "explain"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from blocks import make_program
 from cases import shared_sim, with_states
+from differences import first_difference
 
 from crazysim.core.stage import stage
 from crazysim.engine.backends import source
@@ -14,7 +15,6 @@ from crazysim.engine.ir import dump, listing, ops
 from crazysim.engine.ir.blocks import Builder
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.engine.tools import compare
 
 F = np.float32
 
@@ -151,10 +151,7 @@ def moving_data(data):
 
 
 def test_equal_engines_do_not_differ(moving_data):
-    assert (
-        compare.first_difference({"sway": sway, "mine": undeclared_stage}, moving_data, engines=("plain", "lanes"))
-        is None
-    )
+    assert first_difference({"sway": sway, "mine": undeclared_stage}, moving_data, engines=("plain", "lanes")) is None
 
 
 def test_the_first_difference_has_stage_field_element_and_operation(moving_data, monkeypatch):
@@ -163,7 +160,7 @@ def test_the_first_difference_has_stage_field_element_and_operation(moving_data,
 
     wrong = dataclasses.replace(ops.TABLE["sin"], xla=lambda x: jax.lax.sin(x) + 0.01)
     monkeypatch.setitem(ops.TABLE, "sin", wrong)
-    result = compare.first_difference({"mine": undeclared_stage, "sway": sway}, moving_data, engines=("plain", "lanes"))
+    result = first_difference({"mine": undeclared_stage, "sway": sway}, moving_data, engines=("plain", "lanes"))
     assert result is not None
     assert (result.stage, result.leaf, result.index[2:]) == ("sway", "states.force", (0,))
     assert abs(result.values[1] - result.values[0]) > 1e-4
@@ -173,4 +170,4 @@ def test_the_first_difference_has_stage_field_element_and_operation(moving_data,
 
 def test_nan_is_equal_to_nan(moving_data):
     bad = moving_data.replace(states=moving_data.states.replace(pos=moving_data.states.pos.at[1, 1, 2].set(jnp.nan)))
-    assert compare.first_difference({"sway": sway}, bad, engines=("plain", "lanes")) is None
+    assert first_difference({"sway": sway}, bad, engines=("plain", "lanes")) is None

@@ -182,7 +182,7 @@ for name in sys.argv[1:]:
     env = AutoReset(make(name, camera=()))
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.action.dtype == np.float64
-    program = Step({stage.__name__: stage for stage in env.step_fn.stages}, "lanes").plan(state.full_data, ()).program
+    program = Step({stage.__name__: stage for stage in env.step_fn.stages}, "lanes").plan(state.full_data).program
     kernel.write_kernel(program, "host")
     assert program.fused, (name, program.unfused_stages)
 """

@@ -208,7 +208,7 @@ def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
     state = auto.reset(jax.random.key(0))
     after = auto.step(state, state.action)
     assert jax.tree.structure(state) == jax.tree.structure(after)
-    scopes = {x.name: x.scope for x in auto.step_fn.plan(state.full_data, ()).program.leaves if ".memory" in x.name}
+    scopes = {x.name: x.scope for x in auto.step_fn.plan(state.full_data).program.leaves if ".memory" in x.name}
     assert sorted(scopes.values()) == ["drone", "world", "world"]
     plain, record = after.memory["WithMemory"]
     assert (plain.shape, record.of_drones.shape, record.of_world.shape) == (

@@ -1,1 +1,1 @@
-"""Tools to inspect the engine: comparison, explanation, and CasADi expressions."""
+"""Tools to inspect the engine: explanation, and CasADi expressions."""

@@ -4,8 +4,6 @@
 and, if an engine runs programs, the operation.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,6 +14,7 @@ import numpy as np
 
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Axes, as_stages
+from crazysim.engine import Step
 from crazysim.engine.backends import Build, fused, interpret, lanes
 from crazysim.engine.ir import listing
 from crazysim.engine.ir.blocks import Block, Operation, Value
@@ -70,8 +69,6 @@ def first_difference(
         tolerance: Largest difference that is ignored, relative to the largest component of a vector. NaN is equal to
             NaN.
     """
-    from crazysim.engine.step import Step
-
     axes = Axes(data)
     for name, stage in pipeline.items():
         results = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
