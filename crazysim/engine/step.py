@@ -69,6 +69,34 @@ class FlatData:
         return [self.leaves[i] for i in self.plan.inputs]
 
 
+def scan(
+    fn: Callable[[FlatData, Any, Any], tuple[FlatData, Any, Any]],
+    flat: FlatData,
+    carry: Any = (),
+    xs: Any = None,
+    length: int | None = None,
+    also_changed: Collection[int] = (),
+) -> tuple[FlatData, Any, Any]:
+    """Scan ``flat, carry, output = fn(flat, carry, x)``; leaves that no step writes are constants of the loop.
+
+    Args:
+        fn: Function of the data, the carry and an element of ``xs``.
+        flat: The data at the start.
+        carry: Any tree of arrays.
+        xs: As for ``jax.lax.scan``.
+        length: As for ``jax.lax.scan``.
+        also_changed: Leaves that ``fn`` changes besides those that steps write.
+    """
+    changed = sorted({*flat.plan.written_leaves, *also_changed})
+
+    def body(carried: tuple[list[Any], Any], x: Any) -> Any:
+        flat_after, carry, output = fn(flat.replace(changed, carried[0]), carried[1], x)
+        return ([flat_after.leaves[i] for i in changed], carry), output
+
+    (leaves, carry), outputs = jax.lax.scan(body, ([flat.leaves[i] for i in changed], carry), xs, length)
+    return flat.replace(changed, leaves), carry, outputs
+
+
 def _read_leaf(leaves: Any, plan: Plan, i: int) -> Any:
     """Return leaf ``i`` of the data, unpacked if it is stored as rows."""
     x = leaves[i]

@@ -13,6 +13,7 @@ from jax import Array
 from crazysim.arguments import check_arguments
 from crazysim.core.record import MAX_STEPS
 from crazysim.core.settings import positive_integer
+from crazysim.engine.step import FlatData, scan
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs
@@ -116,25 +117,21 @@ def rollout(
                 f"expected a memory of the shapes and types of initial_memory, {_formats(initial_memory)}, got "
                 f"{_formats(memory)}. Use the memory that a rollout of the same policy returned."
             )
-    carried_indices = flat.plan.written_leaves  # only these change
 
-    def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
-        flat_before, memory = flat.replace(carried_indices, carry[0]), carry[1]
-        state = EnvState(flat_before.data())
+    def step(flat: FlatData, memory: Any, key: Array) -> tuple[FlatData, Any, Any]:
+        state = EnvState(flat.data())
         action, memory, extras = _evaluate(policy, state.obs, memory, key)
-        flat_after = env.advance(flat_before, action)
+        flat_after = env.advance(flat, action)
         new_state = EnvState(flat_after.data())
         if env.reset_policy is not None:  # the policy forgets where a new episode begins
             must_reset = env.reset_policy.must_reset(state.done, new_state)
             memory = jax.tree.map(lambda initial, x: select_worlds(must_reset, initial, x), initial_memory, memory)
-        output = keep(Transition(state.obs, action, extras, new_state))
-        return ([flat_after.leaves[i] for i in carried_indices], memory), output
+        return flat_after, memory, keep(Transition(state.obs, action, extras, new_state))
 
-    carry = [flat.leaves[i] for i in carried_indices], memory
     split_key = partial(jax.random.split, num=n_steps)
     keys = jax.vmap(split_key, out_axes=1)(key) if is_key(key) and key.ndim else split_key(key)
-    (leaves, memory), outputs = jax.lax.scan(step, carry, keys)
-    return EnvState(flat.replace(carried_indices, leaves).data()), memory, outputs
+    flat, memory, outputs = scan(step, flat, memory, keys)
+    return EnvState(flat.data()), memory, outputs
 
 
 def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:

@@ -14,7 +14,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
 from crazysim.engine.host_call import HostLeaves
-from crazysim.engine.step import FlatData, Step
+from crazysim.engine.step import FlatData, Step, scan
 from crazysim.errors import ConfigError
 from crazysim.progress import progress_bar
 from crazysim.pytree import leaf_indices
@@ -85,22 +85,17 @@ def rollout(
         n_waits = -data.core.steps % n_substeps
         n_waits = jnp.where(jnp.all(n_waits == n_waits[0]), n_waits[0, 0], 0)
         flat = jax.lax.cond(n_waits > 0, lambda flat: step.advance(flat, n_waits), lambda flat: flat, flat)
-    carried = sorted({*flat.plan.written_leaves, *staged})
 
-    def control_step(carry: list[Any]) -> list[Any]:
-        flat_before = flat.replace(carried, carry)
-        command = F.check_command(data, data.controls.mode, policy(params, flat_before.data()))
-        flat_after = step.advance(stage_flat(flat_before, data, command), n_substeps)
-        return [flat_after.leaves[i] for i in carried]
+    def control_step(flat: FlatData, *_: Any) -> tuple[FlatData, Any, Any]:
+        command = F.check_command(data, data.controls.mode, policy(params, flat.data()))
+        return step.advance(stage_flat(flat, data, command), n_substeps), (), None
 
-    def advance_and_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
-        carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
-        return carry, keep(flat.replace(carried, carry).data())
+    def advance_and_record(flat: FlatData, *_: Any) -> tuple[FlatData, Any, Any]:
+        flat, _, _ = scan(control_step, flat, length=every, also_changed=staged)
+        return flat, (), keep(flat.data())
 
-    carry, recordings = jax.lax.scan(
-        advance_and_record, [flat.leaves[i] for i in carried], length=n_control_steps // every
-    )
-    return flat.replace(carried, carry).data(), recordings
+    flat, _, recordings = scan(advance_and_record, flat, length=n_control_steps // every, also_changed=staged)
+    return flat.data(), recordings
 
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "wait")

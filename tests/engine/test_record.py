@@ -1,12 +1,14 @@
 """The engine steps any record that says which leaves are its clock, its flags and its watched leaves."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim.core.record import Record, Roles, nonfinite_worlds
-from crazysim.core.stage import Stage, stage
+from crazysim.core.stage import stage
 from crazysim.engine import Step, explain
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, check_axes, leaf, leaf_indices
@@ -145,5 +147,6 @@ def test_the_gradient_of_a_record_is_that_of_differences():
 
 
 def test_only_records_are_stepped():
+    not_a_record: Any = (jnp.zeros(3),)
     with pytest.raises(ConfigError, match=r"Use sim\.data"):
-        Step({"tick": Stage(lambda data: data, "world", name="tick")})((jnp.zeros(3),))
+        Step(PIPELINE)(not_a_record)

@@ -38,7 +38,7 @@ class Leaf:
     """One array of the data."""
 
     name: str
-    """Path of the field in ``SimData``."""
+    """Path of the field in the record."""
     scope: str
     """Scope of the field: ``drone``, ``world``, ``batched``, ``shared`` or ``opaque``."""
     shape: tuple[int, ...]
