@@ -113,7 +113,7 @@ jax.tree_util.register_pytree_node(
 
 
 class _Structure(NamedTuple):
-    """What a step knows of records of one structure, shapes and types."""
+    """Facts about records of one structure, with the same shapes and types, and their plans."""
 
     treedef: Any
     roles: Roles
