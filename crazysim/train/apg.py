@@ -15,14 +15,21 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from crazysim.core.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
-from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
-from crazysim.train.optimizer import build_optimizer
-from crazysim.train.seeds import SweptValues, are_seeds_divided, for_each_seed, split_blocks, stack_swept_values
+from crazysim.train.networks import Layers, Policy, init_mlp
+from crazysim.train.optimizer import all_finite, build_optimizer
+from crazysim.train.seeds import (
+    Step,
+    are_seeds_divided,
+    for_each_seed,
+    rollout_seeds,
+    split_blocks,
+    split_keys,
+    stack_configs,
+)
 
 T = TypeVar("T")
 STATS_ITERATIONS = 20
@@ -88,7 +95,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         keys: Random keys of the seeds. (n_seeds,)
     """
     config = configs[0]
-    k_policy, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
+    k_policy, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
 
     def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
@@ -105,80 +112,77 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """Return the learner after one rollout and one update, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``gradient`` is the norm of the gradient before it is limited; ``finite`` is True if weights, optimiser
-    state, statistics and loss are finite. The rollout starts where
-    the previous rollout ended; worlds in which the episode is over start a new episode. A seed with a non-finite
-    gradient keeps its weights and optimiser state. The scan stores its intermediates instead of recomputing them under
+    state, statistics and loss are finite. The rollout starts where the previous rollout ended; worlds in which the
+    episode is over start a new episode. The scan stores its intermediates instead of recomputing them under
     ``jax.checkpoint``: tens of steps fit in memory.
     """
     initial_state = env.restart(learner.env, learner.env.done)
-    agents, swept_values, config = learner.agents, stack_swept_values(configs), configs[0]
-    split_seeds = partial(split_blocks, n_seeds=len(configs))
-    n_copies = _count_policy_copies(env, len(configs))
+    agents, config, n_seeds, mesh = learner.agents, stack_configs(configs), len(configs), env.sim.mesh
+    # On several devices each has a copy of the policy for its worlds. They sum the gradients of the copies once, after
+    # all steps; with a single policy they would sum its gradients in every step.
+    n_copies = 1 if mesh is None or are_seeds_divided(n_seeds, mesh) else mesh.size
+
+    def copy(tree: T) -> T:
+        if mesh is None or n_copies == 1:
+            return tree
+        copies = jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree)
+        return jax.lax.with_sharding_constraint(copies, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
-        """Return the sum of the losses of all seeds. Its gradient is the stack of the gradients of all copies."""
-        seed_policies = Policies(Policy(_copy_per_device(agents.stats, n_copies, env), policies))
-
-        def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
-            del key
-            return seed_policies(obs), memory, ()
-
-        def record_transition(transition: Transition) -> Any:
-            reward, raw_obs, terminated = split_seeds(
-                (transition.reward, flatten(transition.obs), transition.terminated)
-            )
-            return reward, raw_obs, terminated
-
-        state, _, (rewards, raw_obs, crashed) = rollout(
-            env, initial_state, act, agents.key, config.n_steps, record_transition
+        """Sum the losses of all seeds. The gradient is the stack of the gradients of all copies."""
+        copies = Policy(copy(agents.stats), policies)
+        state, _, records = rollout_seeds(
+            env, initial_state, act, record, (copies,), copy(agents.key), configs[0].n_steps
         )
-        discounts = swept_values["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
-        error = jnp.nanmean(split_seeds(state.info["error"]), axis=(1, 2))
-        rewards, crashed = rewards.mean(axis=(2, 3)), crashed.mean(axis=2)
-        metrics = {"reward": rewards.mean(axis=0), "crashed": crashed.mean(axis=0), "error": error}
-        losses = -(discounts * rewards).mean(axis=0)
-        return losses.sum(), (losses, state, raw_obs, metrics)
+        records = jax.tree.map(lambda x: x.reshape(x.shape[0], n_seeds, -1, *x.shape[3:]), records)
+        errors = split_blocks(state.info["error"], n_seeds)
+        losses, metrics = for_each_seed(compute_loss, config, records, errors, axes=(0, 1, 0))
+        return losses.sum(), (losses, metrics, state, records[0])
 
-    def update(
-        agent: Agent, loss: Array, grads: Layers, raw_obs: Array, swept_values: SweptValues
-    ) -> tuple[Agent, dict[str, Array]]:
-        grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
-        transform = build_optimizer(swept_values["learning_rate"], swept_values["max_grad_norm"], config.iterations)
-        updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
-        updated_state = (optax.apply_updates(agent.policy, updates), optimizer)
-        policy, optimizer = jax.tree.map(
-            lambda x, old: jnp.where(jnp.isfinite(grad_norm), x, old), updated_state, (agent.policy, agent.optimizer)
-        )
-        # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
-        updated_stats, is_updating_stats = agent.stats.update(raw_obs), learner.iteration < STATS_ITERATIONS
-        stats = jax.tree.map(lambda x, old: jnp.where(is_updating_stats, x, old), updated_stats, agent.stats)
-        finite = all_finite((policy, optimizer, stats, loss))
-        return Agent(policy, optimizer, stats, agent.key), {"gradient": grad_norm, "finite": finite}
-
-    policies = _copy_per_device(agents.policy, n_copies, env)
-    (_, (losses, state, raw_obs, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(policies)
-    if n_copies > 1:
-        grads = jax.tree.map(lambda x: x.reshape(-1, n_copies, *x.shape[1:]).sum(axis=1), grads)
-    agents, update_metrics = for_each_seed(update, agents, losses, grads, raw_obs, swept_values, axes=(0, 0, 0, 1, 0))
+    (_, (losses, metrics, state, raw_obs)), grads = jax.value_and_grad(loss, has_aux=True)(copy(agents.policy))
+    grads = jax.tree.map(lambda x: x.reshape(n_seeds, n_copies, *x.shape[1:]).sum(axis=1), grads)
+    is_early = jnp.broadcast_to(learner.iteration < STATS_ITERATIONS, n_seeds)
+    agents, update_metrics = for_each_seed(
+        learn, agents, config, losses, grads, raw_obs, is_early, axes=(0, 0, 0, 0, 1, 0)
+    )
     return Learner(agents, state, learner.iteration + 1), metrics | update_metrics
 
 
-def _count_policy_copies(env: Env, n_seeds: int) -> int:
-    """Return the number of copies of each seed's policy. Each copy controls worlds of one device.
-
-    The devices sum the gradients of the copies once, after all steps. With a single policy they would sum its gradients
-    in every step.
-    """
-    mesh = env.sim.mesh
-    return 1 if mesh is None or are_seeds_divided(n_seeds, mesh) else mesh.size
+def act(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Array]:
+    """Return the action of the policy; the observations are kept for the statistics."""
+    del key
+    return policy(obs), memory, flatten(obs)
 
 
-def _copy_per_device(tree: T, n_copies: int, env: Env) -> T:
-    """Return copies of the arrays of each seed, on the devices that use them. (n_seeds * n_copies, ...) each"""
-    mesh = env.sim.mesh
-    if mesh is None or n_copies == 1:
-        return tree
-    device_sharding = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
-    return jax.lax.with_sharding_constraint(
-        jax.tree.map(lambda x: jnp.repeat(x, n_copies, axis=0), tree), device_sharding
-    )
+def record(policy: Policy, step: Step, raw_obs: Array) -> tuple[Array, Array, Array]:
+    """Return what loss, statistics and metrics need of a step."""
+    del policy
+    return raw_obs, step.reward, step.terminated
+
+
+def compute_loss(config: Config, records: Any, error: Array) -> tuple[Array, dict[str, Array]]:
+    """Compute the negative mean of the discounted rewards of a rollout, and its metrics."""
+    _, rewards, terminated = records
+    rewards = rewards.mean(axis=(1, 2))
+    discounts = config.discount ** jnp.arange(len(rewards), dtype=rewards.dtype)
+    metrics = {"reward": rewards.mean(), "crashed": terminated.mean(axis=1).mean(), "error": jnp.nanmean(error)}
+    return -(discounts * rewards).mean(), metrics
+
+
+def learn(
+    agent: Agent, config: Config, loss: Array, grads: Layers, raw_obs: Array, is_early: Array
+) -> tuple[Agent, dict[str, Array]]:
+    """Update the agent, or keep its weights and its optimiser state if the gradient is not finite."""
+    grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
+    transform = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations)
+    updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
+    updated = optax.apply_updates(agent.policy, updates), optimizer
+    policy, optimizer = _where(jnp.isfinite(grad_norm), updated, (agent.policy, agent.optimizer))
+    # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
+    stats = _where(is_early, agent.stats.update(raw_obs), agent.stats)
+    finite = all_finite((policy, optimizer, stats, loss))
+    return Agent(policy, optimizer, stats, agent.key), {"gradient": grad_norm, "finite": finite}
+
+
+def _where(condition: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.envs.env import Env
+from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError
 
 KERNEL_SIZE, STRIDE = 3, 2
@@ -77,6 +79,11 @@ def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any
             f"depth_image=(16, 12), or leave out convolution."
         )
     return tuple(images)
+
+
+def images_of(env: Env, obs: Obs) -> tuple[Image, ...]:
+    """Return the images among observations of an environment; see ``find_images``."""
+    return find_images({name: x.shape[-1] for name, x in obs.items()}, env.image_formats())
 
 
 def scale_depth(depth: Array) -> Array:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,19 +23,26 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.envs.env import Env
 from crazysim.envs.registry import entry_of
-from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, DivergedError, require_callable
 from crazysim.pytree import PyTree, static
-from crazysim.train.convolution import find_images
+from crazysim.train.convolution import images_of
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters, check_seed
 from crazysim.train.interface import Interface, check_callable, describe_env, sizes_of
-from crazysim.train.networks import Network, Policy, Weights, all_finite, choose_network, forward, init_weights
-from crazysim.train.optimizer import build_optimizer
-from crazysim.train.seeds import SweptValues, for_each_seed, join_blocks, split_blocks, stack_swept_values, take_seed
+from crazysim.train.networks import Network, Policy, Weights, choose_network, forward, init_weights
+from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
+from crazysim.train.seeds import (
+    Step,
+    for_each_seed,
+    rollout_seeds,
+    split_blocks,
+    split_keys,
+    stack_configs,
+    take_seed,
+)
 
 TEACHER_PREFIX = "teacher "
 """Prefix of the names of the teacher's observations."""
@@ -177,21 +183,16 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
         keys: Random keys of the seeds. (n_seeds,)
         teacher: Policy of the teacher; None to load it from the folder ``teacher`` of the hyperparameters.
     """
-    config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
-    if n_worlds % config.minibatches:
-        raise ConfigError(
-            f"expected minibatches that divide the {n_worlds} worlds, got {config.minibatches}. Use for "
-            f"example {math.gcd(n_worlds, 8)}."
-        )
-    k_student, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
+    config = configs[0]
+    check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
+    k_student, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
     obs, teacher_obs = split_obs(state.obs)
     teacher = _load_teacher_run(config.teacher)[0] if teacher is None else teacher
     _check_teacher(teacher, env, teacher_obs, config.teacher)
 
-    sizes, convolution = {name: x.shape[-1] for name, x in obs.items()}, config.convolution
-    images = find_images(sizes, env.image_formats()) if convolution else ()
-    network = choose_network(0, None, convolution, images)
+    images = images_of(env, obs) if config.convolution else ()
+    network = choose_network(0, None, config.convolution, images)
 
     def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
         student: Any = init_weights(network, k_student, obs.shape[-1], (*config.hidden, env.actions.size), 0.01)
@@ -211,41 +212,50 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     the states of the rollout; ``finite`` is True if weights, optimiser state, statistics and losses are finite, and
     ``taught`` if the teacher's actions are.
     """
-    key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
-    agents, swept_values, config = learner.agents.replace(key=key), stack_swept_values(configs), configs[0]
-    split_seeds = functools.partial(split_blocks, n_seeds=len(configs))
+    key, k_fly, k_learn = split_keys(learner.agents.key, 3)
+    agents, config = learner.agents.replace(key=key), configs[0]
     teacher_probability = config.teacher_decay**learner.iteration
 
-    def act(agent: Agent, raw_obs: Array, label: Array, key: Array) -> tuple[Array, Any]:
+    def act(agent: Agent, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+        obs, teacher_obs = split_obs(obs)
+        raw_obs, label = flatten(obs), jnp.clip(learner.teacher(teacher_obs), -1.0, 1.0)
         action = agent.act(agent.stats.normalize(raw_obs))
         is_teacher_acting = jax.random.bernoulli(key, teacher_probability, (len(action), 1, 1))
-        return jnp.where(is_teacher_acting, label, action), (raw_obs, label, jnp.square(action - label).mean())
+        return jnp.where(is_teacher_acting, label, action), memory, (raw_obs, label, jnp.square(action - label).mean())
 
-    def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
-        obs, teacher_obs = split_obs(obs)
-        label = jnp.clip(learner.teacher(teacher_obs), -1.0, 1.0)
-        action, extras = for_each_seed(act, agents, split_seeds(flatten(obs)), split_seeds(label), keys)
-        return join_blocks(action), memory, extras
-
-    def record_transition(transition: Transition) -> Any:
-        reward, error = split_seeds((transition.reward, transition.state.info["error"]))
-        terminated, done = split_seeds((transition.terminated, transition.done))
-        means = reward.mean(axis=(1, 2)), error.mean(axis=(1, 2))
-        return transition.extras, means, (terminated.sum(axis=1), done.sum(axis=1))
-
-    state, _, history = rollout(env, learner.env, policy, k_fly, config.n_steps, record_transition)
-    (raw_obs, labels, difference), (reward, error), (terminated, done) = history
-    update_agent = functools.partial(_update_agent, config=config)
-    agents, finite = for_each_seed(update_agent, agents, raw_obs, labels, swept_values, k_learn, axes=(0, 1, 1, 0, 0))
-    metrics = {
-        "reward": reward.mean(axis=0),
-        "crashed": terminated.sum(axis=0) / jnp.maximum(done.sum(axis=0), 1),
-        "error": error.mean(axis=0),
-        "difference": jnp.sqrt(difference.mean(axis=0)),
-        "finite": finite,
-        "taught": jnp.isfinite(labels).all(axis=(0, 2, 3, 4)),
-    }
+    state, _, records = rollout_seeds(env, learner.env, act, record, (agents,), k_fly, config.n_steps)
+    agents, metrics = for_each_seed(learn, agents, stack_configs(configs), records, k_learn, axes=(0, 0, 1, 0))
     return Learner(agents, learner.teacher, state, learner.iteration + 1), metrics
+
+
+def record(agent: Agent, step: Step, extras: Any) -> Any:
+    """Return the results of ``act`` for a step, and what metrics are made of."""
+    del agent
+    outcome = step.reward.mean(), step.error.mean(), step.terminated.sum(), step.done.sum()
+    return extras, outcome
+
+
+def learn(agent: Agent, config: Config, records: Any, key: Array) -> tuple[Agent, dict[str, Array]]:
+    """Update the student with the records of its rollout, and return it with the metrics of the iteration."""
+    (raw_obs, labels, difference), (reward, error, terminated, done) = records
+
+    def loss(student: Weights, minibatch: Any) -> tuple[Array, Array]:
+        obs, label = minibatch
+        value = jnp.square(agent.replace(student=student).act(obs) - label).mean()
+        return value, value
+
+    samples = agent.stats.normalize(raw_obs), labels
+    student, optimizer, losses = run_epochs(loss, agent.student, agent.optimizer, samples, config, key)
+    stats = agent.stats.update(raw_obs)
+    metrics = {
+        "reward": reward.mean(),
+        "crashed": terminated.sum() / jnp.maximum(done.sum(), 1),
+        "error": error.mean(),
+        "difference": jnp.sqrt(difference.mean()),
+        "finite": all_finite((student, optimizer, stats, losses)),
+        "taught": jnp.isfinite(labels).all(),
+    }
+    return agent.replace(student=student, optimizer=optimizer, stats=stats), metrics
 
 
 def imitate(
@@ -341,40 +351,3 @@ def _check_teacher(teacher: Any, env: Env, teacher_obs: Obs, folder: str) -> Non
             f"expected actions of the teacher of shape {shape} = (n_worlds, n_drones, {shape[-1]}), got {action}. "
             f"Use a function from the observations of all worlds to actions."
         )
-
-
-def _update_agent(
-    agent: Agent, raw_obs: Array, labels: Array, swept_values: SweptValues, key: Array, config: Config
-) -> tuple[Agent, Array]:
-    """Return the student of one seed after the updates on its rollout, and True if all its numbers are finite.
-
-    Args:
-        agent: The student before the updates.
-        raw_obs: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
-        labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
-        swept_values: Hyperparameters of the seed that may differ between seeds. () each
-        key: Random key.
-        config: Hyperparameters of the first seed; values in ``swept_values`` take precedence.
-    """
-    transform = build_optimizer(swept_values["learning_rate"], swept_values["max_grad_norm"], config.n_updates)
-    samples = agent.stats.normalize(raw_obs), labels
-
-    def loss(student: Weights, batch: tuple[Array, Array]) -> Array:
-        obs, label = batch
-        return jnp.square(agent.replace(student=student).act(obs) - label).mean()
-
-    def update(carry: Any, worlds: Array) -> tuple[Any, Array]:
-        student, optimizer = carry
-        loss_value, grads = jax.value_and_grad(loss)(student, jax.tree.map(lambda x: x[:, worlds], samples))
-        updates, optimizer = transform.update(grads, optimizer, student)
-        return (optax.apply_updates(student, updates), optimizer), loss_value
-
-    def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
-        minibatches = jax.random.permutation(key, raw_obs.shape[1]).reshape(config.minibatches, -1)
-        return jax.lax.scan(update, carry, minibatches)
-
-    keys = jax.random.split(key, config.epochs)
-    (student, optimizer), losses = jax.lax.scan(epoch, (agent.student, agent.optimizer), keys)
-    stats = agent.stats.update(raw_obs)
-    finite = all_finite((student, optimizer, stats, losses))
-    return agent.replace(student=student, optimizer=optimizer, stats=stats), finite

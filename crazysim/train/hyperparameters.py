@@ -52,6 +52,11 @@ def check_hyperparameters(config: Any) -> None:
         else:
             value = _check_number(field.name, value, default)
         object.__setattr__(config, field.name, value)
+    critic = getattr(config, "critic", "")
+    if critic.startswith("all_drones") and config.convolution:
+        raise ConfigError(
+            f"expected a critic of one drone with a convolution, got {critic!r}. Use critic='privileged'."
+        )
 
 
 def _check_text(name: str, value: object) -> str:

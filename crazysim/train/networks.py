@@ -324,11 +324,6 @@ def _batch_apply(network: Network, weights: Weights, n_axes: int) -> Callable[[A
     return apply
 
 
-def all_finite(tree: Any) -> Array:
-    """Return True if every number of a pytree is finite. ()"""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
-
-
 class Policy(PyTree):
     """Deterministic policy: observation statistics and a network.
 

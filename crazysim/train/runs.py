@@ -15,7 +15,7 @@ from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError, short_repr
 from crazysim.storage import as_path
 from crazysim.train.config import TrainConfig
-from crazysim.train.convolution import find_images
+from crazysim.train.convolution import images_of
 from crazysim.train.hosts import is_first_host
 from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.show import film as film_policy
@@ -281,8 +281,7 @@ def _check_student(student: TrainConfig) -> None:
     """Raise the errors of a student's settings, which would otherwise be raised after its teacher has been trained."""
     env = student.make_training_env()
     if student.config["convolution"]:
-        obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
-        find_images({name: x.shape[-1] for name, x in obs.items()}, env.image_formats())
+        images_of(env, jax.eval_shape(env.reset, jax.random.key(0)).obs)
 
 
 def _with_teacher(student: TrainConfig, folder: Path) -> TrainConfig:

@@ -1,51 +1,69 @@
-"""Trainings of several seeds in one program: blocks of worlds, one for each seed."""
+"""Several seeds in one program: ``jax.vmap`` around code of one seed, and one rollout of the worlds of all seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from crazysim.core.sharding import WORLD_AXIS
-from crazysim.pytree import float_dtype
+from crazysim.envs.env import Env
+from crazysim.envs.rollout import Transition, rollout
+from crazysim.envs.state import EnvState, Obs
+from crazysim.pytree import PyTree, float_dtype, static
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
-SweptValues = dict[str, Any]
-"""Values of the ``SWEEPABLE`` hyperparameters by name: of one seed, (), or of all seeds, (n_seeds,)."""
 
 
-def stack_swept_values(configs: Sequence[Any]) -> SweptValues:
-    """Return the hyperparameters that may differ between seeds. (n_seeds,) each
+class SeedConfig(PyTree):
+    """Hyperparameters of one seed, read like those of its ``Config``, or of all seeds."""
 
-    They are host arrays, so that the values of a single seed are scalar constants of the compiled program.
+    values: dict[str, Any]
+    """The ``SWEEPABLE`` ones by name: () each, or (n_seeds,) each."""
+    common: Any = static()
+    """``Config`` with the others, which are the same for all seeds."""
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            fields = self.__dict__
+            return fields["values"][name] if name in fields["values"] else getattr(fields["common"], name)
+
+
+def stack_configs(configs: Sequence[T]) -> T:
+    """Stack the hyperparameters of all seeds, as the ``SeedConfig`` that ``for_each_seed`` divides.
+
+    The values are host arrays, so that those of a single seed are scalar constants of the compiled program.
     """
     names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
-    return {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
+    values = {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
+    return cast(T, SeedConfig(values, configs[0]))
 
 
 def split_blocks(tree: T, n_seeds: int) -> T:
-    """Return arrays of all worlds divided into blocks. (n_worlds, ...) -> (n_seeds, n_worlds / n_seeds, ...) each"""
+    """Divide arrays of all worlds into blocks. (n_worlds, ...) -> (n_seeds, n_worlds / n_seeds, ...) each"""
     return jax.tree.map(lambda x: x.reshape(n_seeds, -1, *x.shape[1:]), tree)
 
 
 def join_blocks(tree: T) -> T:
-    """Return arrays of blocks of worlds joined. (n_seeds, n_worlds / n_seeds, ...) -> (n_worlds, ...) each"""
+    """Join arrays of blocks of worlds. (n_seeds, n_worlds / n_seeds, ...) -> (n_worlds, ...) each"""
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
 
 
 def are_seeds_divided(n_seeds: int, mesh: Mesh) -> bool:
-    """Return True if each device of a mesh trains its own seeds."""
+    """Whether each device of a mesh trains its own seeds."""
     return n_seeds % mesh.size == 0
 
 
 def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0, mesh: Mesh | None = None) -> Any:
-    """Return the results of a function of one seed for all seeds, stacked along their first axis.
+    """Apply a function of one seed to all seeds, and stack the results along their first axis.
 
     A single seed is computed without ``jax.vmap``, so that it is the same program as the function itself.
 
@@ -71,6 +89,74 @@ def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | in
     return jax.tree.map(lambda x: jnp.expand_dims(x, 0), fn(*squeezed_args))
 
 
+def split_keys(keys: Array, n: int) -> Array:
+    """Split the random key of every seed into ``n``. (n_seeds,) -> (n, n_seeds)"""
+    return jnp.moveaxis(for_each_seed(partial(jax.random.split, num=n), keys), 1, 0)
+
+
 def take_seed(tree: T, i: int) -> T:
-    """Return the arrays of one seed. (n_seeds, ...) -> (...) each"""
+    """Take the arrays of one seed. (n_seeds, ...) -> (...) each"""
     return jax.tree.map(lambda x: x[i], tree)
+
+
+class Step(PyTree):
+    """Results of an environment step in the worlds of one seed."""
+
+    reward: Array
+    """Rewards. (n_worlds, n_drones)"""
+    terminated: Array
+    """Whether the episode ended by success or failure. (n_worlds,)"""
+    truncated: Array
+    """Whether the episode reached its time limit. (n_worlds,)"""
+    error: Array
+    """Errors of the task. (n_worlds, n_drones)"""
+    final_obs: Obs
+    """Observations at the end of the step, before a new episode begins. (n_worlds, n_drones, k) each"""
+
+    @property
+    def done(self) -> Array:
+        """Whether the episode is over. (n_worlds,)"""
+        return self.terminated | self.truncated
+
+
+def rollout_seeds(
+    env: Env,
+    state: EnvState,
+    act: Callable[..., tuple[Array, Any, Any]],
+    record: Callable[..., Any],
+    seeds: tuple[Any, ...],
+    keys: Array,
+    n_steps: int,
+    initial_memory: Any = (),
+    memory: Any = None,
+) -> tuple[EnvState, Any, Any]:
+    """Fly the worlds of all seeds as one batch, with functions of one seed.
+
+    ``jax.vmap`` of a whole rollout gives the same kernel calls, but moves the packed state of every seed in each step:
+    a rollout of four seeds takes a fifth longer on a CPU.
+
+    Args:
+        env: Environment with a block of worlds for each seed.
+        state: State of all worlds.
+        act: ``act(*seed, obs, memory, key) -> (action, memory, extras)``.
+        record: ``record(*seed, step, extras)``: what to store of a ``Step``.
+        seeds: First arguments of both, pytrees of all seeds. (n_seeds, ...) each
+        keys: Random keys. (n_seeds,)
+        n_steps: Number of steps.
+        initial_memory: Memory of the policies at the start of an episode. (n_worlds, ...) each
+        memory: Memory before the first step; None for ``initial_memory``. (n_worlds, ...) each
+
+    Returns:
+        State and memory of all worlds after the last step, and the records. (n_steps, n_seeds, ...) each
+    """
+    split, each = partial(split_blocks, n_seeds=keys.shape[0]), partial(for_each_seed, mesh=env.sim.mesh)
+
+    def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
+        action, memory, extras = each(act, *seeds, *split((obs, memory)), keys)
+        return join_blocks(action), join_blocks(memory), extras
+
+    def keep(x: Transition) -> Any:
+        step = Step(x.reward, x.terminated, x.truncated, x.state.info["error"], x.final_obs)
+        return each(record, *seeds, split(step), x.extras)
+
+    return rollout(env, state, policy, keys, n_steps, keep, initial_memory, memory)

@@ -40,6 +40,7 @@ from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
 from crazysim.train.convolution import find_images
+from crazysim.train.critic import PRIVILEGED_CRITICS
 from crazysim.train.devices import exchanged_bytes, learner_shardings, replicated_sharding
 from crazysim.train.evaluation import describe_outcome, evaluate_blocks
 from crazysim.train.export import describe
@@ -170,7 +171,7 @@ def train_many(
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
     base_env = config.make_training_env(n_trainings)
     wrapped_env = dagger.wrap_with_teacher(base_env, hyperparameters[0]) if algorithm is dagger else base_env
-    is_privileged = config.config.get("critic") in ppo.PRIVILEGED_CRITICS
+    is_privileged = config.config.get("critic") in PRIVILEGED_CRITICS
     wrapped_env = PrivilegedObservation(base_env) if is_privileged else wrapped_env
     env = base_env if algorithm is apg else AutoReset(wrapped_env)
     eval_env = config.make_env(n_trainings * evaluation_worlds)

@@ -23,12 +23,13 @@ from crazysim.train import Network, ppo
 from crazysim.train import config as configs
 from crazysim.train.checkpoint import read
 from crazysim.train.config import TrainConfig
+from crazysim.train.critic import critic_input, return_std
 from crazysim.train.dagger import imitate
 from crazysim.train.evaluation import evaluate
 from crazysim.train.export import to_c
 from crazysim.train.networks import Policies, gru_network, init_weights, unroll
 from crazysim.train.out_of_tree import to_out_of_tree
-from crazysim.train.seeds import stack_swept_values, take_seed
+from crazysim.train.seeds import rollout_seeds, stack_configs, take_seed
 from crazysim.train.show import film
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 
@@ -65,20 +66,23 @@ def test_an_update_computes_the_outputs_of_the_rollout(rng):
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
     learner, config = init_learner(env, memory=5)
     memory = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), learner.memory)
-    collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
-    key, swept_values = jax.random.key(1)[None], stack_swept_values((config,))
-    _, after, samples, _, _ = collect(learner.agents, learner.replace(memory=memory), env, config, swept_values, key)
+    fly = jax.jit(rollout_seeds, static_argnums=(0, 2, 3, 6))
+    seeds, key = (learner.agents, stack_configs((config,))), jax.random.key(1)[None]
+    initial_memory = (learner.agents.network.make_memory(4, 1),) * 2
+    _, after, (samples, _, _) = fly(
+        env, learner.env, ppo.act, ppo.record, seeds, key, config.n_steps, initial_memory, memory
+    )
     agent, samples = take_seed(learner.agents, 0), jax.tree.map(lambda x: x[:, 0], samples)
     assert samples.done.sum() == 2 * 4
 
     def outputs(done):
         out = unroll(agent.network, agent.policy, samples.obs, memory[0], done)
-        log_prob = ppo._log_prob(jnp.tanh(out), agent.log_std, samples.action)
+        log_prob = ppo.log_prob(jnp.tanh(out), agent.log_std, samples.action)
         return log_prob, unroll(agent.network, agent.value, samples.obs, memory[1], done)[..., 0]
 
     log_prob, value = outputs(samples.done)
     np.testing.assert_allclose(log_prob, samples.log_prob, atol=1e-4)
-    scaled = value * ppo._return_std(agent.returns) + agent.returns.mean
+    scaled = value * return_std(agent.returns) + agent.returns.mean
     np.testing.assert_allclose(scaled, samples.value, atol=1e-5)
     assert np.abs(outputs(jnp.zeros_like(samples.done))[1] - value)[3:].max() > 1e-3, "memories are reset"
     assert np.abs(after[0]).max() > 0
@@ -227,10 +231,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     other = state.obs | {"privileged": 1 + state.obs["privileged"]}
     config = ppo.Config(critic="privileged")
     agent = take_seed(learner.agents, 0)
-    values = [
-        ppo._compute_value(agent, agent.stats.normalize(ppo._critic_obs(obs, config)), (), config)[0]
-        for obs in (state.obs, other)
-    ]
+    values = [agent.estimate_value(agent.observe(obs, config)[1], (), config)[0] for obs in (state.obs, other)]
     assert np.abs(values[0] - values[1]).min() > 1e-4
     assert agent.n_obs == flatten(base.reset(jax.random.key(0)).obs).shape[-1] == agent.as_policy().stats.mean.shape[0]
     with pytest.raises(ConfigError, match=r"expected the observation 'privileged' .*AutoReset\(PrivilegedObservation"):
@@ -252,7 +253,7 @@ def test_an_observation_of_the_task_may_be_named_privileged(rng):
 
 def test_a_critic_of_all_drones_gets_all_observations_with_those_of_its_drone_first():
     obs = jnp.arange(2 * 3 * 2).reshape(2, 3, 2)
-    inputs = np.asarray(ppo._critic_input(obs, ppo.Config(critic="all_drones")))
+    inputs = np.asarray(critic_input(obs, "all_drones"))
     np.testing.assert_array_equal(inputs[0], [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 0, 1], [4, 5, 0, 1, 2, 3]])
     np.testing.assert_array_equal(inputs[1, 2], [10, 11, 6, 7, 8, 9])
 

@@ -76,6 +76,13 @@ def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters
             np.testing.assert_allclose(result[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+def test_one_kernel_call_steps_the_worlds_of_all_seeds():
+    env, configs = AutoReset(make("hover", 8, **SHORT_EPISODES)), (PPO_CONFIGS[0],) * 2
+    learner = jax.eval_shape(lambda keys: ppo.init(env, configs, keys), jax.random.split(jax.random.key(3), 2))
+    program = str(jax.make_jaxpr(ppo.iterate, static_argnums=(1, 2))(learner, env, configs))
+    assert re.findall(r"crazysim_kernel\[[^\]]*?n_worlds=(\d+)", program) == ["8"]
+
+
 def test_the_random_numbers_of_a_block_depend_only_on_its_key():
     """Resets, ``world_keys`` and ``drone_keys`` give a block the same numbers with and without another block.
 

@@ -31,10 +31,11 @@ from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
+from crazysim.train.critic import rescale_value, return_std
 from crazysim.train.evaluation import describe_outcome, evaluate
 from crazysim.train.networks import Policies
 from crazysim.train.runs import run
-from crazysim.train.seeds import stack_swept_values, take_seed
+from crazysim.train.seeds import rollout_seeds, stack_configs, take_seed
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
 from crazysim.train.training import CHECKPOINT_FILE, POLICY_FILE, load_policy, train
 
@@ -538,13 +539,13 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
 
 def test_advantages_are_sums_of_discounted_errors(rng):
     """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
-    rates = stack_swept_values((ppo.Config(discount=0.9, gae_lambda=0.7),))
+    config = ppo.Config(discount=0.9, gae_lambda=0.7)
     reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
     last_value = rng.normal(size=(3, 1)).astype(np.float32)
     done = np.zeros((6, 3, 1), bool)
     done[2, 0], done[5, 1] = True, True
     sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, done)
-    advantages, returns = jax.jit(ppo._estimate_advantages)(sample, last_value, take_seed(rates, 0))
+    advantages, returns = jax.jit(ppo.estimate_advantages, static_argnums=2)(sample, last_value, config)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + 0.9 * next_value * ~done - value
     expected = np.zeros_like(delta)
@@ -562,16 +563,15 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
     config = ppo.Config(n_steps=4, minibatches=4, discount=0.5, hidden=(8,))
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
-    collect = jax.jit(ppo._collect_samples, static_argnums=(2, 3))
-    _, _, samples, _, _ = collect(
-        learner.agents, learner, env, config, stack_swept_values((config,)), jax.random.key(1)[None]
-    )
+    fly = jax.jit(rollout_seeds, static_argnums=(0, 2, 3, 6))
+    seeds = learner.agents, stack_configs((config,))
+    _, _, (samples, _, _) = fly(env, learner.env, ppo.act, ppo.record, seeds, jax.random.key(1)[None], 4, ((), ()))
     agent = take_seed(learner.agents, 0)
     state, step = learner.env, jax.jit(env.step)
     n_truncated = 0
     for k in range(4):
         state = step(state, samples.action[k, 0])
-        value, _ = ppo._compute_value(agent, agent.stats.normalize(flatten(state.info["final_obs"])), (), config)
+        value, _ = agent.estimate_value(agent.stats.normalize(flatten(state.info["final_obs"])), (), config)
         truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
         n_truncated += truncated.sum()
         np.testing.assert_allclose(samples.reward[k, 0], state.reward + 0.5 * truncated * value, atol=1e-5)
@@ -586,12 +586,12 @@ def test_values_stay_when_the_returns_that_scale_them_change(rng):
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     agent = take_seed(learner.agents, 0)
     obs = jnp.asarray(rng.normal(size=(5, agent.stats.mean.shape[0])), jnp.float32)
-    before = ppo._compute_value(agent, obs, (), config)[0]
+    before = agent.estimate_value(obs, (), config)[0]
     returns = agent.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
-    after = agent.replace(value=ppo._rescale_value(agent.value, agent.returns, returns), returns=returns)
-    np.testing.assert_allclose(ppo._compute_value(after, obs, (), config)[0], before, atol=30 * 1e-6)
-    assert np.abs(ppo._compute_value(agent.replace(returns=returns), obs, (), config)[0] - before).min() > 1
-    np.testing.assert_allclose(ppo._return_std(returns), 7.0, rtol=0.1)
+    after = agent.replace(value=rescale_value(agent.value, agent.returns, returns), returns=returns)
+    np.testing.assert_allclose(after.estimate_value(obs, (), config)[0], before, atol=30 * 1e-6)
+    assert np.abs(agent.replace(returns=returns).estimate_value(obs, (), config)[0] - before).min() > 1
+    np.testing.assert_allclose(return_std(returns), 7.0, rtol=0.1)
 
 
 def test_ppo_finds_the_action_that_pays():
