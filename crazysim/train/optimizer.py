@@ -84,5 +84,5 @@ def run_epochs(
 
 
 def all_finite(tree: Any) -> Array:
-    """Whether every number of a pytree is finite. ()"""
+    """Return True if every number of a pytree is finite. ()"""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))

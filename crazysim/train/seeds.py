@@ -58,7 +58,7 @@ def join_blocks(tree: T) -> T:
 
 
 def are_seeds_divided(n_seeds: int, mesh: Mesh) -> bool:
-    """Whether each device of a mesh trains its own seeds."""
+    """Return True if each device of a mesh trains its own seeds."""
     return n_seeds % mesh.size == 0
 
 
@@ -105,9 +105,9 @@ class Step(PyTree):
     reward: Array
     """Rewards. (n_worlds, n_drones)"""
     terminated: Array
-    """Whether the episode ended by success or failure. (n_worlds,)"""
+    """True where the episode ended by success or failure. (n_worlds,)"""
     truncated: Array
-    """Whether the episode reached its time limit. (n_worlds,)"""
+    """True where the episode reached its time limit. (n_worlds,)"""
     error: Array
     """Errors of the task. (n_worlds, n_drones)"""
     final_obs: Obs
@@ -115,7 +115,7 @@ class Step(PyTree):
 
     @property
     def done(self) -> Array:
-        """Whether the episode is over. (n_worlds,)"""
+        """True where the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
 
 

@@ -94,8 +94,9 @@ def train(
     Raises:
         ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``train_many``.
     """
-    settings = (resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
-    return train_many({"": config}, folder, *settings)[""]
+    return train_many({"": config}, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)[
+        ""
+    ]
 
 
 def train_many(
@@ -179,12 +180,10 @@ def train_many(
     seed_keys = [jax.random.key(training.config.seed) for training in trainings]
     keys = jax.jit(lambda keys: jnp.stack([jax.random.fold_in(key, 1) for key in keys]))(seed_keys)
     init_fn = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
-    init, iterate_fn = jax.jit(init_fn, static_argnums=(0, 1)), algorithm.iterate
-    shapes = init.eval_shape(env, hyperparameters, keys)
+    shapes = jax.eval_shape(partial(init_fn, env, hyperparameters), keys)
     shardings, replicated = learner_shardings(shapes, base_env.sim, n_trainings), replicated_sharding(base_env.sim)
-    if base_env.sim.mesh is not None:
-        init = jax.jit(init_fn, static_argnums=(0, 1), out_shardings=shardings)
-        iterate_fn = jax.jit(iterate_fn, static_argnums=(1, 2), out_shardings=(shardings, replicated))
+    init = jax.jit(init_fn, static_argnums=(0, 1), out_shardings=shardings)
+    iterate_fn = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
     policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
     for training in trainings if is_first_host() else ():
