@@ -10,7 +10,7 @@ from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.pair_reductions import reduce_over_others
-from crazysim.core.plugin import Plugin, StagePlacement, parameter
+from crazysim.core.plugin import Param, Plugin, StagePlacement, param, parameter, state
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -89,6 +89,7 @@ __all__ = [
     "Members",
     "MotionCapture",
     "MotorFailure",
+    "Param",
     "Pillars",
     "Plugin",
     "Population",
@@ -115,9 +116,11 @@ __all__ = [
     "leaf",
     "load_airframe",
     "make",
+    "param",
     "parameter",
     "reduce_over_others",
     "stage",
+    "state",
     "static",
 ]
 

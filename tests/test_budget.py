@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1249,
     "control": 2035,
-    "core": 1901,
+    "core": 1903,
     "crazysim": 1409,
     "drones": 531,
     "dynamics": 593,

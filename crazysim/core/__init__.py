@@ -5,7 +5,18 @@ worlds over devices.
 """
 
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn
-from crazysim.core.plugin import FunctionPlugin, Plugin, StagePlacement, check_parameter, parameter
+from crazysim.core.plugin import (
+    FunctionPlugin,
+    Param,
+    Plugin,
+    StagePlacement,
+    check_parameter,
+    derived,
+    param,
+    parameter,
+    part,
+    state,
+)
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
 from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.sharding import shard, world_mesh
@@ -13,17 +24,21 @@ from crazysim.pytree import map_batched, scopes, select_worlds
 
 __all__ = [
     "FunctionPlugin",
+    "Param",
     "Plugin",
     "StagePlacement",
     "append_fn",
     "check_parameter",
+    "derived",
     "dividing_rate",
     "drone_key",
     "drone_keys",
     "insert_fn_after",
     "insert_fn_before",
     "map_batched",
+    "param",
     "parameter",
+    "part",
     "prepend_fn",
     "remove_fn",
     "replace_fn",
@@ -32,6 +47,7 @@ __all__ = [
     "select_worlds",
     "setting",
     "shard",
+    "state",
     "world_key",
     "world_keys",
     "world_mesh",

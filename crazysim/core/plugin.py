@@ -376,7 +376,7 @@ class Plugin(PyTree):
 
     is_bound: bool = dataclasses.field(default=False, kw_only=True, repr=False, metadata={"static": True})
     """True for a plugin in ``data.plugins``, with arrays."""
-    replaced_terms: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
     """Terms of the dynamics model that the plugin replaces or adds, such as ``"drag"``, declared as
     ``class Plugin(..., replaces=("drag",))``. Two plugins that replace the same term are refused."""
     requires: ClassVar[tuple[Requirement, ...]] = ()
@@ -396,7 +396,7 @@ class Plugin(PyTree):
     ) -> None:
         """Make every subclass a frozen dataclass, whose numbers and states are leaves for JAX."""
         if replaces:
-            cls.replaced_terms = replaces
+            cls.replaces = replaces
         cls.requires = (*cls.requires, *(requires if isinstance(requires, tuple) else (requires,)))
         _declare_static_fields(cls)
         super().__init_subclass__(**kwargs)
@@ -469,6 +469,11 @@ class Plugin(PyTree):
     def scope(self) -> str:
         """Scope of the plugin's own states, and of the data that ``derivative`` and ``reset_episode`` take."""
         return "drone"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """Terms of the dynamics model that the plugin replaces with its settings; by default those of its class."""
+        return self.replaces
 
     @classmethod
     def has_arrays(cls) -> bool:
