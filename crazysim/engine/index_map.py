@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,10 +12,11 @@ from jax import Array
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim import jaxcompat
-from crazysim.engine.backends import cuda, native
+from crazysim.core.sharding import Location
 from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.kernel import write_results
 from crazysim.engine.backends.native import Launch
+from crazysim.engine.backends.platforms import TARGETS, compile_kernel, launch_p
 from crazysim.engine.backends.source import Writer, require_block_source, type_name
 from crazysim.engine.ir.blocks import Block, prune
 from crazysim.engine.lowering.jaxprs import Lowering, TableRows, as_elements
@@ -36,30 +36,16 @@ class MapKernels:
     def get_launch(self, platform: str) -> Launch:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
-            if platform == "gpu":
-                self._launches[platform] = cuda.compile_kernel(write_map(self._block, "cuda"))
-            else:
-                self._launches[platform] = native.HostLaunch(write_map(self._block, "host"))
+            self._launches[platform] = compile_kernel(write_map(self._block, TARGETS[platform]), Location(platform))
         return self._launches[platform]
+
+    def n_lanes(self, n: int) -> int:
+        """Return the number of indices."""
+        return n
 
     def result_shapes(self, n: int) -> list[jax.ShapeDtypeStruct]:
         """Return shapes and types of the results for ``n`` indices."""
         return [jax.ShapeDtypeStruct((n,), x.dtype) for x in self._block.outputs]
-
-
-def _result_shapes(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStruct]:
-    del args
-    return kernels.result_shapes(n)
-
-
-def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[Array]:
-    return kernels.get_launch(platform)(n, jnp.zeros(1, np.int32), tables, kernels.result_shapes(n))
-
-
-map_p = jaxcompat.primitive_by_platform(
-    "crazysim_map", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
-)
-"""Primitive that calls a kernel: it takes the tables and returns the results for all indices."""
 
 
 def map_indices(
@@ -87,7 +73,7 @@ def map_indices(
         kernels.get_launch(platform)
 
     def run(tables: list[Array]) -> list[Array]:
-        return list(map_p.bind(*tables, kernels=kernels, n=n))
+        return list(launch_p.bind(jnp.zeros(1, np.int32), *tables, kernels=kernels, n=n))
 
     def batching_rule(size: int, in_batched: Any, tables: list[Array]) -> Any:
         broadcast_tables = [

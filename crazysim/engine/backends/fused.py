@@ -24,7 +24,7 @@ from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 from crazysim.engine.backends.derivatives import CountedRun, make_differentiable
 from crazysim.engine.backends.native import Launch
-from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
+from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel, launch_p
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.passes.layout import packed_rows
@@ -64,28 +64,16 @@ class Kernels:
     def _compile(self, location: Location) -> Launch:
         return compile_kernel(kernel.write_kernel(self.program, TARGETS[location.platform]), location)
 
+    def n_lanes(self, n_worlds: int) -> int:
+        """Return the number of drones in all worlds."""
+        return n_worlds * self.program.n_drones
+
     def result_shapes(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return the shapes and types of the kernel's outputs: leaves, and flags of drones if there is a check."""
         flags = (
             [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check_segment else []
         )
         return [*(lanes.leaf_shape(self.program, i, n_worlds) for i in self.outputs), *flags]
-
-
-def _result_shapes(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
-    del args
-    return kernels.result_shapes(n_worlds)
-
-
-def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_worlds: int) -> list[Array]:
-    launch = kernels.get_launch(platform)
-    return launch(n_worlds * kernels.program.n_drones, count, inputs, kernels.result_shapes(n_worlds))
-
-
-launch_p = jaxcompat.primitive_by_platform(
-    "crazysim_kernel", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
-)
-"""Primitive that calls a kernel: it takes the number of steps and the inputs, and returns the outputs."""
 
 
 def unavailable_reason(platform: str) -> str | None:
@@ -271,7 +259,7 @@ def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[lis
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
     inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
-    results = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
+    results = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n=n_worlds)
     written = [
         jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
         for i, x in zip(kernels.outputs, results[: len(kernels.outputs)], strict=True)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import jax
+from jax import Array
 
+from crazysim import jaxcompat
 from crazysim.core.sharding import Location
 from crazysim.engine.backends import cuda, native
 from crazysim.engine.backends.frame import Kernel
@@ -23,6 +27,25 @@ def compile_kernel(kernel: Kernel, location: Location) -> Launch:
         location: The devices.
     """
     return cuda.compile_kernel(kernel, location.devices) if location.platform == "gpu" else native.HostLaunch(kernel)
+
+
+def _result_shapes(*args: Any, kernels: Any, n: int) -> list[jax.ShapeDtypeStruct]:
+    del args
+    return kernels.result_shapes(n)
+
+
+def _launch(platform: str, count: Array, *inputs: Array, kernels: Any, n: int) -> list[Array]:
+    return kernels.get_launch(platform)(kernels.n_lanes(n), count, inputs, kernels.result_shapes(n))
+
+
+launch_p = jaxcompat.primitive_by_platform(
+    "crazysim_kernel", _result_shapes, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
+)
+"""Primitive that calls a kernel: it takes the number of steps and the inputs, and returns the outputs.
+
+Its parameters are ``kernels``, with the methods ``get_launch(platform)``, ``n_lanes(n)`` and ``result_shapes(n)``, and
+``n``, the number of worlds or of whatever else the kernels are called for.
+"""
 
 
 def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | None) -> str:
