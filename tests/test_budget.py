@@ -16,7 +16,7 @@ BUDGET = {
     "crazysim": 1409,
     "drones": 531,
     "dynamics": 593,
-    "engine": 5805,
+    "engine": 5804,
     "envs": 3896,
     "geometry": 1097,
     "lab": 9874,
