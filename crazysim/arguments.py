@@ -104,7 +104,7 @@ def check_arguments(function: F) -> F:
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        for key, value in signature.bind(*args, **kwargs).arguments.items():
+        for key, value in (bound := signature.bind(*args, **kwargs)).arguments.items():
             types, default = allowed_types().get(key, ()), signature.parameters[key].default
             if isinstance(value, jax.core.Tracer) or (value is None and default is None):
                 continue
@@ -113,7 +113,10 @@ def check_arguments(function: F) -> F:
                 check_array(key, value, remedy)
             else:
                 check_value(key, value, types, remedy=remedy)
-        return function(*args, **kwargs)
+                # One number in an array becomes a number, which can be compared, used as an index, and hashed.
+                is_array = bool(types) and isinstance(value, (np.ndarray, jax.Array))
+                bound.arguments[key] = value.item() if is_array else value
+        return function(*bound.args, **bound.kwargs)
 
     return checked  # type: ignore[return-value]
 
@@ -149,8 +152,6 @@ def annotated_types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         return tuple(itertools.chain(*parts)) if all(parts) else ()
     if typing.get_origin(hint) is Sequence and (inner := annotated_types(typing.get_args(hint)[0], names)):
         return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
-    if hint is None:
-        return (type(None),)
     # Fields that are annotated as arrays are not checked: they may hold NumPy or JAX arrays of any dtype.
     is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
     return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()

@@ -163,7 +163,7 @@ class Step:
         Raises:
             ConfigError: If there is no engine of that name, or it cannot run here.
         """
-        if engine not in ENGINES:
+        if not isinstance(engine, str) or engine not in ENGINES:
             raise ConfigError(f"expected an engine of {', '.join(ENGINES)}, got {engine!r}. Use 'auto'.")
         if engine == "fused" and (reason := fused.unavailable_reason(platform)):
             raise ConfigError(f"engine 'fused' cannot run here: {reason}. Use engine='lanes', or 'auto'.")

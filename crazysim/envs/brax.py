@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.arguments import check_arguments
+from crazysim.arguments import check_arguments, check_array
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
@@ -104,6 +104,7 @@ class BraxEnv:
             state: State of all worlds.
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)
         """
+        check_array("action", action)
         shape = (self.sim.n_worlds, self.action_size)
         if np.shape(action) != shape:
             raise ValueError(

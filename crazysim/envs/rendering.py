@@ -29,7 +29,7 @@ class Renderer:
             worlds: Worlds to render; None for all.
             size: Width and height of an image, pixels.
         """
-        if mode not in (None, *RENDER_MODES):
+        if mode is not None and (not isinstance(mode, str) or mode not in RENDER_MODES):
             raise ConfigError(f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}")
         indices = np.arange(sim.n_worlds) if worlds is None else np.asarray(worlds)
         is_index = indices.ndim == 1 and indices.size and np.issubdtype(indices.dtype, np.integer)

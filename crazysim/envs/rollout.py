@@ -100,9 +100,6 @@ def rollout(
     if n_steps > MAX_STEPS:
         raise ConfigError(f"expected n_steps of at most {MAX_STEPS}, got {n_steps}. Use several rollouts.")
     check_key(key)
-    for name, function in (("policy", policy), ("keep", keep)):
-        if not callable(function):
-            raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
     memory = initial_memory if memory is None else memory
     flat = env.flatten(state)
     if env.reset_policy is not None:

@@ -48,7 +48,7 @@ def render_worlds(
         ImportError: If ``renderer="warp"`` and MuJoCo Warp is not installed.
         RenderError: If this machine cannot draw.
     """
-    if renderer not in RENDERERS:
+    if not isinstance(renderer, str) or renderer not in RENDERERS:
         raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
     indices = world_indices(sim, worlds)
     can_use_warp = (

@@ -162,7 +162,7 @@ def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
         return None
     if isinstance(objects, (Handle, str)):
         return (objects,)
-    selection = tuple(objects) if isinstance(objects, Iterable) else (objects,)
+    selection = tuple(objects) if np.iterable(objects) else (objects,)
     if not all(isinstance(x, (Handle, str)) for x in selection):
         raise ConfigError(
             f"expected objects as handles or names of bodies, got {short_repr(objects)}. Use None for all, () for none."

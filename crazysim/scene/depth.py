@@ -217,7 +217,7 @@ def build_depth_fn(
         kernels: Kernels that cast the rays if possible.
         baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
     """
-    if along not in ("axis", "ray"):
+    if not isinstance(along, str) or along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     height, width = rays[0].shape[:2]

@@ -66,7 +66,7 @@ class Overlays:
 
     def text(self, text: str, corner: str) -> None:
         """Add text to a corner of the image, below earlier text."""
-        if corner not in IMAGE_CORNERS:
+        if not isinstance(corner, str) or corner not in IMAGE_CORNERS:
             raise UnknownNameError(f"expected corner {' or '.join(map(repr, IMAGE_CORNERS))}, got {corner!r}")
         texts_above = self._texts.get(corner)
         self._texts[corner] = (

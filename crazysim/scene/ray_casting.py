@@ -396,7 +396,7 @@ class RayKernels:
             mesh: Devices over which its worlds are distributed; None for one device.
             strict: True to raise an error where XLA would be used with an ``EngineWarning``.
         """
-        has_kernels = engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
+        has_kernels = str(engine) in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict, mesh)
 
     def run_on_each_device(self, fn: Callable[[SimData, RayKernels], T], data: SimData) -> T:

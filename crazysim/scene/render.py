@@ -50,7 +50,7 @@ class ModelRenderer:
         overlays: Overlays,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
         """Return or show an image; see ``Sim.render``."""
-        if mode not in RENDER_MODES:
+        if not isinstance(mode, str) or mode not in RENDER_MODES:
             raise UnknownNameError(f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}")
         check_image_size(width, height)
         if self._model.nmat > MAX_MATERIALS:

@@ -108,7 +108,7 @@ def build_splat_fn(
 
 def _choose_renderer(renderer: Renderer, platform: str) -> Callable[..., tuple[Array, Array, Array]]:
     """Return ``_draw_with_splax`` or ``_draw_with_jax``."""
-    if renderer not in RENDERERS:
+    if not isinstance(renderer, str) or renderer not in RENDERERS:
         raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
     if renderer == "plain" or (renderer == "auto" and (platform != "gpu" or not importlib.util.find_spec("splax"))):
         return _draw_with_jax

@@ -164,10 +164,10 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
         estimator = find_estimator(estimator)
         shorthand_plugins.extend([*estimator.sensors, estimator])
     if aero is not None:
-        if aero != "identified":
+        if not isinstance(aero, str) or aero != "identified":
             raise ConfigError(
-                f"expected aero='identified' or None, got {aero!r}. Use plugins=[RotorAerodynamics()] for the other "
-                f"forces of the air on rotors."
+                f"expected aero='identified' or None, got {short_repr(aero)}. Use plugins=[RotorAerodynamics()] "
+                f"for the other forces of the air on rotors."
             )
         from crazysim.plugins.effects import Residual
 

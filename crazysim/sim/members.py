@@ -14,6 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim import jaxcompat
+from crazysim.arguments import check_arguments, check_array
 from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
@@ -74,12 +75,14 @@ class Member:
                 raise UnknownNameError(
                     f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
                 )
+            check_array(f"{field} of {self.name}", value)
             new_values[field] = self._replace_checked_row(f"{field} of {self.name}", getattr(record, field), value)
         data, record = self._sim.data, record.replace(**new_values)
         plugin = self._plugin
         self._sim.data = data.replace(states=record) if plugin is None else plugin.write(data, record)
 
     @locked
+    @check_arguments
     def command(self, command: ArrayLike) -> None:
         """Stage a command for this drone or member only: (k,) for all worlds, or (n_worlds, k) for each world.
 

@@ -32,7 +32,7 @@ from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Step, explain
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError
 from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
@@ -565,9 +565,6 @@ class Sim:
         Returns:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)
         """
-        for name, function in (("policy", policy), ("keep", keep)):
-            if not callable(function):
-                raise ConfigError(f"expected {name} as a function, got {short_repr(function)}")
         n_substeps = self.freq // self.control_freq
         n_control_steps = positive_integer("n_control_steps", n_control_steps)
         self._stepper.count_steps(n_substeps)  # to the next tick

@@ -12,6 +12,7 @@ from crazysim.drones.body import MAX_LED_DRONES
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import DEFAULT_COLOR
 from crazysim.sim.sim import Sim
+from crazysim.tables import read_floats
 
 
 def draw_line(
@@ -144,7 +145,7 @@ def change_material(
 
 
 def _check_points(points: ArrayLike) -> np.ndarray:
-    array = np.atleast_2d(np.asarray(points, dtype=float))
+    array = np.atleast_2d(read_floats("points", points))
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"expected points of shape (n, 3), got {array.shape}")
     return array

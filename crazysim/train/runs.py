@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError, short_repr
@@ -205,12 +206,11 @@ def make_variants(
         ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
             is not one of ``SWEEPABLE`` or is also in ``config``.
     """
-    _require_iterable("seeds", seeds)
     if not isinstance(sweep, Mapping):
         raise ConfigError(
             f"expected sweep as a dict of values by name, got {short_repr(sweep)}. Use {{'clip': [0.1, 0.2]}}."
         )
-    for name, values in sweep.items():
+    for name, values in {"seeds": seeds, **sweep}.items():
         _require_iterable(name, values)
     values_by_name: dict[str, list[Any]] = {
         name: list(itertools.islice(values, MAX_TRAININGS + 1)) for name, values in {"seeds": seeds, **sweep}.items()
@@ -311,7 +311,7 @@ def _stored_config(folder: Path) -> TrainConfig:
 
 def _require_iterable(name: str, values: object) -> None:
     """Check that an argument is a list of values, or another iterable."""
-    if not isinstance(values, Iterable) or isinstance(values, str):
+    if not np.iterable(values) or isinstance(values, str):
         raise ConfigError(
             f"expected {name} as a list of values, got {short_repr(values)}. Use [{values!r}], for example."
         )

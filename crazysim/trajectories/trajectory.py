@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -340,7 +340,7 @@ def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Tra
             leading axis.
     """
     is_stack = isinstance(trajectories, Trajectory)
-    items = trajectories.unstacked() if is_stack else list(trajectories) if isinstance(trajectories, Iterable) else []
+    items = trajectories.unstacked() if is_stack else list(trajectories) if np.iterable(trajectories) else []
     if not items or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in items):
         raise ConfigError(
             f"expected at least one trajectory, each of one vehicle, got {short_repr(trajectories)}. Pass a list with "
