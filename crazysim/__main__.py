@@ -26,7 +26,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for module in (demo, replay, show, live, training, airframe, identify, validate, info):
         module.add_parsers(commands)
     options = parser.parse_args(arguments)
-    options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     if options.command is None:
         parser.print_help()
         return 0

@@ -1,25 +1,18 @@
-"""Commands that run on several hosts. Each host runs the command in a child process of ``crazysim``.
-
-JAX's runtime aborts the child process when another host is lost, so only its parent can say what happened.
-"""
+"""Commands that run on several hosts, connected by ``jax.distributed``. JAX ends a host when another one is lost."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
-import shlex
 import signal
 import socket
-import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from crazysim.commands.options import duration
@@ -27,8 +20,6 @@ from crazysim.errors import ConfigError, DivergedError
 
 MAX_PORT = 65535
 """Largest TCP port."""
-HOST_VARIABLE = "CRAZYSIM_HOST"
-"""Environment variable of the process of a host: its ``Host`` as JSON."""
 STOP_KEY = "crazysim/stop"
 """Prefix of the keys in the coordinator's store under which hosts write why they stop."""
 STOP_SECONDS = 10
@@ -37,8 +28,6 @@ POLL_SECONDS = 0.5
 """Time between two checks whether another host stops, s."""
 END_SECONDS = 24 * 3600
 """Time for which hosts wait until the last host ends, s: host 0 draws and films when the others have finished."""
-EXPLAINED_LINE = "crazysim: the end of this host is explained"
-"""Line that the process of a host writes when it has printed why it ends, so that its parent prints nothing more."""
 
 
 @dataclass(frozen=True)
@@ -89,16 +78,57 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     """Run a command on this host together with other hosts, and return the exit status.
 
     Args:
-        command: The command. It runs in a separate process, which is connected with the other hosts.
-        options: Options of the command, including those of ``add_options``, and ``arguments``, the command line.
+        command: The command.
+        options: Options of the command, including those of ``add_options``.
 
     Raises:
         ConfigError: If the options are invalid, or no hosts are found.
     """
-    if HOST_VARIABLE in os.environ:
-        return _run_host(Host(**json.loads(os.environ.pop(HOST_VARIABLE))), command, options)
     host = _host_from_scheduler(options) if options.coordinator == "auto" else _host_from_options(options)
-    return _start_host(host, options.arguments)
+    print(f"host {host.host_id} of {host.n_hosts} connects with {host.coordinator}", flush=True)
+
+    import jax
+
+    from crazysim.train.hosts import require_same_versions
+
+    try:
+        jax.distributed.initialize(
+            host.coordinator,
+            host.n_hosts,
+            host.host_id,
+            host.devices,
+            cluster_detection_method="deactivate",
+            initialization_timeout=host.connect_timeout,
+            heartbeat_timeout_seconds=host.heartbeat_timeout,
+            shutdown_timeout_seconds=END_SECONDS,
+        )
+    except RuntimeError as error:
+        raise ConfigError(f"expected an address to listen at as {host.coordinator}, got: {error}") from error
+    signal.signal(signal.SIGINT, _stop_all)
+    threading.Thread(target=_stop_with_others, args=(host,), daemon=True).start()
+    try:
+        require_same_versions()
+        devices = jax.local_devices()
+        print(f"host {host.host_id} of {host.n_hosts}: {len(devices)} {devices[0].device_kind}", flush=True)
+        status = command(options) or 0
+    except SystemExit as end:  # all hosts have agreed on it
+        status = int(end.code or 0)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # probably a host is lost: JAX's runtime then ends this process
+            time.sleep(host.heartbeat_timeout + STOP_SECONDS)
+        _stop_others(host, error)
+    except BaseException as error:
+        _stop_others(host, error)
+    sys.stdout.flush()
+    jax.distributed.shutdown()
+    return status
+
+
+def _stop_all(number: int, frame: object) -> None:
+    """On Ctrl-C, end this process as SIGTERM does: JAX stops all hosts after the same iteration. A second one kills."""
+    del frame
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _host_from_options(options: argparse.Namespace) -> Host:
@@ -144,119 +174,6 @@ def _host_from_scheduler(options: argparse.Namespace) -> Host:
     return Host(coordinator, host_id, n_hosts, devices, options.heartbeat_timeout, options.connect_timeout)
 
 
-def _start_host(host: Host, arguments: Sequence[str]) -> int:
-    """Run the process of a host, pass signals on to it, explain its end, and return its exit status."""
-    signals: list[int] = []
-
-    def forward_signal(number: int, frame: object) -> None:
-        del frame
-        signals.append(number)
-        child.send_signal(signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
-
-    with tempfile.TemporaryFile() as log:
-        environment = os.environ | {HOST_VARIABLE: json.dumps(asdict(host)), "CRAZYSIM_HOST_LOG": str(log.fileno())}
-        child = subprocess.Popen(
-            [sys.executable, "-m", "crazysim", *arguments],
-            env=environment,
-            pass_fds=[log.fileno()],
-            start_new_session=True,  # Ctrl-C goes to this process, which passes it on as SIGTERM
-        )
-        old_handlers = {number: signal.signal(number, forward_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            status = child.wait()
-        finally:
-            for number, handler in old_handlers.items():
-                signal.signal(number, handler)
-        log.seek(0)
-        text = log.read().decode(errors="replace")
-    if status != 0 and not signals and EXPLAINED_LINE not in text:
-        print(f"crazysim: {_explain_end(text, status, host, arguments)}", file=sys.stderr)
-    return 128 + signals[0] if signals and status else status if status >= 0 else 128 - status
-
-
-def _explain_end(log: str, status: int, host: Host, arguments: Sequence[str]) -> str:
-    """Return why the process of a host has ended.
-
-    Args:
-        log: Messages of JAX's runtime and other libraries.
-        status: Exit status of the process; -n for signal n.
-        host: The host.
-        arguments: Arguments of the command.
-    """
-    if "RegisterTask" in log:
-        others = "the other hosts" if host.host_id == 0 else f"host 0 at {host.coordinator}"
-        return (
-            f"host {host.host_id}: expected {host.n_hosts} hosts to connect with {host.coordinator} within "
-            f"{host.connect_timeout} s, got no connection with {others}. Start a process on every host, check the "
-            f"address and the firewall, or wait longer with --connect-timeout."
-        )
-    resume = shlex.join(["crazysim", *arguments, *(["--resume"] if "--resume" not in arguments else [])])
-    remedy = f"The last checkpoint continues the training: start all hosts again, this one with\n  {resume}"
-    unhealthy_match = re.search(r"stopped sending heartbeats\)?:?\s*\n((?:[^\n]*\d+\n)+)", log)
-    lost_hosts = (
-        sorted({int(line.rpartition(":")[2]) for line in unhealthy_match[1].split()} - {host.host_id})
-        if unhealthy_match
-        else []
-    )
-    if lost_hosts:
-        names = f"host{'s' if len(lost_hosts) > 1 else ''} {', '.join(map(str, lost_hosts))}"
-        return f"host {host.host_id}: {names} lost: no heartbeat for {host.heartbeat_timeout} s. {remedy}"
-    if "coordination" in log and host.host_id != 0:
-        return f"host {host.host_id}: host 0 lost: {host.coordinator} does not answer. {remedy}"
-    last_lines = "\n".join(log.strip().splitlines()[-20:])
-    return f"host {host.host_id} ended with status {status}. {remedy}" + (
-        f"\nIts last messages:\n{last_lines}" * bool(last_lines)
-    )
-
-
-def _run_host(host: Host, command: Callable[[argparse.Namespace], int | None], options: argparse.Namespace) -> int:
-    """Connect with the other hosts, run the command, and end with them; return the exit status."""
-    log_descriptor = int(os.environ.pop("CRAZYSIM_HOST_LOG"))
-    sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1) for n in (1, 2))
-    for n in (1, 2):  # for output of libraries that are not written in Python
-        os.dup2(log_descriptor, n)
-    os.close(log_descriptor)
-    parent_id = os.getppid()
-
-    import jax
-
-    from crazysim.train.hosts import require_same_versions
-
-    try:
-        jax.distributed.initialize(
-            host.coordinator,
-            host.n_hosts,
-            host.host_id,
-            host.devices,
-            cluster_detection_method="deactivate",
-            initialization_timeout=host.connect_timeout,
-            heartbeat_timeout_seconds=host.heartbeat_timeout,
-            shutdown_timeout_seconds=END_SECONDS,
-        )
-    except RuntimeError as error:
-        _notify_parent()
-        print(f"crazysim: expected an address to listen at as {host.coordinator}, got: {error}", file=sys.stderr)
-        return 2
-    threading.Thread(target=_stop_with_others, args=(host, parent_id), daemon=True).start()
-    try:
-        require_same_versions()
-        devices = jax.local_devices()
-        print(f"host {host.host_id} of {host.n_hosts}: {len(devices)} {devices[0].device_kind}", flush=True)
-        status = command(options) or 0
-    except SystemExit as end:  # all hosts have agreed on it
-        _notify_parent()
-        status = int(end.code or 0)
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):  # probably a host is lost: JAX's runtime then ends this process
-            time.sleep(host.heartbeat_timeout + STOP_SECONDS)
-        _stop_others(host, error)
-    except BaseException as error:
-        _stop_others(host, error)
-    sys.stdout.flush()
-    jax.distributed.shutdown()
-    return status
-
-
 def _stop_others(host: Host, error: BaseException) -> None:
     """Print an error, send it to the other hosts, and end the process when they have ended."""
     is_expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
@@ -279,7 +196,6 @@ def _end_process(host: Host, line: str, reason: str | None) -> None:
     if not _end_lock.acquire(blocking=False):
         time.sleep(2 * STOP_SECONDS)
     print(line, file=sys.stderr)
-    _notify_parent()
     hosts = connected_hosts()
     with suppress(Exception):  # the process ends in any case
         if hosts is not None:
@@ -293,14 +209,12 @@ def _end_process(host: Host, line: str, reason: str | None) -> None:
     os._exit(2)
 
 
-def _stop_with_others(host: Host, parent_id: int) -> None:
-    """End this process as soon as another host stops with an error, or the parent process has ended."""
+def _stop_with_others(host: Host) -> None:
+    """End this process as soon as another host stops with an error."""
     from crazysim.jaxcompat import connected_hosts
 
     while True:
         time.sleep(POLL_SECONDS)
-        if os.getppid() != parent_id:
-            os._exit(2)
         hosts = connected_hosts()
         with suppress(Exception):  # the coordinator has gone: JAX's runtime ends this process
             stop_reasons = [] if hosts is None else hosts.client.key_value_dir_get(STOP_KEY)
@@ -308,8 +222,3 @@ def _stop_with_others(host: Host, parent_id: int) -> None:
                 other = int(name.rpartition("/")[2])
                 if other != host.host_id:
                     _end_process(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)
-
-
-def _notify_parent() -> None:
-    """Write ``EXPLAINED_LINE`` to the log that the parent process reads."""
-    os.write(2, f"{EXPLAINED_LINE}\n".encode())
