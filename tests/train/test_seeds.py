@@ -80,7 +80,7 @@ def test_one_kernel_call_steps_the_worlds_of_all_seeds():
     env, configs = AutoReset(make("hover", 8, **SHORT_EPISODES)), (PPO_CONFIGS[0],) * 2
     learner = jax.eval_shape(lambda keys: ppo.init(env, configs, keys), jax.random.split(jax.random.key(3), 2))
     program = str(jax.make_jaxpr(ppo.iterate, static_argnums=(1, 2))(learner, env, configs))
-    assert re.findall(r"crazysim_kernel\[[^\]]*?n_worlds=(\d+)", program) == ["8"]
+    assert re.findall(r"crazysim_kernel\[[^\]]*?\bn=(\d+)", program) == ["8"]
 
 
 def test_the_random_numbers_of_a_block_depend_only_on_its_key():
