@@ -8,44 +8,19 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
-from crazysim.core.stage import Stage
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, drone_array, param, state
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 from crazysim.rotation import clip, safe_norm
 
 CLEAR_COLOR, ALARM_COLOR = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
 """RGBA colours of an empty lobe, and of a lobe with a drone in it."""
 N_MERIDIANS, N_POINTS = 12, 40
 """Number of teardrop outlines drawn for a lobe, and number of points on each half of an outline."""
-
-
-class RadarData(PyTree):
-    """Radars, the same in every world, and the time that each drone has been within their lobes."""
-
-    pos: Array = leaf("shared", 2)
-    """Positions of the radars, world frame, m. (n_radars, 3)"""
-    max_range: Array = leaf("shared", 1)
-    """Length of each lobe, m. (n_radars,)"""
-    exponent: Array = leaf("shared", 1)
-    """Exponents of the lobes, 1; the larger, the thinner a lobe is near its radar. (n_radars,)"""
-    height_scale: Array = leaf("shared", 1)
-    """Factors of the thickness of the lobes, 1. (n_radars,)"""
-    tilt: Array = leaf("shared", 1)
-    """Elevations of the lobes, rad. (n_radars,)"""
-    exposure: Array = leaf("drone", 1)
-    """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
-
-    @jit_eager_calls()
-    def margin_at(self, pos: Array) -> Array:
-        """Return the depth of a point within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
-        offset = pos[..., None, :] - self.pos
-        return lobe_margin(offset, self.max_range, self.exponent, self.height_scale, self.tilt)
 
 
 class Radar(Plugin):
@@ -55,21 +30,23 @@ class Radar(Plugin):
     directions. Each setting is one number for all radars, or one number per radar.
     """
 
-    pos: ArrayLike = parameter()
-    """Positions of the radars, world frame, m. (3,) or (n_radars, 3)"""
-    max_range: ArrayLike = parameter(default=10.0, positive=True)
-    """Length of the lobe, m. () or (n_radars,)"""
-    exponent: ArrayLike = parameter(default=1.3, low=0.0)
-    """Exponent of the lobe, 1; the larger, the thinner the lobe is near its radar. () or (n_radars,)"""
-    height_scale: ArrayLike = parameter(default=1.0, positive=True)
-    """Factor of the thickness of the lobe, 1. () or (n_radars,)"""
-    tilt: ArrayLike = parameter(default=0.0, low=-math.pi / 2, high=math.pi / 2)
-    """Elevation of the lobe, rad, positive upwards. () or (n_radars,)"""
+    pos: Param = param(core=("radars", 3), scope="shared")
+    """Positions of the radars, world frame, m; also (3,) as a setting. (n_radars, 3)"""
+    max_range: Param = param(default=10.0, core=("radars",), scope="shared", positive=True)
+    """Length of the lobe, m. (n_radars,)"""
+    exponent: Param = param(default=1.3, core=("radars",), scope="shared", low=0.0)
+    """Exponent of the lobe, 1; the larger, the thinner the lobe is near its radar. (n_radars,)"""
+    height_scale: Param = param(default=1.0, core=("radars",), scope="shared", positive=True)
+    """Factor of the thickness of the lobe, 1. (n_radars,)"""
+    tilt: Param = param(default=0.0, core=("radars",), scope="shared", low=-math.pi / 2, high=math.pi / 2)
+    """Elevation of the lobe, rad, positive upwards. (n_radars,)"""
     visible: bool = False
     """True to draw the lobes into images, in red where a drone is detected."""
+    exposure: Array = state(("radars",))
+    """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
     name: str = "radar"
 
-    def record(self, sim: Simulation) -> RadarData:
+    def bind(self, sim: Simulation) -> Radar:
         pos = np.asarray(self.pos, np.float64)
         pos = pos[None] if pos.ndim == 1 else pos
         if pos.ndim != 2 or pos.shape[1] != 3 or not len(pos):
@@ -85,16 +62,24 @@ class Radar(Plugin):
                     f"expected {name} as one number, or one per radar ({len(pos)},), got shape {value.shape}"
                 )
             settings[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=device_array(pos, dtype), **settings, exposure=drone_array(sim, 0.0, len(pos)))
+        return self.with_arrays(sim, pos=device_array(pos, dtype), **settings, exposure=drone_array(sim, 0.0, len(pos)))
+
+    @jit_eager_calls()
+    def margin_at(self, pos: Array) -> Array:
+        """Return the depth of a point within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)
+
+        For the plugin in ``data.plugins``.
+        """
+        offset = pos[..., None, :] - self.pos
+        return lobe_margin(offset, self.max_range, self.exponent, self.height_scale, self.tilt)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        return [StagePlacement(Stage(self.count_exposure, "drone"), before="increment_steps")]
+        return [StagePlacement(self.stage(self.count_exposure), before="increment_steps")]
 
     def count_exposure(self, data: SimData) -> SimData:
         """Add the duration of a step to the exposure of one drone, for each lobe that contains the drone."""
-        record = self.read(data)
-        time = jnp.where(record.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)
-        return self.write(data, record.replace(exposure=record.exposure + time))
+        time = jnp.where(self.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)
+        return self.write(data, self.replace(exposure=self.exposure + time))
 
     def detects(self, data: SimData) -> Array:
         """Return True where a radar detects a drone, for one drone, one world or all worlds. (..., n_radars)"""
@@ -102,8 +87,7 @@ class Radar(Plugin):
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the depth within each lobe, m, negative outside, and the time within it, s."""
-        record = self.read(data)
-        return {"margin": record.margin_at(data.states.pos), "exposure": record.exposure}
+        return {"margin": self.margin_at(data.states.pos), "exposure": self.exposure}
 
     def draw(self, sim: Simulation, world: int) -> None:
         if not self.visible:
