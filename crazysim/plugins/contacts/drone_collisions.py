@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, param, state
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
@@ -25,24 +25,7 @@ from crazysim.plugins.contacts.rigid_bodies import (
     states_after_contact,
 )
 from crazysim.plugins.contacts.solver import Impulses, solve_contacts
-from crazysim.pytree import PyTree, device_array, leaf
-
-
-class DroneCollisionsData(PyTree):
-    """Parameters of the collisions, and the last impulses."""
-
-    friction: Array = leaf("shared", 1)
-    """Coulomb's coefficient between drones, 1. (1,)"""
-    restitution: Array = leaf("shared", 1)
-    """Ratio of the speeds after and before a bounce, 1. (1,)"""
-    impulse: Array = leaf("drone", 1)
-    """Impulse of the other drones in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
-    normal_impulse: Array = leaf("world", 1)
-    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
-    (n_worlds, 1, n_contacts)"""
-    friction_impulse: Array = leaf("world", 2)
-    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
-    (n_worlds, 1, n_contacts, 3)"""
+from crazysim.pytree import device_array
 
 
 class DroneCollisions(Plugin):
@@ -51,26 +34,34 @@ class DroneCollisions(Plugin):
     All pairs are checked, which suits small swarms only. Momentum and angular momentum are conserved.
     """
 
-    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
-    """Coulomb's coefficient between drones."""
-    restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))
-    """Ratio of the speeds after and before a bounce, 0 to 1."""
+    friction: Param = param(default=0.6, scope="shared", low=0.0, high=MAX_FRICTION, shapes=((),))
+    """Coulomb's coefficient between drones, 1. (1,)"""
+    restitution: Param = param(default=0.2, scope="shared", low=0.0, high=1.0, shapes=((),))
+    """Ratio of the speeds after and before a bounce, 0 to 1. (1,)"""
     softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
     """Time constant with which an overlap is pushed out, s; at least two steps."""
     iterations: int = setting(default=12, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver."""
+    impulse: Array = state((3,))
+    """Impulse of the other drones in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
+    normal_impulse: Array = state(("contacts",), scope="world")
+    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
+    (n_worlds, 1, n_contacts)"""
+    friction_impulse: Array = state(("contacts", 3), scope="world")
+    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
+    (n_worlds, 1, n_contacts, 3)"""
     name: str = "drone_collisions"
 
-    def record(self, sim: Simulation) -> DroneCollisionsData:
+    def bind(self, sim: Simulation) -> DroneCollisions:
         n = sim.n_drones
         if n < 2:
             raise ConfigError(f"expected at least two drones, which can collide, got {n}. Use Sim(n_drones=...).")
         check_softness(sim.data.core.freq, self.softness)
         n_contacts = require_few_contacts(N_BOX_POINTS * n * (n - 1) // 2, f"{n} drones")
-        return DroneCollisionsData(
+        return self.with_arrays(
+            sim,
             friction=device_array([self.friction]),
             restitution=device_array([self.restitution]),
-            impulse=drone_array(sim, 0.0, 3),
             normal_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
             friction_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )
