@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1097,
     "lab": 9874,
     "media": 1010,
-    "plugins": 7355,
+    "plugins": 7336,
     "scene": 3153,
     "sim": 1236,
     "train": 2497,

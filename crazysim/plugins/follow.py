@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Sequence
 
@@ -14,12 +15,11 @@ from numpy.typing import ArrayLike
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, derived, param
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
 from crazysim.core.stages import is_tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, device_array, leaf, static
+from crazysim.pytree import device_array
 from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 MIN_SLOT_DEGREE = 7
@@ -33,37 +33,7 @@ PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
 """Colour of paths and setpoints, rgba."""
 
 
-class FollowData(PyTree):
-    """Trajectories in slots (rows of arrays, one trajectory each), and the slot, start and rate of every drone."""
-
-    ends: Array = leaf("shared", 2)
-    """End of each piece of the trajectory in each slot, s since its start. (n_slots, max_pieces)"""
-    coefficients: Array = leaf("shared", 4)
-    """Coefficients as in ``Trajectory``. (n_slots, max_pieces, 4, degree + 1)"""
-    repeats: Array = leaf("shared", 1)
-    """True where a trajectory starts again after its end. (n_slots,)"""
-    index: Array = leaf("parameter", 1, (1,))
-    """Slot that a drone follows. (1,)"""
-    start: Array = leaf("parameter", 1, (1,))
-    """Time since the reset of the world at which a drone starts, s. (1,)"""
-    rate: Array = leaf("parameter", 1, (1,))
-    """Factor of the speed along the trajectory, 1: with 2 a drone takes half the time. (1,)"""
-    degrees: tuple[int, ...] = static()
-    """Largest degrees of x, y, z and yaw that a trajectory in a slot may have, -1 where all coefficients are zero.
-    (4,)"""
-
-    @property
-    def trajectories(self) -> Trajectory:
-        """The trajectories in all slots, with a leading axis over slots."""
-        return Trajectory(self.ends, self.coefficients, self.repeats)
-
-    def setpoint(self, t: Array) -> Setpoint:
-        """Return the setpoint of one drone at a time of its world, s. ()"""
-        rate = self.rate[0]
-        return self.trajectories.evaluate_at_rate(self.index[0], (t - self.start[0]) * rate, rate, self.degrees)
-
-
-class Follow(Plugin):
+class Follow(Plugin, replaces=("state commands",)):
     """State commands from trajectories, each drone with its own trajectory, start and rate.
 
     At every tick of the state controller the plugin stages the setpoint of that time. A drone waits at the first point
@@ -71,29 +41,34 @@ class Follow(Plugin):
     ``Sim(control="state")``.
     """
 
-    trajectories: Trajectory | Sequence[Trajectory]
-    """Trajectories in the first slots: one trajectory, a sequence of them, or a ``Trajectory`` with a leading axis."""
-    index: ArrayLike | None = parameter(default=None, low=0, dtype=np.int32)
-    """Slot that a drone follows; with None, drone i follows trajectory i modulo the number of trajectories. (),
-    (n_drones,) or (n_worlds, n_drones)"""
-    start: ArrayLike = parameter(default=0.0)
+    trajectories: Trajectory | Sequence[Trajectory] = dataclasses.field(metadata={"static": True, "keep": False})
+    """Trajectories in the first slots: one trajectory, a sequence of them, or a ``Trajectory`` with a leading axis.
+    None in the data, which has ``slots``."""
+    index: Param = param(default=None, low=0, dtype=np.int32)
+    """Slot that a drone follows; with None, drone i follows trajectory i modulo the number of trajectories. (1,)"""
+    start: Param = param(default=0.0)
     """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
-    its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
-    rate: ArrayLike = parameter(default=1.0, positive=True)
-    """Factor of the speed along the trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
+    its trajectory at the reset: with -2 and a rate of 1, at 2 s. Also (n_drones,) as a setting. (1,)"""
+    rate: Param = param(default=1.0, positive=True)
+    """Factor of the speed along the trajectory, 1: with 2 a drone takes half the time. (1,)"""
     n_slots: int | None = setting(default=None, low=1)
     """Number of slots; None for one per trajectory. Additional slots hold the first trajectory until ``upload``."""
     max_pieces: int | None = setting(default=None, low=1)
     """Largest number of pieces of a trajectory in a slot; None for the largest number among ``trajectories``."""
     visible: bool = True
     """True to draw the path ahead and the setpoint of every drone."""
+    ends: Array = derived(("slots", "pieces"), scope="shared")
+    """End of each piece of the trajectory in each slot, s since its start. (n_slots, max_pieces)"""
+    coefficients: Array = derived(("slots", "pieces", 4, "coefficients"), scope="shared")
+    """Coefficients as in ``Trajectory``. (n_slots, max_pieces, 4, degree + 1)"""
+    repeats: Array = derived(("slots",), scope="shared")
+    """True where a trajectory starts again after its end. (n_slots,)"""
+    degrees: tuple[int, ...] = dataclasses.field(default=(), kw_only=True, repr=False)
+    """Largest degrees of x, y, z and yaw that a trajectory in a slot may have, -1 where all coefficients are zero; set
+    by ``bind``. (4,)"""
     name: str = "follow"
 
-    @property
-    def replaced_terms(self) -> tuple[str, ...]:
-        return ("state commands",)
-
-    def record(self, sim: Simulation) -> FollowData:
+    def bind(self, sim: Simulation) -> Follow:
         if sim.data.controls.state is None:
             raise ConfigError(
                 f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
@@ -114,7 +89,8 @@ class Follow(Plugin):
         if self.index is None and len(trajectories) > 1 and sim.n_drones > 1:
             index = np.broadcast_to(np.arange(sim.n_drones) % len(trajectories), (sim.n_worlds, sim.n_drones))
         ends, coefficients, repeats = (device_array(x, x.dtype) for x in jax.tree.leaves(slots))
-        return FollowData(
+        return self.with_arrays(
+            sim,
             ends=ends,
             coefficients=coefficients,
             repeats=repeats,
@@ -124,9 +100,14 @@ class Follow(Plugin):
             degrees=(slots.degree,) * 4 if has_room else slots.degrees(),
         )
 
+    @property
+    def slots(self) -> Trajectory:
+        """The trajectories in all slots, with a leading axis over slots."""
+        return Trajectory(self.ends, self.coefficients, self.repeats)
+
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        stage_at_ticks = stage("drone", when=lambda data: is_tick(data, data.controls.state.freq))
-        return [StagePlacement(stage_at_ticks(self.stage_setpoint), before="state_controller")]
+        stage_at_ticks = self.stage(self.stage_setpoint, when=lambda data: is_tick(data, data.controls.state.freq))
+        return [StagePlacement(stage_at_ticks, before="state_controller")]
 
     def stage_setpoint(self, data: SimData) -> SimData:
         """Stage the setpoint of one drone."""
@@ -135,7 +116,12 @@ class Follow(Plugin):
 
     def setpoint(self, data: SimData) -> Setpoint:
         """Return the setpoint of one drone now."""
-        return self.read(data).setpoint(data.core.steps / data.core.freq)
+        return self.read(data).setpoint_at(data.core.steps / data.core.freq)
+
+    def setpoint_at(self, t: Array) -> Setpoint:
+        """Return the setpoint of one drone at a time of its world, s; of the plugin in ``data.plugins``. ()"""
+        rate = self.rate[0]
+        return self.slots.evaluate_at_rate(self.index[0], (t - self.start[0]) * rate, rate, self.degrees)
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the errors of position, m, and velocity, m/s: desired minus actual, world frame. (3,) each"""
@@ -255,7 +241,7 @@ def _replace_slot(old_arrays: list[Array], new_arrays: list[Array], slot: Array)
 
 
 @jax.jit
-def _future_paths(record: FollowData, slot_values: list[Array], times: Array) -> Array:
+def _future_paths(record: Follow, slot_values: list[Array], times: Array) -> Array:
     """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)
 
     Args:
@@ -266,6 +252,6 @@ def _future_paths(record: FollowData, slot_values: list[Array], times: Array) ->
 
     def drone_path(index: Array, start: Array, rate: Array) -> Array:
         drone_record = record.replace(index=index, start=start, rate=rate)
-        return jax.vmap(lambda t: drone_record.setpoint(t).pos)(times)
+        return jax.vmap(lambda t: drone_record.setpoint_at(t).pos)(times)
 
     return jax.vmap(drone_path)(*slot_values)

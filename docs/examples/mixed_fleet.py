@@ -80,7 +80,7 @@ def build(n_worlds):
 def tracking_errors(data):
     """Return the distances of drones, or of their load, and of cars from their paths, m. (n_worlds, 5)"""
     follow, time = data.plugins["follow"], data.core.steps[:, :1] / data.core.freq
-    goal = jax.vmap(jax.vmap(follow.trajectories.evaluate_one))(follow.index[..., 0], time - follow.start[..., 0]).pos
+    goal = jax.vmap(jax.vmap(follow.slots.evaluate_one))(follow.index[..., 0], time - follow.start[..., 0]).pos
     body = data.states.pos.at[:, 2].set(data.plugins["load"].pos[:, 2])
 
     def off_path(car, index, arc, pos):
