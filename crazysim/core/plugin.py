@@ -348,10 +348,6 @@ Requirement = type | Callable[[Simulation, Any], None]
 """A class of plugins, one of which must be added too, or a function that raises an error."""
 
 
-def _is_kept(kind: type, name: str) -> bool:
-    return kind.__dataclass_fields__[name].metadata.get("keep", True)  # type: ignore[attr-defined]
-
-
 @dataclass_transform(
     frozen_default=True,
     eq_default=False,
@@ -422,12 +418,13 @@ class Plugin(PyTree):
             sim: The simulation.
             values: Values of fields. If a value is None, the user's number is still checked.
         """
-        statics = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
-        for name, value in statics.items():
-            if isinstance(value, list) and name not in values:
+        kept = [f.name for f in dataclasses.fields(self) if f.metadata.get("static") and f.metadata.get("keep", True)]
+        for name in kept:
+            value = values.get(name, getattr(self, name))
+            if isinstance(value, list):
                 values[name] = value = tuple(value)
             try:
-                hash(values.get(name, value) if _is_kept(type(self), name) else None)
+                hash(value)
             except TypeError:
                 raise ConfigError(
                     f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "

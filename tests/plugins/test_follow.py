@@ -149,6 +149,7 @@ def test_resets_restore_slots_starts_and_indices():
     sim = build()
     plugin = sim.add(Follow([EIGHT, UP], start=START))
     before = sim.data.plugins["follow"]
+    assert before.trajectories is None
     plugin.upload(sim, 0, hover())
     record = sim.data.plugins["follow"]
     later, first = np.asarray(record.start) + 1, np.zeros_like(record.index)
