@@ -189,7 +189,7 @@ def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> 
         render_mode: Mode of ``render``.
         options: Options of ``crazysim.envs.make``, such as ``n_drones``.
     """
-    return DroneParallelEnv(make(task, 1, **options), render_mode)
+    return DroneParallelEnv(make(task, options.pop("n_worlds", 1), **options), render_mode)
 
 
 def _box(shape: tuple[int, ...], limit: float, dtype: DTypeLike) -> gymnasium.spaces.Box:

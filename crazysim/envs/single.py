@@ -96,4 +96,4 @@ def make_single(task: str, render_mode: str | None = None, **options: Any) -> Dr
         render_mode: Mode of ``render``.
         options: Options of ``crazysim.envs.make``.
     """
-    return DroneSingleEnv(make(task, 1, **options), render_mode)
+    return DroneSingleEnv(make(task, options.pop("n_worlds", 1), **options), render_mode)

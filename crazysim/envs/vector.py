@@ -229,6 +229,8 @@ def make_vector(
         render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
     """
+    if "n_worlds" in options:
+        raise ConfigError(f"expected num_envs, got n_worlds={short_repr(options['n_worlds'])}. Use num_envs alone.")
     if max_episode_steps is not None:
         if "seconds" in options:
             raise ConfigError(

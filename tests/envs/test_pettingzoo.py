@@ -125,6 +125,8 @@ def test_wrong_actions_are_refused(env):
 def test_wrong_settings_are_refused(drone_env):
     with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
         DroneParallelEnv(make("hover", 2))
+    with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
+        make_parallel("hover", n_worlds=2)
     with pytest.raises(ConfigError, match="without AutoReset"):
         DroneParallelEnv(AutoReset(drone_env))
     with pytest.raises(ConfigError, match="got 'ascii'"):

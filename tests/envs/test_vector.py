@@ -216,6 +216,7 @@ def test_wrong_resets_are_errors(next_step, kwargs, error, message):
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"color": "red"}, "effects, randomize, camera, depth_image, sim_freq; the simulation has"),
         ({"n_world": 2}, "did you mean n_worlds"),
+        ({"n_worlds": 4}, "expected num_envs, got n_worlds=4"),
         ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
         ({"seconds": 2.0, "max_episode_steps": 5}, "expected max_episode_steps or seconds, got 5 and 2.0: both"),
         ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
@@ -359,6 +360,8 @@ def test_one_world_is_an_environment_that_gymnasium_accepts():
         env.reset(options={"reset_mask": [True]})
     with pytest.raises(ConfigError, match=r"Use gymnasium\.make_vec"):
         DroneSingleEnv(make("hover", 2))
+    with pytest.raises(ConfigError, match=r"Use gymnasium\.make_vec"):
+        gymnasium.make(ID, n_worlds=2)
 
 
 def test_several_drones_have_an_axis_and_share_their_mean_reward():
