@@ -231,7 +231,8 @@ def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
         if body < 0 or mj_model.body_mocapid[body] < 0:
             raise ConfigError(
-                f"expected a mocap body {name!r}, got none. Edits of sim.spec must leave it in the scene."
+                f"expected a mocap body {name!r}, got none. Edits of sim.spec must leave drones and objects with poses "
+                f"in the scene. Use set_pose of its handle to move an object away, or add it with mocap=False."
             )
         ids.append(int(mj_model.body_mocapid[body]))
     return ids

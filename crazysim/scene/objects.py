@@ -209,7 +209,7 @@ class SceneObjects:
             raise ConfigError(f"expected a non-empty string as name of an object, got {short_repr(name)}")
         numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
-        used_names = sorted({body.name for body in spec.bodies} & {name, *names})
+        used_names = sorted({*self.movable, *(body.name for body in spec.bodies)} & {name, *names})
         if used_names or name == "drone":
             raise ConfigError(
                 f"expected a new name, got {(used_names or ['drone:0'])[0]!r}, a body of the scene. Pass name=."

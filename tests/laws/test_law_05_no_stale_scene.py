@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from crazysim import SlungLoad
+from crazysim import ConfigError, SlungLoad
 from crazysim.core import functional as F
 from crazysim.engine import Step
 from crazysim.scene import mjx_scene
@@ -500,6 +500,18 @@ def test_a_spec_that_lost_a_drone_is_refused_by_name():
     sim.scene.add("box")
     with pytest.raises(ValueError, match="expected mocap body 'drone:1' in the spec, got none"):
         _ = sim.data
+
+
+def test_a_spec_that_lost_an_object_with_poses_is_refused_and_keeps_its_name():
+    sim = Sim()
+    ball = sim.scene.add("sphere", "ball", pos=[1, 0, 0])
+    sim.step()
+    sim.spec.delete(sim.spec.body("ball:0"))
+    with pytest.raises(ConfigError, match=r"'ball:0'.* Use set_pose of its handle .* mocap=False"):
+        sim.build_mjx()
+    with pytest.raises(ConfigError, match="expected a new name, got 'ball:0'"):
+        sim.scene.add("sphere", "ball", pos=[-1, 0, 0])
+    np.testing.assert_array_equal(ball.pose(sim.data)[0], [[[1, 0, 0]]])
 
 
 def test_drawing_one_world_allocates_nothing_for_the_others(opengl, syncs):
