@@ -135,7 +135,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             for other in others:
                 if error := self._unmet_need(other):
                     raise ConfigError(
-                        f"expected no plugin that needs {name!r}, got {type(other).__name__} {other.name!r}: {error} "
+                        f"expected no plugin that needs {name!r}, got {type(other).__name__} {other.name!r}. "
                         f"Use sim.remove({other.name!r}) first."
                     ) from error
             self._build(pipeline, resets)
