@@ -131,7 +131,12 @@ def identify_attitude(
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
     if flight_mass != base_mass:
         tables["rigid_body"] = {"mass": flight_mass}
-        lines += ["", "[rigid_body]", f'mass = {{ value = {flight_mass}, unit = "kg", source = "flights" }}']
+        lines += [
+            'given = "not fitted: the mass that was passed to identify"',
+            "",
+            "[rigid_body]",
+            f'mass = {{ value = {flight_mass}, unit = "kg", source = "given" }}',
+        ]
     lines += ["", f"[fitted.{dynamics}]"]
     lines += [f'{k} = {{ value = {x}, unit = "{PARAMETER_UNITS[k]}", source = "flights" }}' for k, x in table.items()]
     lines += ["", "# Standard deviations:"]

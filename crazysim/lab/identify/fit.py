@@ -119,7 +119,13 @@ class Identification:
             "drag.coefficients": "N s/m", "controller.thrust2torque": "m",
             "residual.linear": "N and N m per input", "residual.hidden": "1 per input", "residual.output": "N and N m",
         }  # fmt: skip
-        lines = [f"base = {json.dumps(self.base)}", "", "[sources]", f"flights = {json.dumps(source)}"]
+        lines = [
+            f"base = {json.dumps(self.base)}",
+            "",
+            "[sources]",
+            f"flights = {json.dumps(source)}",
+            'given = "not fitted: the mass that was passed to identify, or else that of the base"',
+        ]
         if self.doubtful:
             lines.insert(
                 0, f"# Doubtful, less than 1/3 or more than 3 times the base's value: {', '.join(self.doubtful)}."
@@ -132,7 +138,10 @@ class Identification:
                 lines += ["", f"[{table}]"]
             rounded_values = [float(f"{x:.6g}") for x in value.ravel()]
             numbers = np.reshape(rounded_values, value.shape).tolist()
-            lines.append(f'{key} = {{ value = {numbers}, unit = "{units[path]}", source = "flights" }}')
+            lines.append(
+                f'{key} = {{ value = {numbers}, unit = "{units[path]}", '
+                f'source = "{"given" if path == "rigid_body.mass" else "flights"}" }}'
+            )
         lines += ["", "# Every parameter with its standard deviation."]
         lines += [f"# {line}" for line in self.describe()]
         return "\n".join(lines) + "\n"

@@ -136,7 +136,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
     if len(content) < 9 or content[0] != 0xBC:
         raise ConfigError(
             f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
-            "Tables need the ending .csv or .npz."
+            "Tables need the ending .csv or .npz, PX4's logs .ulg, ROS bags .bag, .mcap or .db3."
         )
     version, n_events = struct.unpack_from("<HH", content, 1)
     if version not in (1, 2):

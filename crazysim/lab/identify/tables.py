@@ -74,12 +74,12 @@ def _read_source(
             f"export it from the Blackbox Explorer."
         )
     with wrap_read_errors(path.name, "a log of a flight", "Copy or export it again."):
-        if path.suffix == ".ulg":
+        if path.suffix.lower() == ".ulg":
             return path.stem, read_ulog(path, repairs)
-        if path.suffix == ".npz":
+        if path.suffix.lower() == ".npz":
             with path.open("rb") as file:
                 table = read_arrays(file, path.name)
-        elif path.suffix != ".csv":
+        elif path.suffix.lower() != ".csv":
             return path.stem, read_crazyflie(path, repairs, columns)
         elif find_header(path) is not None:
             return path.stem, read_blackbox(path, repairs)

@@ -135,6 +135,7 @@ def test_command_writes_an_airframe(flights, tmp_path, capsys):
     sim.add(Residual())
     assert sim.data.plugins["residual"].output.shape == (6, 4)
     assert load_airframe(out).value("rigid_body.mass") == load_airframe("cf21B_500").value("rigid_body.mass")
+    assert re.search(r"^mass = .*source = \"given\"", out.read_text(), re.MULTILINE)
     np.testing.assert_allclose(load_airframe(out).value("rotors.lag"), [25, 0, 25, 0], rtol=0.05)
 
 

@@ -64,7 +64,7 @@ def test_names_of_crazyflow_find_the_parameters(flight):
 def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
     path, out, plot = tmp_path / "flight.npz", tmp_path / "mine.toml", tmp_path / "errors.png"
     np.savez(path, **flight)
-    options = ["--airframe", "cf2x_L250", "--dynamics", MODEL, "--out", str(out)]
+    options = ["--airframe", "cf2x_L250", "--dynamics", MODEL, "--mass", "0.033", "--out", str(out)]
     assert main(["identify", str(path), *options, "--test", str(path), "--plot", str(plot)]) == 0
     printed = capsys.readouterr().out
     assert "held-out logs, cf2x_L250\n" in printed
@@ -73,6 +73,7 @@ def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
     mine, base = load_airframe(out), load_airframe("cf2x_L250")
     for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef"):
         np.testing.assert_allclose(mine.value(f"fitted.{MODEL}.{key}"), base.value(f"fitted.{MODEL}.{key}"), rtol=0.02)
+    assert 'mass = { value = 0.033, unit = "kg", source = "given" }' in out.read_text()
     Sim(drone=out, dynamics=MODEL, control="attitude").step()
 
 

@@ -117,6 +117,7 @@ def test_ulogs_lack_what_is_not_logged_or_slow(tmp_path):
         read_log(write_ulog(tmp_path / "b.ulg", slow=["vehicle_attitude"]))
     with pytest.raises(ConfigError, match="expected messages vehicle_attitude, got esc_status"):
         read_log(write_ulog(tmp_path / "c.ulg", ["vehicle_attitude"]))
+    assert read_log((tmp_path / "a.ulg").rename(tmp_path / "A.ULG")).t.shape == log.t.shape
     (tmp_path / "d.ulg").write_bytes(b"no ULog")
     with pytest.raises(ConfigError, match="expected a ULog"):
         read_log(tmp_path / "d.ulg")
