@@ -87,8 +87,8 @@ class Interface:
             )
         if None not in (self.task_code, other.task_code) and self.task_code != other.task_code:
             warn(
-                f"the code of task {self.task!r} differs from that of the policy's training: observations may have "
-                f"other units or contents under the same names"
+                "the code of the task differs from that of the policy's training: observations may have other units or "
+                "contents under the same names"
             )
         if not self.has_ranges_of(other):
             warn(f"actions of {source} have other ranges than in the policy's training, as of another drone")

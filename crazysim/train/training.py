@@ -511,7 +511,7 @@ def load_policy(
     """
     folder = as_path(folder)
     if folder.is_file():
-        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {folder.parent}.")
+        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {str(folder.parent)!r}.")
     path = folder / POLICY_FILE
     if not path.exists() and (folder / TABLE_FILE).exists():
         names = [row["name"] for row in json.loads(read_text(folder / TABLE_FILE, MAX_TEXT_BYTES))]

@@ -672,7 +672,7 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
         (["export", folder], "--onnx FILE, --c FILE"),
         (["export", folder, "--c", "policy.txt"], "ends with .h, got 'policy.txt'"),
         (["export", folder, "--onnx", "policy.h"], "ends with .onnx, got 'policy.h'"),
-        (["evaluate", f"{folder}/policy.npz"], f"got the file '{folder}/policy.npz'. Use {folder}."),
+        (["evaluate", f"{folder}/policy.npz"], f"got the file '{folder}/policy.npz'. Use '{folder}'."),
         (["evaluate", folder, "--task", str(task_file)], "no vel 3, height 1 in addition. Use"),
     ):
         assert main(arguments) == 2
