@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.data import SimData, SimState, SimStateDeriv
 from crazysim.core.influence import apply_constraint, apply_influence, plugin_rates
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import Stage, vmap_drones
@@ -22,6 +23,8 @@ R = TypeVar("R", bound=PyTree)
 DerivFn = Callable[[SimData], SimStateDeriv]
 """Function from data to the time derivative of the states."""
 
+FLOOR_HEIGHT = -0.001
+"""Height above the ground at which drones stop, m: slightly below zero, so that a negative height means a landing."""
 MAX_ROTATION = 1.0
 """Largest rotation per step about a body axis, rad. Angular velocities are limited to ``MAX_ROTATION * freq``.
 
@@ -47,6 +50,22 @@ class Integrator(StrEnum):
     def order(self) -> int:
         """Order of convergence."""
         return 4 if self == Integrator.rk4 else 1
+
+
+def hold_on_ground(s: SimState, deriv: SimStateDeriv, ground: Array | float) -> SimStateDeriv:
+    """Return the derivative in which drones that stand on the ground and do not lift off have no acceleration.
+
+    Integrators that move positions with the velocities of the same step need it. Explicit Euler moves positions with
+    the velocities of the previous step, which the stage that stops drones at the ground has set to zero.
+
+    Args:
+        s: States.
+        deriv: Their derivative.
+        ground: Height of the ground, world frame, m. (..., 1)
+    """
+    is_on_ground = (s.pos[..., 2:] == ground) | (s.pos[..., 2:] == ground + FLOOR_HEIGHT)
+    is_standing = is_on_ground & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
+    return deriv.replace(acc=jnp.where(is_standing, 0.0, deriv.acc), ang_acc=jnp.where(is_standing, 0.0, deriv.ang_acc))
 
 
 def euler(data: SimData, deriv_fn: DerivFn) -> SimData:
@@ -134,10 +153,16 @@ class Integration:
     """Derivative of the drones' states."""
     plugins: tuple[Plugin, ...] = ()
     """Plugins with influences, derivatives or a constraint, in the order in which they are applied."""
+    ground: Callable[[SimData], Array | float] | None = None
+    """Height of the ground on which drones stand, world frame, m; None without ground."""
 
     def __call__(self, data: SimData) -> SimData:
         """Return the data one step later."""
         return self.method(data, self.derivative)
+
+    def on(self, ground: Callable[[SimData], Array | float] | None) -> Integration:
+        """Return the integration of drones that stand on a ground."""
+        return self if ground is self.ground else replace(self, ground=ground)
 
     @property
     def couples_world(self) -> bool:
@@ -164,6 +189,8 @@ class Integration:
         for plugin in self.plugins:
             data = apply_influence(plugin, data)
         deriv = self.deriv_fn(data)
+        if self.ground is not None and self.method is not euler:
+            deriv = hold_on_ground(data.states, deriv, self.ground(data))
         drone_plugins = [plugin for plugin in self.plugins if plugin.scope == "drone"]
         plugin_derivs = {plugin.name: rates for plugin in drone_plugins if (rates := plugin_rates(plugin, data))}
         return data, deriv.replace(plugins=plugin_derivs) if plugin_derivs else deriv

@@ -62,15 +62,17 @@ class Stage:
         trace_once: bool = False,
         unfused_reason: str = "it is not declared for one drone or one world",
         phase: Phase = "each",
+        ground: Callable[..., Array | float] | None = None,
     ):
         """Declare a stage; see ``stage``.
 
         ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that their
         operations are the same in all simulations and do not depend on ``n_worlds`` and ``n_drones``, so that an engine
         traces them only once in a process. ``unfused_reason`` is the reason for the scope ``"batch"``, for messages.
+        ``ground`` is a function from the same data to the height of the ground at which the stage stops drones, m.
         """
         self.fn, self.when, self.batched, self.trace_once = fn, when, batched, trace_once
-        self.unfused_reason = unfused_reason
+        self.unfused_reason, self.ground = unfused_reason, ground
         self.scope: StageScope = scope
         self.phase: Phase = phase
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
@@ -174,10 +176,21 @@ def is_first_step(data: Any) -> Array:
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages with the names in the pipeline.
 
-    A function without a declared scope receives the full batch.
+    A function without a declared scope receives the full batch. The integration holds drones on the ground at which a
+    stage of this pipeline stops them.
     """
+    ground = next((x for fn in pipeline.values() if (x := getattr(fn, "ground", None))), None)
     return [
-        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.trace_once, fn.unfused_reason, fn.phase)
+        Stage(
+            fn.fn.on(ground) if hasattr(fn.fn, "on") else fn.fn,
+            fn.scope,
+            fn.when,
+            fn.batched,
+            name,
+            fn.trace_once,
+            fn.unfused_reason,
+            fn.phase,
+        )
         if isinstance(fn, Stage)
         else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,20 +14,19 @@ from crazysim.control import Control, Controller, force_torque2rotor_vel
 from crazysim.control.protocol import controller_chain
 from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
-from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
+from crazysim.core.integration import FLOOR_HEIGHT, INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage, StageScope, is_tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import n_batch_axes, scopes, select_worlds
 
-FLOOR_HEIGHT = -0.001
-"""Height of the floor, at which drones stop, m. It is slightly below zero: a negative height means a landed drone."""
 
-
-def _built_in_stage(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
+def _built_in_stage(
+    scope: StageScope, when: Callable[[SimData], Array | None] | None = None, **options: Any
+) -> Callable[..., Stage]:
     """Return a decorator that declares a built-in stage; the decorated function accepts any leading axes."""
-    return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True)
+    return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True, **options)
 
 
 def _rate_condition(level: str) -> Callable[[SimData], Array | None]:
@@ -53,9 +53,7 @@ def build_step_pipeline(
         deriv_fn = fitted_derivative
     elif integrator.order == 1:
         deriv_fn = first_principles_euler_derivative
-    if integrator != Integrator.euler:
-        deriv_fn = hold_on_floor(deriv_fn)
-    stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn).stage()
+    stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn, ground=clip_floor_pos.ground).stage()
     stages["clip_floor_pos"] = clip_floor_pos
     stages["increment_steps"] = increment_steps
     return stages
@@ -118,44 +116,29 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     return SimStateDeriv(vel=vel, ang_vel=s.ang_vel, acc=acc, ang_acc=ang_acc, rotor_acc=rotor_acc)
 
 
-@functools.cache  # the same function for equal derivatives, so that they share a trace
-def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
-    """Return a derivative function in which a drone that stands on the floor and does not lift off has no acceleration.
+def stop_at_ground(s: SimState, ground: Array | float) -> SimState:
+    """Return the states in which drones that have come down to the ground are at rest, ``FLOOR_HEIGHT`` above it.
 
-    Integrators that move positions with the velocities of the same step need it. Explicit Euler moves positions with
-    the velocities of the previous step, which ``clip_floor_pos`` has set to zero.
-    """
-
-    def derivative_on_floor(data: SimData) -> SimStateDeriv:
-        s, deriv = data.states, deriv_fn(data)
-        is_standing = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
-        return deriv.replace(
-            acc=jnp.where(is_standing, 0.0, deriv.acc), ang_acc=jnp.where(is_standing, 0.0, deriv.ang_acc)
-        )
-
-    return derivative_on_floor
-
-
-def stop_at_surface(s: SimState, surface_height: Array | float) -> SimState:
-    """Return the states in which drones that are below a surface, or on it and not rising, are at rest on it.
+    Drones that stand at the height of the ground itself, such as those at their start, stay there.
 
     Args:
         s: States.
-        surface_height: Height of the surface, world frame, m. (..., 1)
+        ground: Height of the ground, world frame, m. (..., 1)
     """
     height, climb_rate = s.pos[..., 2:], s.vel[..., 2:]
-    is_stopped = (height < surface_height) | ((height == surface_height) & (climb_rate <= 0))
+    rest_height = jnp.where(height == ground, ground, ground + FLOOR_HEIGHT)
+    is_stopped = (height < rest_height) | ((height == rest_height) & (climb_rate <= 0))
     return s.replace(
-        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, surface_height)], axis=-1),
+        pos=jnp.concatenate([s.pos[..., :2], jnp.where(is_stopped, rest_height, height)], axis=-1),
         vel=jnp.where(is_stopped, 0.0, s.vel),
         ang_vel=jnp.where(is_stopped, 0.0, s.ang_vel),
     )
 
 
-@_built_in_stage("drone")
+@_built_in_stage("drone", ground=lambda _: 0.0)
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor."""
-    return data.replace(states=stop_at_surface(data.states, FLOOR_HEIGHT))
+    return data.replace(states=stop_at_ground(data.states, 0.0))
 
 
 @_built_in_stage("world")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import leaf_on_host, needs_compiler, trees_equal
+from cases import leaf_on_host, needs_compiler, trees_equal, with_states
 
 from crazysim import Cars, Downwash, Sim
 from crazysim.core.sharding import world_mesh
@@ -18,10 +18,16 @@ pytestmark = needs_compiler
 COMMAND = np.full((3, 2, 4), 0.1)
 
 
+def build_falling_sim():
+    sim = Sim(3, 2, control="attitude")
+    sim.data = with_states(sim.data, pos=[0, 0, 5.0])
+    sim.attitude_control(COMMAND)
+    return sim
+
+
 @pytest.fixture
 def sim():
-    sim = Sim(3, 2, control="attitude")
-    sim.attitude_control(COMMAND)
+    sim = build_falling_sim()
     sim.step(2)
     assert sim.step_fn.plan(sim.data).host_call.was_called
     return sim
@@ -36,6 +42,7 @@ def step_on_xla(sim, n):
 @pytest.mark.parametrize("n_drones", [1, 2])
 def test_host_calls_give_the_numbers_of_the_compiled_step(n_worlds, n_drones):
     sim = Sim(n_worlds, n_drones, control="state")
+    sim.data = with_states(sim.data, pos=[0, 0, 5.0])
     for _ in range(3):
         expected = step_on_xla(sim, 7)
         sim.step(7)
@@ -66,6 +73,7 @@ def test_two_threads_of_python_may_step_at_once():
     """One caller uses the threads of the kernel; the other caller runs without threads."""
     sims = [Sim(4000, control="attitude") for _ in range(2)]
     for sim in sims:
+        sim.data = with_states(sim.data, pos=[0, 0, 5.0])
         sim.step()
     expected = step_on_xla(sims[0], 60)
     threads = [threading.Thread(target=sim.step, args=(60,)) for sim in sims]
@@ -148,8 +156,7 @@ def test_a_record_that_was_not_read_can_be_copied(sim):
 
 @pytest.mark.parametrize("field", ["states", "params", "controls"])
 def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim, field):
-    twin = Sim(3, 2, control="attitude")
-    twin.attitude_control(COMMAND)
+    twin = build_falling_sim()
     twin.step(2)
     sim.step()
     twin.step()

@@ -24,7 +24,7 @@ from cases import (
 )
 
 from crazysim import ConfigError, PyTree, Sim, leaf
-from crazysim.core.stages import FLOOR_HEIGHT
+from crazysim.core.integration import FLOOR_HEIGHT
 from crazysim.pytree import n_batch_axes, scopes
 
 

@@ -23,7 +23,7 @@ from cases import (
 )
 
 from crazysim import Drone, Sim, load_airframe
-from crazysim.core.stages import FLOOR_HEIGHT
+from crazysim.core.integration import FLOOR_HEIGHT
 from crazysim.dynamics import supported_dynamics
 
 SQRT_HALF = np.sqrt(0.5)

@@ -15,11 +15,11 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.settings import as_rgba, color, setting
 from crazysim.core.stage import Stage
-from crazysim.core.stages import FLOOR_HEIGHT, stop_at_surface
+from crazysim.core.stages import stop_at_ground
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON
-from crazysim.plugins.effects.ground import TerrainData, ground_height
+from crazysim.plugins.effects.ground import TerrainData, ground_below, ground_height
 from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
@@ -71,13 +71,13 @@ class Terrain(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
-        stop_stage = Stage(self.stop_drones, scope, batched=True, unfused_reason=UNFUSED_REASON)
+        stop_stage = Stage(self.stop_drones, scope, batched=True, unfused_reason=UNFUSED_REASON, ground=ground_below)
         return [StagePlacement(stop_stage, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop_drones(self, data: SimData) -> SimData:
         """Return the data with drones that are below the ground, or on it and not rising, on the ground at rest."""
         ground = ground_height(data, data.states.pos)
-        states = stop_at_surface(data.states, ground + FLOOR_HEIGHT)
+        states = stop_at_ground(data.states, ground)
         return self.write(data.replace(states=states), self.read(data).replace(height_below=ground))
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

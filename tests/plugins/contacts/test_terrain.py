@@ -10,8 +10,8 @@ from cases import with_states
 from pictures import encode_png
 
 from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, RangeFinder, Sim, SlungLoad, Terrain, Wind
+from crazysim.core.integration import FLOOR_HEIGHT, Integrator
 from crazysim.core.pipeline import remove_fn
-from crazysim.core.stages import FLOOR_HEIGHT
 from crazysim.plugins.contacts import terrain as terrain_module
 from crazysim.plugins.effects.ground import ground_at, ground_height
 
@@ -90,6 +90,19 @@ def test_drones_land_on_terrain_and_take_off():
     np.testing.assert_allclose(
         plugin.read(sim.data).height_below, ground_height(sim.data, sim.data.states.pos), rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("integrator", list(Integrator))
+def test_a_drone_stands_where_the_terrain_is_and_falls_where_it_is_lower(integrator):
+    sim = Sim(integrator=integrator)
+    sim.data = with_states(sim.data, pos=[0.3, 0.2, 0.0], force=[0.1, 0, 0])
+    sim.build_default_data()
+    sim.add(Terrain(flat(0.0), SIZE, floor=False))
+    sim.step(50)
+    np.testing.assert_array_equal(sim.data.states.pos, sim.default_data.states.pos)
+    sim.replace(Terrain(flat(-2.0), SIZE, floor=False))
+    sim.step(100)
+    assert float(sim.data.states.pos[0, 0, 2]) < -0.15  # g t^2 / 2 = 0.196 m, less drag
 
 
 def test_law_07_nothing_breaks_at_the_border_of_the_terrain():
