@@ -14,7 +14,7 @@ from crazysim.engine.ir.program import Segment
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.pytree import PyTree, leaf, leaf_indices
+from crazysim.pytree import PyTree, leaf
 
 SCALAR = jax.ShapeDtypeStruct((), np.float32)
 
@@ -46,7 +46,6 @@ def step():
         lower_stages(
             as_stages(sim.step_pipeline),
             sim.data,
-            watched=dict.fromkeys(jax.tree.leaves(leaf_indices(sim.data).states), True),
         )
     )
     leaves = jax.tree.leaves(sim.data)

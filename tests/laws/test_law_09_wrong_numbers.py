@@ -86,7 +86,7 @@ NEVER_NEGATIVE = re.compile(
 """Names of quantities that are at least zero."""
 
 
-UNCHECKED = ["Bicycles.members", "Cars.members", "FreeBodies.members", "Twin.fixed"]
+UNCHECKED = ["Bicycles.members", "Cars.members", "Follow.degrees", "FreeBodies.members", "Twin.fixed"]
 """Settings whose annotation mixes numbers with other types; their classes check them."""
 
 
