@@ -378,7 +378,7 @@ def test_only_one_module_goes_beyond_the_public_interface():
         if path.name != "jaxcompat.py" and word in path.read_text()
     }
     # Methods of ours by that name, for the tests of law 6 of CONTRIBUTING.md, no silent retrace.
-    assert result == {"engine/step.py: _cache_size", "engine/backends/plain.py: _cache_size"}
+    assert result == {"engine/step.py: _cache_size", "sim/reset.py: _cache_size"}
 
 
 @pytest.mark.long("runs tests in another process")
@@ -387,7 +387,7 @@ def test_the_engine_runs_without_functions_that_jax_may_remove():
 
     The step runs in one kernel, split by an unfused stage, with each engine, and with commands.
     """
-    tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/engine/test_stepper.py"]
+    tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/sim/test_stepper.py"]
     chosen = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
             " or commands_to_flattened")  # fmt: skip
     done = subprocess.run(
