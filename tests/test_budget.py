@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 531,
     "dynamics": 593,
     "engine": 5804,
-    "envs": 3894,
+    "envs": 3896,
     "geometry": 1097,
     "lab": 9874,
     "media": 1010,
