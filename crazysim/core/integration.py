@@ -160,7 +160,7 @@ class Integration:
         """Return the data one step later."""
         return self.method(data, self.derivative)
 
-    def on(self, ground: Callable[[SimData], Array | float] | None) -> Integration:
+    def on_ground(self, ground: Callable[[SimData], Array | float] | None) -> Integration:
         """Return the integration of drones that stand on a ground."""
         return self if ground is self.ground else replace(self, ground=ground)
 

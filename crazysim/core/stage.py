@@ -179,10 +179,10 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     A function without a declared scope receives the full batch. The integration holds drones on the ground at which a
     stage of this pipeline stops them.
     """
-    ground = next((x for fn in pipeline.values() if (x := getattr(fn, "ground", None))), None)
+    ground = next((fn.ground for fn in pipeline.values() if isinstance(fn, Stage) and fn.ground is not None), None)
     return [
         Stage(
-            fn.fn.on(ground) if hasattr(fn.fn, "on") else fn.fn,
+            fn.fn.on_ground(ground) if hasattr(fn.fn, "on_ground") else fn.fn,
             fn.scope,
             fn.when,
             fn.batched,
