@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1197,
     "control": 2035,
-    "core": 1907,
+    "core": 1899,
     "crazysim": 1408,
     "drones": 531,
     "dynamics": 593,
@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1097,
     "lab": 9874,
     "media": 1010,
-    "plugins": 7336,
+    "plugins": 7332,
     "scene": 3153,
     "sim": 1236,
     "train": 2497,

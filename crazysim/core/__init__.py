@@ -14,7 +14,6 @@ from crazysim.core.plugin import (
     derived,
     param,
     parameter,
-    part,
     state,
 )
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
@@ -38,7 +37,6 @@ __all__ = [
     "map_batched",
     "param",
     "parameter",
-    "part",
     "prepend_fn",
     "remove_fn",
     "replace_fn",

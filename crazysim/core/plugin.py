@@ -1,7 +1,8 @@
 """Plugins: optional parts of a simulation, such as effects, sensors and logs, all added with ``sim.add``.
 
-A plugin is a frozen record of settings. Everything that changes, and every number that may be replaced without
-compiling the step again, is in its record, ``data.plugins[plugin.name]``. Most methods are written for one drone.
+A plugin is numbers, states and stages. ``data.plugins[plugin.name]`` has the same class with arrays, or the record that
+``record`` returns: everything that changes, and every number that may be replaced without compiling the step again.
+Most methods are written for one drone.
 """
 
 from __future__ import annotations
@@ -186,11 +187,6 @@ def derived(
     return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
 
 
-def part(default: PyTree) -> Any:
-    """Declare a record with numbers and states of its own, declared with ``param`` and ``state``."""
-    return dataclasses.field(default=default, metadata={"part": True})
-
-
 def _leaf_metadata(scope: Scope, core: CoreShape, **details: Any) -> dict[str, Any]:
     fixed_core = None if any(isinstance(n, str) for n in core) or scope == "shared" else core
     metadata = {"scope": scope, CORE_NDIM_KEY: len(core), "core": fixed_core, "shape": core}
@@ -209,23 +205,33 @@ def _declare_static_fields(cls: type) -> None:
             field = dataclasses.field(default=field)
             setattr(cls, name, field)
         metadata = {**inherited.get(name, {}), **field.metadata}
-        if not metadata.keys() & {"scope", "part", "static"}:
+        if not metadata.keys() & {"scope", "static"}:
             metadata["static"] = True
         field.metadata = MappingProxyType(metadata)
 
 
-def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
+def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike], core: CoreShape = ()) -> np.ndarray:
     """Return a quantity of the airframes for ``check_parameter``: one value for all drones, or one per drone.
 
     Args:
         sim: The simulation.
         get_number: Function from an airframe to a number or array. (*core)
+        core: Shape with ``"rotors"`` to pad the arrays with zeros for rotors that a drone lacks; other shapes change
+            nothing.
 
     Returns:
         (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
     """
     distinct_airframes = {id(airframe): airframe for airframe in sim.airframes}
     values = {key: np.asarray(get_number(airframe)) for key, airframe in distinct_airframes.items()}
+    if "rotors" in core:
+        n_rotors = sim.data.states.rotor_vel.shape[-1]
+        values = {
+            key: np.pad(
+                x, [(0, n_rotors - n if axis == "rotors" else 0) for n, axis in zip(x.shape, core, strict=True)]
+            )
+            for key, x in values.items()
+        }
     first_value = next(iter(values.values()))
     if len(distinct_airframes) == 1:
         return first_value
@@ -295,44 +301,14 @@ def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
-def bind_fields(sim: Simulation, record: R, **values: Any) -> R:
-    """Return a plugin, or a part of one, with arrays for the numbers and states that have no value yet.
-
-    Args:
-        sim: The simulation.
-        record: The plugin or part as the user wrote it.
-        values: Values of fields. If a value is None, the user's number is still checked.
-    """
-    bound = dict(values)
-    for field in dataclasses.fields(record):  # type: ignore[arg-type]
-        name, value = field.name, getattr(record, field.name)
-        if field.metadata.get("part"):
-            bound.setdefault(name, value if value is None else bind_fields(sim, value))
-        elif "scope" in field.metadata and values.get(name) is None:
-            bound.setdefault(name, _bind_leaf(sim, name, value, field.metadata))
-        elif not field.metadata.get("keep", True):
-            bound.setdefault(name, None)
-    return record.replace(**bound)
-
-
-def _airframe_number(airframe: Airframe, source: Any, shape: CoreShape, core: tuple[int, ...]) -> np.ndarray:
-    """Return a number of an airframe, zero for rotors that it lacks beside the other drones. ``core`` or ()"""
-    value = np.asarray(source(airframe) if callable(source) else airframe.value(source))
-    if "rotors" not in shape:
-        return value
-    return np.pad(
-        value, [(0, n - k if axis == "rotors" else 0) for n, k, axis in zip(core, value.shape, shape, strict=True)]
-    )
-
-
 def _bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any]) -> Array | None:
     """Return the array of a field for all worlds."""
-    shape, scope, dtype = metadata["shape"], metadata["scope"], metadata["dtype"] or sim.data.states.pos.dtype
-    n_rotors = sim.data.states.rotor_vel.shape[-1]
-    core = tuple([n_rotors if n == "rotors" else n for n in shape])
+    scope, dtype = metadata["scope"], metadata["dtype"] or sim.data.states.pos.dtype
+    core = tuple([sim.data.states.rotor_vel.shape[-1] if n == "rotors" else n for n in metadata["shape"]])
     declaration = metadata.get("setting", Setting())
     if value is None and (source := metadata.get("airframe")) is not None:
-        value = airframe_numbers(sim, lambda airframe: _airframe_number(airframe, source, shape, core))
+        get_number: Any = source if callable(source) else lambda airframe: airframe.value(source)
+        value = airframe_numbers(sim, get_number, metadata["shape"])
     if value is None and (metadata.get("optional") or "setting" in metadata):
         return None
     if scope == "shared":
@@ -351,7 +327,7 @@ Requirement = type | Callable[[Simulation, Any], None]
 @dataclass_transform(
     frozen_default=True,
     eq_default=False,
-    field_specifiers=(param, state, derived, part, parameter, setting, dataclasses.field),
+    field_specifiers=(param, state, derived, parameter, setting, dataclasses.field),
 )
 class Plugin(PyTree):
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
@@ -430,7 +406,14 @@ class Plugin(PyTree):
                     f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "
                     f"numbers with param(...), or use a tuple."
                 ) from None
-        return bind_fields(sim, self, is_bound=True, **values)
+        bound: dict[str, Any] = {"is_bound": True, **values}
+        for field in dataclasses.fields(self):
+            name = field.name
+            if "scope" in field.metadata and values.get(name) is None:
+                bound.setdefault(name, _bind_leaf(sim, name, getattr(self, name), field.metadata))
+            elif not field.metadata.get("keep", True):
+                bound.setdefault(name, None)
+        return self.replace(**bound)
 
     def bound(self, data: SimData) -> Self:
         """Return the plugin with the arrays of data of any scope; the plugin itself if it has none."""
@@ -474,8 +457,8 @@ class Plugin(PyTree):
 
     @classmethod
     def has_arrays(cls) -> bool:
-        """True if the class declares numbers, states or parts."""
-        return any(f.metadata.keys() & {"scope", "part"} for f in dataclasses.fields(cls))
+        """True if the class declares numbers or states."""
+        return any("scope" in f.metadata for f in dataclasses.fields(cls))
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return what ``data.plugins`` has for all worlds: the plugin with arrays, or None if it needs none.

@@ -505,6 +505,23 @@ class Undeclared(Plugin):
         return {"height": np.zeros((1, 1, 1))}
 
 
+class Sail(Plugin, requires=Wind):
+    """A plugin that needs another one."""
+
+    name: str = "sail"
+
+
+def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
+    sim = Sim(engine="interpret")
+    sim.add(Sail())
+    with pytest.raises(ConfigError, match="expected a simulation with a Wind, which Sail 'sail' needs, got 'sail'"):
+        sim.step()
+    sim.add(Wind())
+    sim.step()
+    with pytest.raises(ConfigError, match="expected no plugin that needs 'wind', got Sail 'sail'"):
+        sim.remove("wind")
+
+
 @pytest.mark.parametrize("act, error, words", [
     (lambda sim: sim.add(Wind()), ConfigError, r"wind is already enabled. Use sim.replace\(Wind\(...\)\)"),
     (lambda sim: sim.add("wind"), ConfigError, "expected a plugin, got 'wind'"),

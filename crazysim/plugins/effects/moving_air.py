@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter
-from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
@@ -103,13 +102,8 @@ def needs_drag(sim: Simulation, plugin: Plugin) -> None:
 
 def rotor_positions(sim: Simulation) -> Array:
     """Return the positions of the rotors, body frame, m; zero for rotors that a drone lacks. (..., n_rotors, 3)"""
-    n_rotors = sim.data.states.rotor_vel.shape[-1]
-
-    def read_airframe(airframe: Airframe) -> np.ndarray:
-        positions = airframe.value("rotors.position")
-        return np.pad(positions, [(0, n_rotors - len(positions)), (0, 0)])  # missing rotors have no thrust
-
-    return device_array(airframe_numbers(sim, read_airframe), sim.data.states.pos.dtype)
+    positions = airframe_numbers(sim, lambda airframe: airframe.value("rotors.position"), ("rotors", 3))
+    return device_array(positions, sim.data.states.pos.dtype)
 
 
 def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
