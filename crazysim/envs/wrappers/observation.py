@@ -86,7 +86,7 @@ class PrivilegedObservation(Observe):
             )
         params = zip(jax.tree.leaves(data.params), jax.tree.leaves(scopes(data.params)), self._scales, strict=True)
         drone_params = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
-        effects = vmap_drones(lambda drone: [plugin.observations(drone) for plugin in self._plugins])(data)
+        effects = vmap_drones(lambda drone: [plugin.bound(drone).observations(drone) for plugin in self._plugins])(data)
         parts = [flatten(state_of(data)), data.states.rotor_vel, *drone_params, *jax.tree.leaves(effects)]
         parts += self.task.privileged(data).values()
         return obs | {PRIVILEGED: jnp.concatenate(parts, axis=-1)}
