@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, short_repr
 from crazysim.tables import ANY_NUMBER, Range, Shapes, read_numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -44,8 +44,7 @@ def check_flag(name: str, value: object) -> bool:
         name: Name of the setting, for messages.
         value: The setting.
     """
-    if not isinstance(value, (bool, np.bool_)):
-        raise ConfigError(f"expected {name} as True or False, got {short_repr(value)}")
+    expect(isinstance(value, (bool, np.bool_)), f"{name} as True or False", value)
     return bool(value)
 
 

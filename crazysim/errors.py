@@ -78,16 +78,29 @@ class ConfigError(ValueError):
     """Settings that are invalid, incomplete or contradict each other."""
 
 
+def require(ok: object, message: str, error: type[Exception] = ConfigError) -> None:
+    """Raise an error unless a condition holds: ``assert`` for what users write.
+
+    The message is formatted in any case, so it holds nothing that takes time. ``expect`` shows a value of any size.
+    """
+    if not ok:
+        raise error(message)
+
+
+def expect(ok: object, what: str, got: object, remedy: str = "") -> None:
+    """Raise a ConfigError that shows a value, as "expected ..., got ...", unless a condition holds."""
+    if not ok:
+        raise ConfigError(f"expected {what}, got {short_repr(got)}{remedy and f'. {remedy}'}")
+
+
 def require_type(value: object, kind: type, remedy: str) -> None:
     """Check that a value is an instance of a class."""
-    if not isinstance(value, kind):
-        raise ConfigError(f"expected {kind.__name__}, got {short_repr(value)}. {remedy}")
+    expect(isinstance(value, kind), kind.__name__, value, remedy)
 
 
 def require_callable(name: str, value: object) -> None:
     """Check that an argument is a function, or None."""
-    if value is not None and not callable(value):
-        raise ConfigError(f"expected {name} as a function or None, got {short_repr(value)}. Use a function.")
+    expect(value is None or callable(value), f"{name} as a function or None", value, "Use a function.")
 
 
 class UnknownNameError(ConfigError, KeyError):

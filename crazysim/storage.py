@@ -26,7 +26,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, DamagedFileError
+from crazysim.errors import ConfigError, DamagedFileError, require
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 """Suffixes of the formats in which figures are saved."""
@@ -53,8 +53,10 @@ SYSTEM_USERS = (0, 65534)
 
 def as_path(path: str | Path) -> Path:
     """Return a path, after checking that it is a text or a path."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise ConfigError(f"expected the path of a file or folder, got {path!r}. Use a text, such as 'out/hover'.")
+    require(
+        isinstance(path, (str, os.PathLike)),
+        f"expected the path of a file or folder, got {path!r}. Use a text, such as 'out/hover'.",
+    )
     return Path(path)
 
 
@@ -286,8 +288,7 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
         ConfigError: If the folder does not exist, or the file cannot be written, for example on a full disk.
     """
     path = as_path(path)
-    if not path.parent.is_dir():
-        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+    require(path.parent.is_dir(), f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
     if path.exists() and not path.is_file():
         kind = "folder" if path.is_dir() else "device or pipe"
         raise ConfigError(
@@ -343,10 +344,10 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     Raises:
         ConfigError: If its name has another ending, the folder does not exist, or it cannot be written.
     """
-    if suffixes and as_path(path).suffix.lower() not in suffixes:
-        raise ConfigError(
-            f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}. Use another name."
-        )
+    require(
+        not suffixes or as_path(path).suffix.lower() in suffixes,
+        f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}. Use another name.",
+    )
     with suppress(_NothingToWriteError), open_replacement(path):
         raise _NothingToWriteError
 
@@ -372,8 +373,7 @@ class ZipReader:
         self._max_file_bytes, self._max_total_bytes = max_file_bytes, max_total_bytes
         self._n_unpacked_bytes = 0
         members = self._zip.infolist()
-        if len(members) > max_files:
-            raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {name}")
+        require(len(members) <= max_files, f"expected at most {max_files} files, got {len(members)} in {name}")
         self._members = {str(PurePosixPath(member.filename)): member for member in members}
         self.names = self._members.keys()
         """Names of the files."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 from crazysim.storage import is_file, read_toml
 
 MAX_NUMBER = 1e30
@@ -256,22 +256,22 @@ def read_source(
     """
     if isinstance(source, Mapping):
         return "custom", "", dict(source)
-    if not isinstance(source, (str, Path)):
-        raise ConfigError(
-            f"expected a {kind} as a name, the path of a TOML file, a dict or {class_name}, got {short_repr(source)}"
-        )
+    expect(
+        isinstance(source, (str, Path)), f"a {kind} as a name, the path of a TOML file, a dict or {class_name}", source
+    )
     if str(source) in names:
         return str(source), "", _read_built_in(folder / f"{source}.toml", guide)
-    if not is_file(source):
-        raise UnknownNameError(
-            f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
-            f"{short_repr(str(source))}, and no file of that path exists"
-        )
-    if Path(source).suffix.lower() in MODEL_SUFFIXES:
-        raise ConfigError(
-            f"expected a {kind} as a .toml file, got {str(source)!r}, a model of bodies. Write its mass, inertia and "
-            f"rotors into a .toml file, for drones with 'crazysim airframe new'. Sim(xml_path=...) loads a scene."
-        )
+    require(
+        is_file(source),
+        f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
+        f"{short_repr(str(source))}, and no file of that path exists",
+        UnknownNameError,
+    )
+    require(
+        Path(source).suffix.lower() not in MODEL_SUFFIXES,
+        f"expected a {kind} as a .toml file, got {str(source)!r}, a model of bodies. Write its mass, inertia and "
+        f"rotors into a .toml file, for drones with 'crazysim airframe new'. Sim(xml_path=...) loads a scene.",
+    )
     return Path(source).stem, f" in {source}", read_toml(source, guide)
 
 

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import sweep
 from env_cases import random_action, task_names
+from raised import raised
 
 import crazysim
 from crazysim.engine import Step
@@ -89,12 +90,11 @@ def messages():
     found = {}
     for path in sorted(Path(crazysim.__file__).parent.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
-            call = node.exc if isinstance(node, ast.Raise) else node
-            is_message = isinstance(call, ast.Call) and ast.unparse(call.func).endswith(("Error", "Warning", "warn"))
-            if is_message and call.args:
-                text = ast.unparse(call.args[0])
-                found.setdefault(text, 0)
-                found[text] += isinstance(node, ast.Raise)
+            match raised(node) or node:
+                case (error, text) if error.endswith("Error"):
+                    found[text] = found.get(text, 0) + 1
+                case ast.Call(func=kind, args=[text, *_]) if ast.unparse(kind).endswith(("Error", "Warning", "warn")):
+                    found.setdefault(ast.unparse(text), 0)
     return {"messages": found}
 
 

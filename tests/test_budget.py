@@ -13,7 +13,7 @@ BUDGET = {
     "commands": 1197,
     "control": 2035,
     "core": 1899,
-    "crazysim": 1408,
+    "crazysim": 1404,
     "drones": 531,
     "dynamics": 593,
     "engine": 5804,

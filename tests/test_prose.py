@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from raised import raised
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "crazysim").rglob("*.py"))
@@ -80,9 +81,8 @@ def violations(source):
     for node in ast.walk(tree):
         if isinstance(node, ast.Assert):
             result.append((node.lineno, "assert: raise an error that names the remedy"))
-        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
-            name = node.exc.func.id if isinstance(node.exc.func, ast.Name) else ""
-            message = literal(node.exc.args[0])
+        if error := raised(node):
+            name, message = error[0], literal(ast.parse(error[1], mode="eval").body)
             if name in USER_ERRORS and message is not None and not REMEDY.search(message):
                 result.append((node.lineno, f"message without a remedy: {message!r}"))
     return sorted(result)
