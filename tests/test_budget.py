@@ -25,7 +25,7 @@ BUDGET = {
     "scene": 3153,
     "sim": 1236,
     "train": 2497,
-    "trajectories": 1431,
+    "trajectories": 1398,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
 

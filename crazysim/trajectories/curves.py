@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_flag
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.tables import MAX_NUMBER, read_floats
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -211,14 +211,15 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
 
 def _resolve_period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
     """Return ``period``, s, or ``length``, m, divided by ``speed``; the default period if both are None."""
-    if period is not None and speed is not None:
-        raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
+    require(
+        period is None or speed is None,
+        f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.",
+    )
     if speed is None:
         time = require_positive(name, DEFAULT_PERIOD if period is None else period)
     else:
         require_positive("speed", speed)
-        if length == 0:
-            raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
+        require(length != 0, f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
         time = length / speed
     if not PERIOD_RANGE[0] <= time <= PERIOD_RANGE[1]:
         raise ConfigError(f"expected a {name} from {PERIOD_RANGE[0]:g} to {PERIOD_RANGE[1]:g} s, got {time:g} s")
@@ -228,8 +229,7 @@ def _resolve_period(period: float | None, speed: float | None, length: float, na
 def require_positive(name: str, value: float) -> float:
     """Return the value of a setting as a float after a check that it is positive and finite."""
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
-    if not is_number or not 0 < value <= MAX_NUMBER:
-        raise ConfigError(f"expected {name} as a positive number, got {value!r}")
+    require(is_number and 0 < value <= MAX_NUMBER, f"expected {name} as a positive number, got {value!r}")
     return float(value)
 
 

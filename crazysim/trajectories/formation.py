@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import grid_2d
 from crazysim.core.settings import positive_integer
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.tables import read_floats
 from crazysim.trajectories.curves import require_positive, require_vector
 
@@ -58,8 +58,10 @@ def circle(
         center: Centre, world frame, m. (3,)
         yaw: Angle by which the circle is rotated around its centre, rad.
     """
-    if spacing is not None and radius is not None:
-        raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
+    require(
+        spacing is None or radius is None,
+        f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.",
+    )
     angle = 2 * math.pi * np.arange(positive_integer("n", n)) / n
     if radius is None:
         side = require_positive("spacing", 1.0 if spacing is None else spacing)
@@ -81,8 +83,10 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
         targets: Positions to fly to, in any order, m. (n, 3)
     """
     a, b = read_floats("starts", starts), read_floats("targets", targets)
-    if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or not np.all(np.isfinite(a) & np.isfinite(b)):
-        raise ConfigError(f"expected as many finite starts as targets, (n, 3) each, got shapes {a.shape} and {b.shape}")
+    require(
+        a.shape == b.shape and a.ndim == 2 and a.shape[1] == 3 and np.all(np.isfinite(a) & np.isfinite(b)),
+        f"expected as many finite starts as targets, (n, 3) each, got shapes {a.shape} and {b.shape}",
+    )
     from scipy.optimize import linear_sum_assignment  # a fifth of a second to import
 
     squares = np.sum(np.square(a[:, None] - b), axis=-1)

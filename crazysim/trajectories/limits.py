@@ -13,7 +13,7 @@ from crazysim.arguments import check_arguments
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.trajectories.approaches import Approach, closest_approaches
 from crazysim.trajectories.peaks import QUANTITIES, Peak, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
@@ -157,10 +157,7 @@ class Report:
 
 def require_limits(limits: Limits) -> None:
     """Check that an argument is a ``Limits``."""
-    if not isinstance(limits, Limits):
-        raise ConfigError(
-            f"expected limits as Limits, got {short_repr(limits)}. Use Limits(speed=...), or Limits() for none."
-        )
+    expect(isinstance(limits, Limits), "limits as Limits", limits, "Use Limits(speed=...), or Limits() for none.")
 
 
 def tolerance_scale(name: str, limit: float) -> float:
@@ -199,16 +196,21 @@ def check(
     if len(flights) == 1 and np.ndim(starts) == 1:
         flights *= np.size(starts)
     table = PieceTable.create(flights, starts, duration)
-    if not isinstance(names, (Sequence, type(None))) or isinstance(names, str):
-        raise ConfigError(f"expected names as a list of texts, got {short_repr(names)}. Pass one name per trajectory.")
+    expect(
+        isinstance(names, (Sequence, type(None))) and not isinstance(names, str),
+        "names as a list of texts",
+        names,
+        "Pass one name per trajectory.",
+    )
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(flights)))
-    if len(labels) != len(flights):
-        raise ConfigError(
-            f"expected {len(flights)} names, one for each drone, got {len(labels)}. Pass one name per trajectory."
-        )
+    require(
+        len(labels) == len(flights),
+        f"expected {len(flights)} names, one for each drone, got {len(labels)}. Pass one name per trajectory.",
+    )
     is_number = isinstance(tolerance, (int, float, np.number))
-    if not is_number or not 0 < tolerance < np.inf:
-        raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
+    require(
+        is_number and 0 < tolerance < np.inf, f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3."
+    )
     limit_values = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
     peaks, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []

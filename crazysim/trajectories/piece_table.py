@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.tables import read_floats
 from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
@@ -48,8 +48,7 @@ class PieceTable:
             duration: Duration, s; None to end with the last trajectory. A repeating trajectory then ends after one
                 round.
         """
-        if not trajectories:
-            raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
+        require(trajectories, "expected at least one trajectory, got none. Pass a list with one per drone.")
         start_times = read_floats("starts", starts)
         n_drones = len(trajectories)
         if start_times.shape not in ((), (n_drones,)) or not np.all(np.isfinite(start_times)):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_flag
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.bezier import power_coefficients
@@ -34,20 +34,22 @@ def spline(
             (n_points,)
         at_rest: True to start and end at rest; False for a natural spline, with free derivatives at both ends.
     """
-    if not isinstance(degree, (int, np.integer)) or degree not in SPLINE_ORDERS:
-        raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
+    require(
+        isinstance(degree, (int, np.integer)) and degree in SPLINE_ORDERS,
+        f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).",
+    )
     knots, x = read_floats("times", times), read_floats("points", points)
-    if knots.ndim != 1 or x.shape != (len(knots), 3):
-        raise ConfigError(
-            f"expected times (n_points,) and points (n_points, 3), got shapes {knots.shape} and {x.shape}. Pass one "
-            "time per point."
-        )
+    require(
+        knots.ndim == 1 and x.shape == (len(knots), 3),
+        f"expected times (n_points,) and points (n_points, 3), got shapes {knots.shape} and {x.shape}. Pass one "
+        "time per point.",
+    )
     n_min = 2 if check_flag("at_rest", at_rest) else SPLINE_ORDERS[degree]
-    if len(knots) < n_min:
-        raise ConfigError(
-            f"expected at least {n_min} points for a spline of degree {degree}, got {len(knots)}. Add points, or lower "
-            "the degree."
-        )
+    require(
+        len(knots) >= n_min,
+        f"expected at least {n_min} points for a spline of degree {degree}, got {len(knots)}. Add points, or lower "
+        "the degree.",
+    )
     durations = np.diff(knots)
     if not np.all(np.isfinite(knots)) or not np.all(durations > 0):
         raise ConfigError(
@@ -73,23 +75,24 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         repeats: True to start again after the end.
     """
     end_times = read_floats("ends", ends)
-    if not isinstance(control_points, (list, tuple, np.ndarray)) or not getattr(control_points, "ndim", 1):
-        raise ConfigError(
-            f"expected control points as a list with an array per curve, got {short_repr(control_points)}"
-        )
+    expect(
+        isinstance(control_points, (list, tuple, np.ndarray)) and getattr(control_points, "ndim", 1),
+        "control points as a list with an array per curve",
+        control_points,
+    )
     curves = [read_floats("control points", points) for points in control_points]
     shapes = [curve.shape for curve in curves]
-    if end_times.shape != (len(curves),) or not curves:
-        raise ConfigError(
-            f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {end_times.shape}. Pass the "
-            "time at which each ends."
-        )
+    require(
+        end_times.shape == (len(curves),) and curves,
+        f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {end_times.shape}. Pass the "
+        "time at which each ends.",
+    )
     is_curve = [len(shape) == 2 and shape[0] > 0 and shape[1] in (3, 4) for shape in shapes]
-    if not all(is_curve) or len({shape[1] for shape in shapes}) != 1:
-        raise ConfigError(
-            f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}. Give "
-            "all curves a yaw, or none."
-        )
+    require(
+        all(is_curve) and len({shape[1] for shape in shapes}) == 1,
+        f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}. Give "
+        "all curves a yaw, or none.",
+    )
     durations = np.diff(end_times, prepend=0.0)
     if not np.all(np.isfinite(end_times)) or not np.all(durations > 0):
         raise ConfigError(
@@ -123,11 +126,11 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
         n_points: Number of points.
     """
     angles = require_finite(read_floats("yaw", yaw), "yaw")
-    if angles.shape not in ((), (n_points,)):
-        raise ConfigError(
-            f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}. Pass a number, or an "
-            "array of that length."
-        )
+    require(
+        angles.shape in ((), (n_points,)),
+        f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}. Pass a number, or an "
+        "array of that length.",
+    )
     return np.unwrap(np.broadcast_to(angles, (n_points,)))
 
 

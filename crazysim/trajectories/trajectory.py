@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from crazysim.arguments import check_flag
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.tables import read_floats
 from crazysim.trajectories.interpolation import unit_coefficients
@@ -55,17 +55,16 @@ class Trajectory(PyTree):
             repeats: True to start again after the end.
         """
         lengths, c = read_floats("durations", durations), read_floats("coefficients", coefficients)
-        if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
-            raise ConfigError(
-                f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
-                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}. Pass one set of coefficients "
-                "per piece."
-            )
-        if not c.shape[2] or not np.all(np.isfinite(c)):
-            raise ConfigError(
-                f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for "
-                "NaN."
-            )
+        require(
+            lengths.ndim == 1 and lengths.size and c.ndim == 3 and c.shape[1] in (3, 4) and len(c) == len(lengths),
+            f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
+            f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}. Pass one set of coefficients "
+            "per piece.",
+        )
+        require(
+            c.shape[2] and np.all(np.isfinite(c)),
+            f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for NaN.",
+        )
         ends = np.cumsum(lengths).astype(float_dtype())
         steps = np.diff(ends, prepend=0.0)
         if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
@@ -130,11 +129,11 @@ class Trajectory(PyTree):
                 higher degrees are ignored. None to use ``degree`` for all axes. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
-        if ends.ndim != 2:
-            raise ConfigError(
-                f"expected trajectories along one leading axis, got ends of shape {ends.shape}. Use evaluate(t) for a "
-                f"single trajectory, and Trajectory.stack for several."
-            )
+        require(
+            ends.ndim == 2,
+            f"expected trajectories along one leading axis, got ends of shape {ends.shape}. Use evaluate(t) for a "
+            f"single trajectory, and Trajectory.stack for several.",
+        )
         end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
         local_time, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _find_piece(ends, index, local_time)
@@ -161,12 +160,15 @@ class Trajectory(PyTree):
             Values, their first derivatives, and so on. (4,) each
         """
         self._require_single("evaluate_one(index, t)")
-        if np.shape(t) != ():
-            raise ConfigError(
-                f"expected one time, got shape {np.shape(t)}. Use jax.vmap(trajectory.evaluate)(times) for several."
-            )
-        if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 0 <= order <= N_DERIVATIVES:
-            raise ConfigError(f"expected an order from 0 to {N_DERIVATIVES}, got {short_repr(order)}")
+        require(
+            np.shape(t) == (),
+            f"expected one time, got shape {np.shape(t)}. Use jax.vmap(trajectory.evaluate)(times) for several.",
+        )
+        expect(
+            not isinstance(order, bool) and isinstance(order, (int, np.integer)) and 0 <= order <= N_DERIVATIVES,
+            f"an order from 0 to {N_DERIVATIVES}",
+            order,
+        )
         xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
         # A table with one row for each piece needs a single lookup. The parts of a row begin at multiples of four.
@@ -234,8 +236,10 @@ class Trajectory(PyTree):
         """
         if n is None:
             return self.replace(repeats=np.bool_(True))
-        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-            raise ConfigError(f"expected a number of rounds of at least 1, got {n!r}. Use None for no end.")
+        require(
+            not isinstance(n, bool) and isinstance(n, (int, np.integer)) and n >= 1,
+            f"expected a number of rounds of at least 1, got {n!r}. Use None for no end.",
+        )
         self._require_single("unstacked()")
         xp = _array_module(self)
         rounds = xp.arange(n, dtype=self.ends.dtype)[:, None] * self.ends[-1]
@@ -256,8 +260,7 @@ class Trajectory(PyTree):
             transition: Duration of an additional piece of degree 7 that connects the two trajectories, s; 0 for none.
                 Velocity, acceleration and jerk are continuous, and the yaw turns the shorter way.
         """
-        if not isinstance(other, Trajectory):
-            raise ConfigError(f"expected a trajectory to follow, got {short_repr(other)}. Use a.then(b).")
+        expect(isinstance(other, Trajectory), "a trajectory to follow", other, "Use a.then(b).")
         self._require_single("unstacked()")
         other._require_single("unstacked()")
         if self.repeats or other.repeats:
@@ -267,8 +270,10 @@ class Trajectory(PyTree):
                 f"such as repeat(1) for one round."
             )
         is_number = isinstance(transition, (int, float, np.number)) and not isinstance(transition, bool)
-        if not is_number or not 0 <= transition < np.inf:
-            raise ConfigError(f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.")
+        require(
+            is_number and 0 <= transition < np.inf,
+            f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.",
+        )
         if transition > 0:
             before, after = self._end_derivatives(at_end=True), other._end_derivatives(at_end=False)
             yaw_shift = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
@@ -295,11 +300,11 @@ class Trajectory(PyTree):
         Args:
             remedy: Method to use for several trajectories.
         """
-        if np.ndim(self.ends) != 1:
-            raise ConfigError(
-                f"expected a trajectory of one vehicle, got several, with ends of shape {np.shape(self.ends)}. Use "
-                f"{remedy} of them."
-            )
+        require(
+            np.ndim(self.ends) == 1,
+            f"expected a trajectory of one vehicle, got several, with ends of shape {np.shape(self.ends)}. Use "
+            f"{remedy} of them.",
+        )
 
     def _end_derivatives(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
@@ -321,8 +326,11 @@ class Trajectory(PyTree):
             is_concrete = not isinstance(value, jax.core.Tracer)
             array = np.asarray(value) if is_concrete else value
             is_finite = is_concrete and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
-            if array.shape != shape or (is_concrete and not is_finite):
-                raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {short_repr(value)}")
+            expect(
+                array.shape == shape and (not is_concrete or is_finite),
+                f"{name} as finite numbers of shape {shape}",
+                value,
+            )
         xp = _array_module([self, offset, yaw])
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)
@@ -341,11 +349,12 @@ def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Tra
     """
     is_stack = isinstance(trajectories, Trajectory)
     items = trajectories.unstacked() if is_stack else list(trajectories) if np.iterable(trajectories) else []
-    if not items or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in items):
-        raise ConfigError(
-            f"expected at least one trajectory, each of one vehicle, got {short_repr(trajectories)}. Pass a list with "
-            f"one per drone."
-        )
+    expect(
+        items and all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in items),
+        "at least one trajectory, each of one vehicle",
+        trajectories,
+        "Pass a list with one per drone.",
+    )
     return items
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation, timing
 from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
@@ -209,11 +209,11 @@ def _plan_trajectory(
 def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     positions = read_floats("waypoints", waypoints)
-    if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
-        raise ConfigError(
-            f"expected waypoints (n, 3), at least two, got shape {positions.shape}. Pass an array with a row for each "
-            f"point."
-        )
+    require(
+        positions.ndim == 2 and positions.shape[1] == 3 and len(positions) >= 2,
+        f"expected waypoints (n, 3), at least two, got shape {positions.shape}. Pass an array with a row for each "
+        f"point.",
+    )
     nodes = np.full((len(positions), len(fixed_derivatives) + 1, 3), np.nan)
     nodes[:, 0] = require_finite(positions, "waypoints")
     for k, (name, values) in enumerate(
@@ -223,11 +223,11 @@ def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike 
             nodes[[0, -1], k] = 0.0
             continue
         array = read_floats(name, values)
-        if array.shape != positions.shape or np.any(np.isinf(array)):
-            raise ConfigError(
-                f"expected finite {name} {positions.shape}, NaN where free, got shape {array.shape}. Pass one row per "
-                "waypoint."
-            )
+        require(
+            array.shape == positions.shape and not np.any(np.isinf(array)),
+            f"expected finite {name} {positions.shape}, NaN where free, got shape {array.shape}. Pass one row per "
+            "waypoint.",
+        )
         nodes[:, k] = array
     return nodes
 

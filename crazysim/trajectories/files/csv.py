@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import require, short_repr
 from crazysim.storage import read_text, write_file
 from crazysim.tables import read_floats
 from crazysim.trajectories.files import checks
@@ -122,10 +122,10 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
         header += ",yaw"
     n = columns[0].size
     shapes = [column.shape for column in columns]
-    if shapes != [(n,), (n, 3), (n,)][: len(shapes)]:
-        raise ConfigError(
-            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {shapes}. Pass one row per time."
-        )
+    require(
+        shapes == [(n,), (n, 3), (n,)][: len(shapes)],
+        f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {shapes}. Pass one row per time.",
+    )
     for name, column in zip(("times", "pos", "yaw"), columns, strict=False):
         require_finite(column, name)
     columns = [column.reshape(n, -1) for column in columns]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -29,14 +29,13 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
         Ends, s (n_pieces,), and coefficients of x, y, z, m, and yaw, rad, constant term first, in each piece's time
         scaled to [0, 1] (n_pieces, 4, degree + 1).
     """
-    if not isinstance(trajectory, Trajectory):
-        raise ConfigError(f"expected a trajectory, got {short_repr(trajectory)}. Use figure_eight(), for example.")
+    expect(isinstance(trajectory, Trajectory), "a trajectory", trajectory, "Use figure_eight(), for example.")
     ends = np.asarray(trajectory.ends)
-    if ends.ndim != 1:
-        raise ConfigError(
-            f"expected a trajectory of one vehicle, got ends of shape {ends.shape}. Save each one by itself, or all as "
-            f"a show."
-        )
+    require(
+        ends.ndim == 1,
+        f"expected a trajectory of one vehicle, got ends of shape {ends.shape}. Save each one by itself, or all as "
+        f"a show.",
+    )
     times = np.array([float(str(x)) for x in ends])
     has_length = np.diff(times, prepend=0.0) > 0
     return times[has_length], np.asarray(trajectory.coefficients, float)[has_length]
