@@ -14,7 +14,7 @@ BUDGET = {
     "control": 2035,
     "core": 1899,
     "crazysim": 1404,
-    "drones": 531,
+    "drones": 514,
     "dynamics": 593,
     "engine": 5804,
     "envs": 3896,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.drones.keys import GUIDE, LAYOUT
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 TUNED_TABLES = ("fitted", "controller", "geometric", "mellinger", "pid", "residual")
 """Tables of gains and fits."""
@@ -74,8 +74,10 @@ class Airframe:
                 f"{_lookup_advice(path, self.values)}"
             )
         value = self.values[path]
-        if shape is not None and value.shape != shape:
-            raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
+        require(
+            shape is None or value.shape == shape,
+            f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}",
+        )
         return value
 
     def matrix(self, path: str) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE, Airframe
 from crazysim.drones.keys import GUIDE, LAYOUT
-from crazysim.errors import AirframeWarning, ConfigError, short_repr, warn
+from crazysim.errors import AirframeWarning, ConfigError, require, short_repr, warn
 from crazysim.tables import INERTIA, check_numbers
 
 MAX_ROTORS = 64
@@ -37,13 +37,15 @@ def check_airframe(airframe: Airframe) -> None:
     for table in ("rigid_body", "rotors"):
         airframe.table(table)
     owner, position = f"airframe {airframe.name!r}", airframe.value("rotors.position")
-    if position.ndim != 2 or position.shape[1] != 3:
-        raise ConfigError(f"{owner}: expected rotors.position of shape (n, 3), got {position.shape}")
+    require(
+        position.ndim == 2 and position.shape[1] == 3,
+        f"{owner}: expected rotors.position of shape (n, 3), got {position.shape}",
+    )
     n = len(position)
-    if n > MAX_ROTORS:
-        raise ConfigError(
-            f"{owner}: expected at most {MAX_ROTORS} rotors, got {n}. Leave the others out of rotors.position."
-        )
+    require(
+        n <= MAX_ROTORS,
+        f"{owner}: expected at most {MAX_ROTORS} rotors, got {n}. Leave the others out of rotors.position.",
+    )
     for path, value in airframe.values.items():
         check_numbers(owner, path, value, LAYOUT.keys[path], n)
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):

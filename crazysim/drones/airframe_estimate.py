@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.arguments import check_arguments
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.drones.airframe_checks import MAX_ROTORS
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.storage import MAX_TEXT_BYTES, is_file, read_text
 from crazysim.tables import POSITIVE, read_number, read_numbers
 
@@ -218,8 +218,7 @@ class _AirframeFile:
 
 def _toml_string(text: str) -> str:
     escaped_text = text.replace("\\", "\\\\").replace('"', '\\"')
-    if not escaped_text.isprintable():
-        raise ConfigError(f"expected a name of printable characters, got {short_repr(text)}")
+    expect(escaped_text.isprintable(), "a name of printable characters", text)
     return f'"{escaped_text}"'
 
 
@@ -240,26 +239,27 @@ def _rotor_layout(
     propeller: float,
 ) -> tuple[NDArray, NDArray]:
     """Return positions (n, 3), m, and signs of the yaw torques (n,) of the rotors; describe a layout in the file."""
-    if (arm is None) == (positions is None):
-        raise ConfigError("expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.")
+    require(
+        (arm is None) != (positions is None),
+        "expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.",
+    )
     if positions is None:
-        if layout not in ("x", "+"):
-            raise ConfigError(f"expected layout as 'x' or '+', got {short_repr(layout)}. Use positions for any other.")
-        if not 4 <= n_rotors <= MAX_ROTORS or n_rotors % 2:
-            raise ConfigError(
-                f"expected an even number of rotors from 4 to {MAX_ROTORS}, which alternate, got {n_rotors}. Use "
-                "positions and spins."
-            )
+        expect(layout in ("x", "+"), "layout as 'x' or '+'", layout, "Use positions for any other.")
+        require(
+            4 <= n_rotors <= MAX_ROTORS and n_rotors % 2 == 0,
+            f"expected an even number of rotors from 4 to {MAX_ROTORS}, which alternate, got {n_rotors}. Use "
+            "positions and spins.",
+        )
         angle_step = 2 * np.pi / n_rotors
         angles = -angle_step * (np.arange(n_rotors) + (0.5 if layout == "x" else 0.0))
         rotor_pos = arm * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
         file.describe("layout", SOURCES["layout"].format(n=n_rotors, arm=arm))
     else:
         rotor_pos = np.asarray(positions, float)
-        if rotor_pos.ndim != 2 or rotor_pos.shape[1] not in (2, 3) or len(rotor_pos) < 3:
-            raise ConfigError(
-                f"expected positions of shape (n, 3) or (n, 2) of at least 3 rotors, got {rotor_pos.shape}"
-            )
+        require(
+            rotor_pos.ndim == 2 and rotor_pos.shape[1] in (2, 3) and len(rotor_pos) >= 3,
+            f"expected positions of shape (n, 3) or (n, 2) of at least 3 rotors, got {rotor_pos.shape}",
+        )
         rotor_pos = np.pad(rotor_pos, ((0, 0), (0, 3 - rotor_pos.shape[1])))
     rotor_pos = np.where(np.abs(rotor_pos) < 1e-9, 0.0, rotor_pos)
     gaps = rotor_pos[:, None] - rotor_pos[None]
@@ -271,20 +271,19 @@ def _rotor_layout(
             f"apart. Use a longer arm, a smaller propeller (5 inches are 0.127 m), or other heights of the rotors."
         )
     if spins is None:
-        if len(rotor_pos) % 2:
-            raise ConfigError(
-                f"expected spins for {len(rotor_pos)} rotors, which cannot alternate. Use spins=[1, -1, ...]."
-            )
+        require(
+            len(rotor_pos) % 2 == 0,
+            f"expected spins for {len(rotor_pos)} rotors, which cannot alternate. Use spins=[1, -1, ...].",
+        )
         spins = [1, -1] * (len(rotor_pos) // 2)
     spin_signs = np.asarray(spins)
-    if (
-        spin_signs.shape != (len(rotor_pos),)
-        or not np.all(np.isin(spin_signs, (1, -1)))
-        or abs(np.sum(spin_signs)) == len(rotor_pos)
-    ):
-        raise ConfigError(
-            f"expected spins of 1 and -1 for {len(rotor_pos)} rotors, and not all equal, got {short_repr(spins)}"
-        )
+    expect(
+        spin_signs.shape == (len(rotor_pos),)
+        and np.all(np.isin(spin_signs, (1, -1)))
+        and abs(np.sum(spin_signs)) != len(rotor_pos),
+        f"spins of 1 and -1 for {len(rotor_pos)} rotors, and not all equal",
+        spins,
+    )
     return rotor_pos, -spin_signs
 
 
@@ -306,11 +305,11 @@ def _add_thrust(
     pitch: float | None,
 ) -> float:
     """Add the largest thrust and the curves of thrust and torque; return the largest thrust of one rotor, N."""
-    if (thrust_to_weight is None) == (motor_table is None):
-        raise ConfigError(
-            "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
-            "4 for an agile one."
-        )
+    require(
+        (thrust_to_weight is None) != (motor_table is None),
+        "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
+        "4 for an agile one.",
+    )
     motor_data = {} if motor_table is None else _parse_motor_table(motor_table)
     table_name = (
         f"motor table {Path(motor_table).name}"
@@ -381,8 +380,7 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
     column_names = ", ".join(COLUMNS)
     column_by_quantity: dict[str, NDArray] = {}
     for key, values in columns.items():
-        if str(key).strip().lower() not in COLUMNS:
-            raise ConfigError(f"expected columns of a motor table among {column_names}, got {short_repr(key)}")
+        expect(str(key).strip().lower() in COLUMNS, f"columns of a motor table among {column_names}", key)
         quantity, factor = COLUMNS[str(key).strip().lower()]
         try:
             array = np.asarray(values, float) * factor
@@ -399,14 +397,18 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
                 f"expected columns of the motor table that agree on the {quantity}, got {previous[k]:.4g} and "
                 f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
             )
-    if "thrust" not in column_by_quantity or not np.max(column_by_quantity["thrust"]) > 0:
-        raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {short_repr(list(columns))}")
-    if len({len(array) for array in column_by_quantity.values()}) != 1:
-        raise ConfigError("expected columns of equal lengths in the motor table")
+    expect(
+        "thrust" in column_by_quantity and np.max(column_by_quantity["thrust"]) > 0,
+        "a motor table with a column thrust_n or thrust_g",
+        list(columns),
+    )
+    require(
+        len({len(array) for array in column_by_quantity.values()}) == 1,
+        "expected columns of equal lengths in the motor table",
+    )
     if "rpm" in column_by_quantity:
         is_running = column_by_quantity["rpm"] > 0
-        if not np.any(is_running):
-            raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
+        require(np.any(is_running), "expected a speed above 0 in column 'rpm' of the motor table, got none")
         order = np.argsort(column_by_quantity["rpm"][is_running], kind="stable")
         column_by_quantity = {quantity: array[is_running][order] for quantity, array in column_by_quantity.items()}
         for quantity in ("thrust", "torque"):
@@ -424,12 +426,13 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
     """Return the columns of a CSV file by their names in its first line."""
-    if not is_file(path):
-        raise ConfigError(f"expected a motor table as an existing CSV file, got {str(path)!r}")
+    require(is_file(path), f"expected a motor table as an existing CSV file, got {str(path)!r}")
     lines = [line for line in read_text(path, MAX_TEXT_BYTES).splitlines() if line.strip() and line[0] != "#"]
     header, *rows = csv.reader(lines) if lines else [[]]
-    if not header or not rows or any(len(row) != len(header) for row in rows):
-        raise ConfigError(f"expected a line of names and lines of as many numbers in {str(path)!r}")
+    require(
+        header and rows and not any(len(row) != len(header) for row in rows),
+        f"expected a line of names and lines of as many numbers in {str(path)!r}",
+    )
     return {key: [row[i] for row in rows] for i, key in enumerate(header)}
 
 
