@@ -20,7 +20,7 @@ BUDGET = {
     "envs": 3896,
     "geometry": 1097,
     "lab": 9874,
-    "media": 1010,
+    "media": 986,
     "plugins": 7332,
     "scene": 3153,
     "sim": 1236,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.settings import positive_integer
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.media.view import View
 from crazysim.media.worlds import world_indices
 from crazysim.scene import batch_render
@@ -48,8 +48,10 @@ def render_worlds(
         ImportError: If ``renderer="warp"`` and MuJoCo Warp is not installed.
         RenderError: If this machine cannot draw.
     """
-    if not isinstance(renderer, str) or renderer not in RENDERERS:
-        raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
+    require(
+        isinstance(renderer, str) and renderer in RENDERERS,
+        f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}",
+    )
     indices = world_indices(sim, worlds)
     can_use_warp = (
         camera != -1 and not len(sim.overlays) and sim.device.platform == "gpu" and batch_render.is_installed()

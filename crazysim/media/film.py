@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments, check_flag
-from crazysim.errors import ConfigError, RenderError, not_installed
+from crazysim.errors import ConfigError, RenderError, not_installed, require
 from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, show_flight_at
 from crazysim.media.view import View
@@ -80,10 +80,8 @@ class Film:
         self._absolute_path = self.path.absolute()
         self._unfinished_path = unfinished_path(self._absolute_path)
         for name, value in (("fps", fps), ("speed", speed)):
-            if not np.isfinite(value) or value <= 0:
-                raise ConfigError(f"expected a positive {name}, got {value!r}")
-        if fps > MAX_FPS:
-            raise ConfigError(f"expected fps of at most {MAX_FPS}, got {fps!r}. Use a smaller speed for slow motion.")
+            require(np.isfinite(value) and value > 0, f"expected a positive {name}, got {value!r}")
+        require(fps <= MAX_FPS, f"expected fps of at most {MAX_FPS}, got {fps!r}. Use a smaller speed for slow motion.")
         size = self.view.width, self.view.height
         if self.path.suffix.lower() == ".mp4" and any(n % 2 for n in size):
             even_size = [n + n % 2 for n in size]
@@ -147,8 +145,10 @@ class Film:
             RenderError: If the file cannot be written.
         """
         pixels, shape = np.asarray(image), (self.view.height, self.view.width, 3)
-        if pixels.shape != shape or pixels.dtype != np.uint8:
-            raise ConfigError(f"expected an image of shape {shape}, uint8, got {pixels.shape}, {pixels.dtype}")
+        require(
+            pixels.shape == shape and pixels.dtype == np.uint8,
+            f"expected an image of shape {shape}, uint8, got {pixels.shape}, {pixels.dtype}",
+        )
         if self._ffmpeg is None:
             self._ffmpeg = subprocess.Popen(self._command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
         try:

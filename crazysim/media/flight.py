@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
 from crazysim.storage import open_file, open_replacement, read_arrays, wrap_read_errors
@@ -92,8 +92,7 @@ class Flight:
             ConfigError: If the name has another suffix, or the file cannot be written. No file is left then.
         """
         path = Path(path)
-        if path.suffix != ".npz":
-            raise ConfigError(f"expected the name of a recording to end with .npz, got {str(path)!r}")
+        require(path.suffix == ".npz", f"expected the name of a recording to end with .npz, got {str(path)!r}")
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
         arrays |= shape_arrays(self.shapes)
         with open_replacement(path) as file:
@@ -176,8 +175,7 @@ def _read_samples(path: Path) -> dict[str, NDArray]:
             scene = unpack_arrays(content)
         elif kind == SAMPLE_CHUNK:
             samples.append(np.frombuffer(content, "<f8"))
-    if not samples or not scene:
-        raise ValueError("expected at least one sample, got none")
+    require(samples and scene, "expected at least one sample, got none", ValueError)
     n_worlds, n_drones, n_bodies = (len(scene[name]) for name in ("worlds", "drone_ids", "body_ids"))
     values = np.stack(samples)
     sizes = [(), (n_worlds, n_drones, 3), (n_worlds, n_drones, 4), (n_worlds, n_bodies, 3), (n_worlds, n_bodies, 4)]

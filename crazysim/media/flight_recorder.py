@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crazysim.arguments import check_arguments
 from crazysim.core.functional import default_feedforward, stage_command, staged_leaves
 from crazysim.eager import fetch_rows
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
 from crazysim.media.poses import mocap_poses
@@ -117,8 +117,7 @@ class Recorder:
 
     def flight(self) -> Flight:
         """Return the flight up to the last sample."""
-        if not self._n_samples:
-            raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
+        require(self._n_samples, "expected at least one sample, got none. Call recorder.add() between steps.")
         if self._journal is not None:
             return Flight.load(self._journal.path)
         return Flight(
@@ -142,18 +141,15 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
         worlds: Indices of the worlds to record; None for all.
     """
     indices, sizes = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
-    if not hasattr(states, "pos") or not hasattr(states, "quat"):
-        raise ConfigError(f"expected states as sim.rollout returns them, got {short_repr(states)}")
-    if np.shape(states.pos)[1:] != (*sizes, 3) or np.shape(states.quat) != (len(states.pos), *sizes, 4):
-        raise ConfigError(
-            f"expected positions of shape (n, *{(*sizes, 3)}) and quaternions of shape (n, *{(*sizes, 4)}), as "
-            f"sim.rollout returns them, got {np.shape(states.pos)} and {np.shape(states.quat)}"
-        )
-    if not np.isfinite(dt) or dt <= 0:
-        raise ConfigError(f"expected a positive dt, s, got {dt!r}")
+    expect(hasattr(states, "pos") and hasattr(states, "quat"), "states as sim.rollout returns them", states)
+    require(
+        np.shape(states.pos)[1:] == (*sizes, 3) and np.shape(states.quat) == (len(states.pos), *sizes, 4),
+        f"expected positions of shape (n, *{(*sizes, 3)}) and quaternions of shape (n, *{(*sizes, 4)}), as "
+        f"sim.rollout returns them, got {np.shape(states.pos)} and {np.shape(states.quat)}",
+    )
+    require(np.isfinite(dt) and dt > 0, f"expected a positive dt, s, got {dt!r}")
     n = len(states.pos)
-    if not n:
-        raise ConfigError("expected at least one state, got none")
+    require(n, "expected at least one state, got none")
     body_pos, body_quat = _body_poses(sim, indices)
     return Flight(
         time=dt * np.arange(n),

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.storage import Closeable, open_file, read_arrays
 
 log = logging.getLogger(__name__)
@@ -73,8 +73,7 @@ class Journal(Closeable):
         Raises:
             OSError: If the chunk cannot be written, for example because the disk is full.
         """
-        if len(kind) != 4:
-            raise ConfigError(f"expected a kind of 4 bytes, got {kind!r}")
+        require(len(kind) == 4, f"expected a kind of 4 bytes, got {kind!r}")
         self._write(CHUNK_HEADER.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import as_rgba
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.scene.overlays import Overlays
 
 COLORS = np.array([[0.90, 0.30, 0.20, 1], [0.15, 0.50, 0.85, 1], [0.20, 0.65, 0.35, 1], [0.85, 0.60, 0.10, 1]])
@@ -36,8 +36,10 @@ class Trail:
         Args:
             seconds: Duration of the trail, s.
         """
-        if not isinstance(seconds, (int, float, np.number)) or not 0 < seconds < np.inf:
-            raise ConfigError(f"expected a positive duration of a trail, s, got {seconds!r}")
+        require(
+            isinstance(seconds, (int, float, np.number)) and 0 < seconds < np.inf,
+            f"expected a positive duration of a trail, s, got {seconds!r}",
+        )
         self.seconds = float(seconds)
         self._samples: deque[tuple[NDArray, NDArray]] = deque()
 
@@ -53,11 +55,11 @@ class Trail:
             pos: Positions of the drones, world frame, m. (n_worlds, n_drones, 3)
         """
         times, pos = np.array(time, float), np.array(pos, float)
-        if pos.ndim != 3 or pos.shape[2] != 3 or times.shape != pos.shape[:1]:
-            raise ConfigError(
-                f"expected times of shape (n_worlds,) and positions of shape (n_worlds, n_drones, 3), got "
-                f"{times.shape} and {pos.shape}"
-            )
+        require(
+            pos.ndim == 3 and pos.shape[2] == 3 and times.shape == pos.shape[:1],
+            f"expected times of shape (n_worlds,) and positions of shape (n_worlds, n_drones, 3), got "
+            f"{times.shape} and {pos.shape}",
+        )
         if self._samples and self._samples[-1][1].shape != pos.shape:
             raise ConfigError(f"expected positions of shape {self._samples[-1][1].shape}, as before, got {pos.shape}")
         if self._samples and (self._samples[-1][0] == times).all():

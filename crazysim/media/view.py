@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_settings, color, positive_integer, setting
 from crazysim.eager import fetch_rows
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.media.top_view import TopView
 from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.media.worlds import world_indices
@@ -86,23 +86,24 @@ class View:
             positive_integer(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height")
         )
         worlds = np.atleast_1d(np.asarray(self.worlds))  # ``check_settings`` has checked that these are numbers
-        if worlds.ndim != 1:
-            raise ConfigError(f"expected worlds as a list of indices, got {short_repr(self.worlds)}. Use (0,).")
+        expect(worlds.ndim == 1, "worlds as a list of indices", self.worlds, "Use (0,).")
         self.worlds = worlds.tolist()
         if self.columns is not None:
             positive_integer("columns", self.columns)
-        if min(self.tile_size) < 1:
-            raise ConfigError(
-                f"expected an image that {len(self.worlds)} worlds fit into, got {self.width} x {self.height} pixels. "
-                f"Show fewer worlds or increase the size."
-            )
-        if self.follow is not None and self.hold is not None:
-            raise ConfigError("expected a drone to follow or points to hold in view, got both. Use only one of them.")
-        if (self.follow is not None or self.hold is not None) and self.camera != -1:
-            raise ConfigError(
-                f"expected camera=-1, the free camera, to follow a drone or hold points in view, got "
-                f"{self.camera!r}. Drones carry the cameras track_cam:i and fpv_cam:i."
-            )
+        require(
+            min(self.tile_size) >= 1,
+            f"expected an image that {len(self.worlds)} worlds fit into, got {self.width} x {self.height} pixels. "
+            f"Show fewer worlds or increase the size.",
+        )
+        require(
+            self.follow is None or self.hold is None,
+            "expected a drone to follow or points to hold in view, got both. Use only one of them.",
+        )
+        require(
+            (self.follow is None and self.hold is None) or self.camera == -1,
+            f"expected camera=-1, the free camera, to follow a drone or hold points in view, got "
+            f"{self.camera!r}. Drones carry the cameras track_cam:i and fpv_cam:i.",
+        )
         if self.trail != 0:
             self._trail = Trail(self.trail)
         if self.top_view:
@@ -176,8 +177,10 @@ class View:
     def _read_worlds(self, sim: Sim) -> tuple[NDArray, NDArray]:
         """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds; add them to the trails."""
         worlds = world_indices(sim, self.worlds)
-        if self.follow is not None and self.follow not in range(sim.n_drones):
-            raise ConfigError(f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}")
+        require(
+            self.follow is None or self.follow in range(sim.n_drones),
+            f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}",
+        )
         time, pos = (
             np.asarray(fetch_rows(sim.time, worlds)[:, 0], float),
             np.asarray(fetch_rows(sim.data.states.pos, worlds), float),
@@ -202,17 +205,20 @@ class View:
     def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
         """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
         config = self.cam_config(time) if callable(self.cam_config) else self.cam_config
-        if config is not None and not isinstance(config, Mapping):
-            raise ConfigError(
-                f"expected cam_config to return a dict, got {short_repr(config)}. Use {{'distance': 3.0}}."
-            )
+        expect(
+            config is None or isinstance(config, Mapping),
+            "cam_config to return a dict",
+            config,
+            "Use {'distance': 3.0}.",
+        )
         config = dict(config or {})
         if self.follow is not None:
             config["lookat"] = self._smooth_aim(k, time, pos[self.follow])
         if self.hold is not None:
             target = np.asarray(self.hold(sim, self.worlds[k]), float)
-            if target.shape[-1:] != (3,):
-                raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {target.shape}.")
+            require(
+                target.shape[-1:] == (3,), f"expected hold to return points of shape (n, 3), got shape {target.shape}."
+            )
             points = np.concatenate([pos, target.reshape(-1, 3)])
             aim = self._smooth_aim(k, time, _frame_points(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}

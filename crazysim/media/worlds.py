@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import expect, require
 from crazysim.sim.sim import Sim
 
 
@@ -18,11 +18,9 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
         sim: Simulation.
         worlds: Indices; None for all worlds.
     """
-    if worlds is not None and np.ndim(worlds) != 1:
-        raise ConfigError(f"expected worlds as a list of indices, got {short_repr(worlds)}. Use [0] for the first.")
+    expect(worlds is None or np.ndim(worlds) == 1, "worlds as a list of indices", worlds, "Use [0] for the first.")
     indices = list(range(sim.n_worlds) if worlds is None else worlds)
-    if not indices:
-        raise ConfigError("expected at least one world, got none")
+    require(indices, "expected at least one world, got none")
     for world in indices:
         require_world(sim, world)
     return np.array(indices)
@@ -30,5 +28,7 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
 
 def require_world(sim: Sim, world: int) -> None:
     """Raise ``ConfigError`` unless a world exists."""
-    if not isinstance(world, (int, np.integer)) or world not in range(sim.n_worlds):
-        raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world!r}")
+    require(
+        isinstance(world, (int, np.integer)) and world in range(sim.n_worlds),
+        f"expected a world from 0 to {sim.n_worlds - 1}, got {world!r}",
+    )
