@@ -18,7 +18,7 @@ BUDGET = {
     "dynamics": 593,
     "engine": 5804,
     "envs": 3896,
-    "geometry": 1097,
+    "geometry": 1089,
     "lab": 9874,
     "media": 986,
     "plugins": 7332,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.geometry.heightfield import drone_to_field, field_distance
 from crazysim.geometry.overlap import convex_distance
 from crazysim.geometry.points import POINT_DISTANCE, components, magnitude
@@ -50,8 +50,10 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
         rot: Rotation matrix from the frame of ``a`` to the frame of ``b``. (..., 3, 3)
     """
-    if a.kind not in DRONE_KINDS:
-        raise ConfigError(f"expected a drone shape of kind {', '.join(DRONE_KINDS)}, got {a.kind}; use one of these")
+    require(
+        a.kind in DRONE_KINDS,
+        f"expected a drone shape of kind {', '.join(DRONE_KINDS)}, got {a.kind}; use one of these",
+    )
     pos, rot = jnp.asarray(pos), jnp.asarray(rot)
     if b.kind == "hfield" and a.kind == "sphere":
         return field_distance(b, pos, a.size[0]) - a.size[0]

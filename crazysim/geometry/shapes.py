@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.tables import read_floats
 
 N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
@@ -51,8 +51,10 @@ class Shape:
     """Heights of a height field, rows along y and columns along x, m. (n_rows, n_columns)"""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.kind, str) or self.kind not in N_SIZES:
-            raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
+        require(
+            isinstance(self.kind, str) and self.kind in N_SIZES,
+            f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these",
+        )
         n_sizes = N_SIZES[self.kind]
         numbers = read_floats("size", self.size).reshape(-1)
         size = numbers[:n_sizes]
@@ -62,15 +64,16 @@ class Shape:
                 f"{tuple(numbers.tolist())}; use MuJoCo's conventions"
             )
         for name, kind, maker in (("vertices", "mesh", "hull"), ("heights", "hfield", "hfield")):
-            if self.kind == kind and getattr(self, name) is None:
-                raise ConfigError(f"expected a {kind} with {name}, got none; make it with geometry.{maker}")
+            require(
+                self.kind != kind or getattr(self, name) is not None,
+                f"expected a {kind} with {name}, got none; make it with geometry.{maker}",
+            )
         object.__setattr__(self, "size", tuple(size.tolist()))
 
     def array(self, name: str) -> np.ndarray:
         """Return an array of the shape by name."""
         values = getattr(self, name)
-        if values is None:
-            raise TypeError(f"expected a shape with {name}, got a {self.kind}, which has none")
+        require(values is not None, f"expected a shape with {name}, got a {self.kind}, which has none", TypeError)
         return values
 
     def _content(self) -> tuple[object, ...]:
@@ -94,15 +97,19 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
             None computes the hull, for up to 64 vertices. (n_faces, 3)
     """
     v = np.asarray(vertices, np.float64)
-    if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
-        raise ConfigError(f"expected four or more finite vertices, (n_vertices, 3), got shape {v.shape}")
+    require(
+        v.ndim == 2 and v.shape[1] == 3 and len(v) >= 4 and np.all(np.isfinite(v)),
+        f"expected four or more finite vertices, (n_vertices, 3), got shape {v.shape}",
+    )
     scale = float(np.max(np.ptp(v, axis=0)))
     thickness = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
     if thickness <= 1e-9 * scale:
         raise ConfigError(f"expected vertices that span a volume, got {len(v)} in one plane; add one outside of it")
     triangles = _find_triangles(v, 1e-9 * scale) if faces is None else np.asarray(faces)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        raise ConfigError(f"expected faces as integers, (n_faces, 3), got {triangles.dtype} {triangles.shape}")
+    require(
+        triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype.kind in "iu",
+        f"expected faces as integers, (n_faces, 3), got {triangles.dtype} {triangles.shape}",
+    )
     if triangles.min() < 0 or triangles.max() >= len(v):
         raise ConfigError(f"expected faces of vertices 0 to {len(v) - 1}, got {triangles.min()} to {triangles.max()}")
     a, b, c = (v[triangles[:, k]] for k in range(3))
@@ -139,8 +146,7 @@ def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
         size: Half extents along x and y, largest height, depth of the ground below z = 0, m. (4,)
     """
     h = np.asarray(heights, np.float64)
-    if h.ndim != 2 or min(h.shape) < 2:
-        raise ConfigError(f"expected heights of two or more rows and columns, got shape {h.shape}")
+    require(h.ndim == 2 and min(h.shape) >= 2, f"expected heights of two or more rows and columns, got shape {h.shape}")
     shape = Shape("hfield", tuple(np.ravel(size)), heights=_read_only_copy(h))
     if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
         raise ConfigError(f"expected heights between 0 and {shape.size[2]} m, got {h.min()} to {h.max()}")
@@ -173,11 +179,11 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the triangles of a convex hull, which have no vertex above their plane; a flat side is a triangle fan."""
-    if len(v) > MAX_HULL_VERTICES:
-        raise ConfigError(
-            f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "
-            f"triangles of the convex hull"
-        )
+    require(
+        len(v) <= MAX_HULL_VERTICES,
+        f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "
+        f"triangles of the convex hull",
+    )
     i, j, k = np.array([(i, j, k) for i in range(len(v)) for j in range(i) for k in range(j)]).T
     normals = np.cross(v[j] - v[i], v[k] - v[i])
     length = np.linalg.norm(normals, axis=1)
