@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 1197,
+    "commands": 1180,
     "control": 2035,
     "core": 1899,
     "crazysim": 1404,

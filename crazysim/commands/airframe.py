@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from crazysim.commands.options import DefaultsFormatter
+from crazysim.errors import require
 from crazysim.storage import check_writable, write_file
 
 ESTIMATE_OPTIONS = (
@@ -68,8 +69,11 @@ def estimate(options: argparse.Namespace) -> None:
 
     path: Path = options.file
     check_writable(path, (".toml",))
-    if path.exists():
-        raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
+    require(
+        not path.exists(),
+        f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it",
+        ValueError,
+    )
     if unknown := [x for x in options.spins or () if x.lower() not in SPIN_SIGNS]:
         raise ValueError(f"expected --spins of ccw and cw, got {unknown[0]!r}")
     try:

@@ -17,7 +17,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import ConfigError, RenderError, not_installed
+from crazysim.errors import RenderError, not_installed, require
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
 from crazysim.progress import progress_bar
@@ -57,8 +57,10 @@ def run_demo_flight(
         out: Folder of the files.
         film: True to write a film.
     """
-    if not 1 / FPS <= seconds < math.inf:
-        raise ConfigError(f"expected --seconds of at least {1 / FPS}, and finite, got {seconds}. Use 10, for example.")
+    require(
+        1 / FPS <= seconds < math.inf,
+        f"expected --seconds of at least {1 / FPS}, and finite, got {seconds}. Use 10, for example.",
+    )
     make_folder(out)
     n_frames = round(seconds * FPS)
     sim = build_sim(n_worlds, n_drones, device)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from crazysim.commands.options import duration
-from crazysim.errors import ConfigError, DivergedError
+from crazysim.errors import ConfigError, DivergedError, require
 
 MAX_PORT = 65535
 """Largest TCP port."""
@@ -66,11 +66,11 @@ def has_several_hosts(options: argparse.Namespace) -> bool:
     Raises:
         ConfigError: If ``--host-id`` or ``--hosts`` is given without ``--coordinator``.
     """
-    if options.coordinator is None and (options.host_id is not None or options.hosts is not None):
-        raise ConfigError(
-            "expected --coordinator with --host-id and --hosts, got none. Use the address of host 0, such as "
-            "--coordinator 10.0.0.1:1234."
-        )
+    require(
+        options.coordinator is not None or (options.host_id is None and options.hosts is None),
+        "expected --coordinator with --host-id and --hosts, got none. Use the address of host 0, such as "
+        "--coordinator 10.0.0.1:1234.",
+    )
     return options.coordinator is not None
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from crazysim.commands.options import DefaultsFormatter, count
 from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import FITTED_MODELS
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify import (
     Columns,
     FittedModel,
@@ -77,22 +77,23 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fit an airframe, print its errors, and write its file."""
     check_writable(options.out, (".toml",))
-    if options.out.exists():
-        raise ConfigError(f"expected a new file, got {str(options.out)!r}, which exists. Choose another name.")
+    require(
+        not options.out.exists(), f"expected a new file, got {str(options.out)!r}, which exists. Choose another name."
+    )
     if options.plot is not None:
         check_writable(options.plot, PICTURE_SUFFIXES)
-    if options.dynamics != "first_principles" and options.network is not None:
-        raise ConfigError(
-            f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
-            "Leave --network out, or use --dynamics first_principles with logs of rotor speeds."
-        )
+    require(
+        options.dynamics == "first_principles" or options.network is None,
+        f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
+        "Leave --network out, or use --dynamics first_principles with logs of rotor speeds.",
+    )
     columns = _read_columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
-    if options.motion and len(options.motion) != len(paths):
-        raise ConfigError(
-            f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
-            "Name them in the order of the logs, then of the logs of --test."
-        )
+    require(
+        not options.motion or len(options.motion) == len(paths),
+        f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
+        "Name them in the order of the logs, then of the logs of --test.",
+    )
     all_logs = [
         read_log(path, columns, motion, interval)
         for (path, interval), motion in zip(
@@ -169,11 +170,11 @@ def _read_columns(texts: Sequence[str]) -> Columns:
     fields: dict[str, Any] = {}
     for text in texts:
         name, equals, names = text.partition("=")
-        if name not in column_fields or not equals:
-            raise ConfigError(
-                f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
-                f"Fields are {', '.join(column_fields)}."
-            )
+        require(
+            name in column_fields and equals,
+            f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
+            f"Fields are {', '.join(column_fields)}.",
+        )
         if "_per_" not in name:  # column names; the other fields are factors, such as rpm_per_unit
             fields[name] = names if name == "time" else tuple(filter(None, names.split(",")))
             continue

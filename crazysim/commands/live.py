@@ -19,7 +19,7 @@ from crazysim.commands.options import (
     require_screen,
     specified_options,
 )
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 if TYPE_CHECKING:
     from crazysim.lab.live.policy_pilot import PolicyPilot
@@ -64,17 +64,19 @@ def run(options: argparse.Namespace) -> None:
     viewers = [name for name in ("window", "browser") if getattr(options, name)]
     if options.headless and viewers:
         raise ConfigError(f"expected --headless or --{viewers[0]}, got both. Leave one out.")
-    if options.headless and options.seconds is None:
-        raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
+    require(
+        not options.headless or options.seconds is not None,
+        "expected --seconds with --headless, got none. Use --seconds 20, for example.",
+    )
     if not options.headless and not viewers:
         viewers = ["window" if has_screen() else "browser"]
     if options.window:
         require_screen("--browser or --headless")
     speed, is_piloted = _parse_speed(options.speed), options.pilot or options.gamepad
-    if options.commands and is_piloted:
-        raise ConfigError(
-            "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
-        )
+    require(
+        not options.commands or not is_piloted,
+        "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad.",
+    )
     policy_pilot, n_worlds = _policy_pilot(options), options.worlds
     if policy_pilot is None:
         control_freq = 100 if options.control_freq is None else options.control_freq
@@ -116,8 +118,7 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     """Return the pilot of the policy to fly; None for a flight without one."""
     excluded = ("drones", "control_freq", "freq", "drone", "dynamics", "controller", "pilot", "gamepad", "commands")
     if options.policy is None:
-        if options.goals is not None:
-            raise ConfigError("expected --policy with --goals, got none. Use --policy out/hover, for example.")
+        require(options.goals is None, "expected --policy with --goals, got none. Use --policy out/hover, for example.")
         return None
     if names := [f"--{name.replace('_', '-')}" for name in excluded if getattr(options, name) not in (None, False)]:
         raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(names)}. Leave them out.")

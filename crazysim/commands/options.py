@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crazysim.dynamics import Dynamics
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 if TYPE_CHECKING:
     from crazysim.envs.env import Env
@@ -40,8 +40,9 @@ def count(at_most: int = MAX_COUNT) -> Callable[[str], int]:
 
     def whole_number(text: str) -> int:
         n = int(text)
-        if n > at_most:
-            raise argparse.ArgumentTypeError(f"expected at most {at_most:,}, got {text}. Use a smaller number.")
+        require(
+            n <= at_most, f"expected at most {at_most:,}, got {text}. Use a smaller number.", argparse.ArgumentTypeError
+        )
         return n
 
     return whole_number
@@ -50,8 +51,11 @@ def count(at_most: int = MAX_COUNT) -> Callable[[str], int]:
 def duration(text: str) -> int:
     """Return an option that is a time to wait, s."""
     seconds = int(text)
-    if not 1 <= seconds <= MAX_WAIT:
-        raise argparse.ArgumentTypeError(f"expected 1 to {MAX_WAIT} s, got {text}. Use for example 60.")
+    require(
+        1 <= seconds <= MAX_WAIT,
+        f"expected 1 to {MAX_WAIT} s, got {text}. Use for example 60.",
+        argparse.ArgumentTypeError,
+    )
     return seconds
 
 
@@ -97,8 +101,7 @@ def require_screen(remedy: str) -> None:
     Raises:
         ConfigError: If there is none.
     """
-    if not has_screen():
-        raise ConfigError(f"expected a screen for --window, got none. Use {remedy}.")
+    require(has_screen(), f"expected a screen for --window, got none. Use {remedy}.")
 
 
 def load_policy_and_env(

@@ -15,7 +15,7 @@ from crazysim.commands.options import (
     require_screen,
     specified_options,
 )
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.show_files import Show, load_show
 from crazysim.storage import check_writable, write_file
 
@@ -90,8 +90,7 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
     from crazysim.lab.shows.view import camera_around, live_show
 
     file_option = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
-    if file_option is not None:
-        raise ConfigError(f"expected --live or --{file_option}, got both. Leave one of them out.")
+    require(file_option is None, f"expected --live or --{file_option}, got both. Leave one of them out.")
     with live_show(show, **settings) as live:
         if options.window:
             planned = planned_positions(show.trajectories, np.linspace(0.0, show.duration, 50))

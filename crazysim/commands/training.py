@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from crazysim.commands import hosts
 from crazysim.commands.options import DefaultsFormatter, count, load_policy_and_env, specified_options
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
 
@@ -101,11 +101,12 @@ def parse_seeds(text: str) -> Sequence[int]:
         seeds = range(int(start), int(stop)) if colon else [int(x) for x in text.split(",")]
     except ValueError:
         seeds = []
-    if not seeds or (not colon and len(set(seeds)) < len(seeds)):
-        raise argparse.ArgumentTypeError(
-            f"expected FIRST:END with FIRST below END, or seeds with commas, each once, got {text!r}. Use for example "
-            f"0:8, for the seeds 0 to 7."
-        )
+    require(
+        seeds and (colon or len(set(seeds)) == len(seeds)),
+        f"expected FIRST:END with FIRST below END, or seeds with commas, each once, got {text!r}. Use for example "
+        f"0:8, for the seeds 0 to 7.",
+        argparse.ArgumentTypeError,
+    )
     return seeds
 
 
@@ -129,8 +130,7 @@ def _parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
     pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
-        if not equals:
-            raise ValueError(f"expected NAME=VALUE, got {text!r}; write for example seconds=5")
+        require(equals, f"expected NAME=VALUE, got {text!r}; write for example seconds=5", ValueError)
         try:
             pairs[name] = json.loads(value)
         except ValueError:
@@ -173,8 +173,7 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> None:
     if options.seeds is None and not options.sweep:
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
         return
-    if options.seeds is not None and options.seed is not None:
-        raise ConfigError("expected --seed or --seeds, got both. Use --seeds alone.")
+    require(options.seeds is None or options.seed is None, "expected --seed or --seeds, got both. Use --seeds alone.")
     seeds = options.seeds or [options.seed or 0]
     run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
 
@@ -212,8 +211,11 @@ def export(options: argparse.Namespace) -> None:
     from crazysim.train.export import to_c, to_onnx
     from crazysim.train.training import load_policy
 
-    if options.onnx is None and options.c is None and options.out_of_tree is None:
-        raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or --out-of-tree FOLDER")
+    require(
+        options.onnx is not None or options.c is not None or options.out_of_tree is not None,
+        "expected a file to write, got none; use --onnx FILE, --c FILE, or --out-of-tree FOLDER",
+        ValueError,
+    )
     for path, suffix in ((options.onnx, ".onnx"), (options.c, ".h")):
         if path is not None:
             check_writable(path, (suffix,))
