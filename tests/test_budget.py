@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 9874,
     "media": 986,
     "plugins": 7332,
-    "scene": 3153,
+    "scene": 3102,
     "sim": 1236,
     "train": 2497,
     "trajectories": 1398,

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.settings import check_image_size
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import not_installed, require
 from crazysim.scene.render import camera_id
 
 INSTALL_MESSAGE = not_installed("images of many worlds at once need", "warp-lang", "warp")
@@ -48,8 +48,9 @@ class BatchRenderer:
             raise ImportError(INSTALL_MESSAGE)
         check_image_size(width, height)
         camera_index = camera_id(model, camera)
-        if camera_index < 0:
-            raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")
+        require(
+            camera_index >= 0, "expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render"
+        )
         import warp as wp
 
         wp.config.log_level = wp.LOG_WARNING  # must be set before MuJoCo Warp starts Warp

@@ -15,7 +15,7 @@ import numpy as np
 
 from crazysim.drones.airframe import Airframe
 from crazysim.drones.body import LED_MATERIALS, MATERIALS, MAX_LED_DRONES, BodyGeom, body_cameras, body_geoms
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.scene import mjx
 
 SCENE_FILE = Path(__file__).parents[1] / "scene.xml"
@@ -44,11 +44,11 @@ def build_spec(
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
     reserved_names = [body.name for body in spec.bodies if body.name.startswith("drone:")]
-    if reserved_names:
-        raise ConfigError(
-            f"expected no bodies named 'drone:...', which are reserved for the drones, got {reserved_names} in "
-            f"{str(xml_path)!r}"
-        )
+    require(
+        not reserved_names,
+        f"expected no bodies named 'drone:...', which are reserved for the drones, got {reserved_names} in "
+        f"{str(xml_path)!r}",
+    )
     _add_drones(spec, airframes)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
     dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
@@ -64,11 +64,12 @@ def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
     Raises:
         ConfigError: If the file does not exist or cannot be read.
     """
-    if xml_path is not None and not isinstance(xml_path, (str, Path)):
-        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
+    require(
+        xml_path is None or isinstance(xml_path, (str, Path)),
+        f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}",
+    )
     path = SCENE_FILE if xml_path is None else Path(xml_path)
-    if not path.is_file():
-        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
+    require(path.is_file(), f"expected an existing MJCF file as xml_path, got {str(path)!r}")
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -205,13 +206,15 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
     changes = {}
     for name, size in (("mocap_pos", 3), ("mocap_quat", 4)):
         value, shape = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
-        if np.shape(value) != shape:
-            raise ConfigError(
-                f"expected mjx_data.{name} of shape {shape} = (n_worlds, mocap bodies, {size}), got "
-                f"{np.shape(value)}. To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...)."
-            )
-        if not isinstance(value, jax.Array) and not np.isfinite(value).all():
-            raise ConfigError(f"expected finite numbers in mjx_data.{name}, got NaN or infinity")
+        require(
+            np.shape(value) == shape,
+            f"expected mjx_data.{name} of shape {shape} = (n_worlds, mocap bodies, {size}), got "
+            f"{np.shape(value)}. To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...).",
+        )
+        require(
+            isinstance(value, jax.Array) or np.isfinite(value).all(),
+            f"expected finite numbers in mjx_data.{name}, got NaN or infinity",
+        )
         changes[name] = jnp.asarray(value, dtype=float)
     return mjx_data.replace(**changes)
 
@@ -229,10 +232,10 @@ def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
     ids = []
     for name in names:
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
-        if body < 0 or mj_model.body_mocapid[body] < 0:
-            raise ConfigError(
-                f"expected a mocap body {name!r}, got none. Edits of sim.spec must leave drones and objects with poses "
-                f"in the scene. Use set_pose of its handle to move an object away, or add it with mocap=False."
-            )
+        require(
+            body >= 0 and mj_model.body_mocapid[body] >= 0,
+            f"expected a mocap body {name!r}, got none. Edits of sim.spec must leave drones and objects with poses "
+            f"in the scene. Use set_pose of its handle to move an object away, or add it with mocap=False.",
+        )
         ids.append(int(mj_model.body_mocapid[body]))
     return ids

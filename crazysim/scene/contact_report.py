@@ -23,7 +23,7 @@ from crazysim.arguments import check_flag
 from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData, require_states
 from crazysim.core.pair_reductions import reduce_over_others
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import SizedShapes
@@ -113,8 +113,7 @@ def build_contact_fn(
     floor, drones = check_flag("floor", floor), check_flag("drones", drones)
     bodies = select_bodies(model, objects, require_data=False)
     names = tuple(body.name for body in bodies)
-    if not (bodies or floor or drones):
-        raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
+    require(bodies or floor or drones, "expected floor, drones or at least one object, got a contact report of nothing")
     groups = [list(group) for _, group in groupby(bodies, _group_key)]
 
     def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
@@ -163,10 +162,12 @@ def list_objects(objects: ObjectSelection) -> tuple[Handle | str, ...] | None:
     if isinstance(objects, (Handle, str)):
         return (objects,)
     selection = tuple(objects) if np.iterable(objects) else (objects,)
-    if not all(isinstance(x, (Handle, str)) for x in selection):
-        raise ConfigError(
-            f"expected objects as handles or names of bodies, got {short_repr(objects)}. Use None for all, () for none."
-        )
+    expect(
+        all(isinstance(x, (Handle, str)) for x in selection),
+        "objects as handles or names of bodies",
+        objects,
+        "Use None for all, () for none.",
+    )
     return selection
 
 
@@ -190,11 +191,11 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
                 f"expected an object that drones can touch, {', '.join(by_name) or 'but the scene has none'}, got "
                 f"{name!r}"
             )
-        if require_data and name in model.mocap_bodies:
-            raise ConfigError(
-                f"expected objects whose poses are in the data, got body {name!r}, which is moved through "
-                f"sim.mjx_data. Add it with sim.scene.add, or leave it out with objects=."
-            )
+        require(
+            not require_data or name not in model.mocap_bodies,
+            f"expected objects whose poses are in the data, got body {name!r}, which is moved through "
+            f"sim.mjx_data. Add it with sim.scene.add, or leave it out with objects=.",
+        )
     return [by_name[name] for name in names]
 
 

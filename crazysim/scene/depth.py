@@ -17,7 +17,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.arguments import check_flag
 from crazysim.core.data import SimData, require_states
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
@@ -217,8 +217,10 @@ def build_depth_fn(
         kernels: Kernels that cast the rays if possible.
         baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
     """
-    if not isinstance(along, str) or along not in ("axis", "ray"):
-        raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
+    require(
+        isinstance(along, str) and along in ("axis", "ray"),
+        f"expected along='axis' of the camera or along='ray', got {along!r}",
+    )
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     height, width = rays[0].shape[:2]
     tile_height, tile_width = (math.gcd(n, TILE_SIDE) for n in (height, width))
@@ -287,8 +289,9 @@ def build_depth_fn(
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
         require_states(data, ("pos", "quat"), batched=False)
-        if data.states.pos.ndim == 1:
-            raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
+        require(
+            data.states.pos.ndim != 1, "expected data of all worlds or of one world for images, got data of one drone"
+        )
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.storage import read_bytes, wrap_read_errors
 
 MAX_FILE_BYTES = 2**32
@@ -62,8 +62,7 @@ def read_map(path: str | Path) -> MapFile:
                 raise ValueError(
                     f"expected triangles of {len(points)} vertices, got {triangles.min()} to {triangles.max()}"
                 )
-    if not len(points):
-        raise ConfigError(f"expected points, got {str(path)!r}, which has none. {READ_REMEDY}")
+    require(len(points), f"expected points, got {str(path)!r}, which has none. {READ_REMEDY}")
     return MapFile(points, triangles if triangles is not None and len(triangles) else None)
 
 
@@ -79,8 +78,7 @@ def read_ply(content: bytes) -> dict[str, Columns]:
         ValueError: If the file is damaged, cut off, or of another kind.
     """
     header, body = _split_header(content, b"end_header")
-    if not header or header[0] != ["ply"]:
-        raise ValueError("expected 'ply' in the first line")
+    require(header and header[0] == ["ply"], "expected 'ply' in the first line", ValueError)
     layout, elements = "", []
     for line in header[1:]:
         if line[0] == "format":
@@ -184,8 +182,7 @@ def _split_header(content: bytes, last_keyword: bytes) -> tuple[list[list[str]],
 def _parse_count(number: str | int) -> int:
     """Return a number of entries, after a check that it is not negative."""
     n = int(number)
-    if n < 0:
-        raise ValueError(f"expected a number of entries, got {n}")
+    require(n >= 0, f"expected a number of entries, got {n}", ValueError)
     return n
 
 
@@ -196,8 +193,7 @@ def _number_padding_columns(names: list[str]) -> list[str]:
 
 def _parse_numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
     """Return the first ``n`` words as numbers, after a check that there are enough words."""
-    if len(words) < n:
-        raise ValueError(f"expected {n} numbers, got {len(words)}")
+    require(len(words) >= n, f"expected {n} numbers, got {len(words)}", ValueError)
     return np.array(words[:n], np.float64)
 
 
@@ -238,8 +234,7 @@ class _AsciiTable:
 
     def _take_words(self, n: int) -> list[bytes]:
         words = self._words[self._position : self._position + n]
-        if len(words) < n:
-            raise ValueError(f"expected {n} numbers, got {len(words)}")
+        require(len(words) >= n, f"expected {n} numbers, got {len(words)}", ValueError)
         self._position += n
         return words
 

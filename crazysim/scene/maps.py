@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_rgba, positive_integer
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.scene.map_files import MapFile, read_map
 from crazysim.scene.primitives import DRONE_TOUCH_BITS
 from crazysim.scene.voxels import count_candidates, merge_voxels, voxels_of_points, voxels_of_triangles
@@ -61,11 +61,11 @@ def map_spec(
     if triangles is None:
         _check_count("points", len(points), MAX_VOXELS, f"Use a part of the map. {remedy}")
         voxels = voxels_of_points(points, resolution, min_points)
-        if not len(voxels):
-            raise ConfigError(f"expected voxels with min_points={min_points} points, got none. Use a smaller number.")
+        require(len(voxels), f"expected voxels with min_points={min_points} points, got none. Use a smaller number.")
     else:
-        if min_points > 1:
-            raise ConfigError(f"expected min_points=1 for triangles, got {min_points}. Only clouds have noise to drop.")
+        require(
+            min_points <= 1, f"expected min_points=1 for triangles, got {min_points}. Only clouds have noise to drop."
+        )
         corners = points[triangles]
         max_voxels = MAX_UNSCALED_VOXELS if scale is None else MAX_VOXELS
         label = f"voxels of {resolution:g} m near triangles"
@@ -73,11 +73,11 @@ def map_spec(
         with announce_if_slow("finding the voxels of triangles", "up to 2 minutes for large meshes"):
             voxels = voxels_of_triangles(corners, resolution)
     boxes = merge_voxels(voxels)
-    if len(boxes) > MAX_BOXES:
-        raise ConfigError(
-            f"expected a map of at most {MAX_BOXES} boxes, got {len(boxes)} from {len(voxels)} voxels of {resolution} "
-            f"m. {remedy}"
-        )
+    require(
+        len(boxes) <= MAX_BOXES,
+        f"expected a map of at most {MAX_BOXES} boxes, got {len(boxes)} from {len(voxels)} voxels of {resolution} "
+        f"m. {remedy}",
+    )
     spec = mujoco.MjSpec()
     options = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": as_rgba(rgba), **DRONE_TOUCH_BITS}
     for first, last in zip(boxes[:, :3], boxes[:, 3:], strict=True):
@@ -111,18 +111,17 @@ def read_frame(
     """Return position (3,), rotation matrix (3, 3) and scale of a file's frame, checked; see ``to_world_frame``."""
     pos = read_numbers("pos", pos, range_between(-MAX_COORDINATE, MAX_COORDINATE), ((3,),))
     quat = read_numbers("quat", quat, shapes=((4,),))
-    if not np.linalg.norm(quat) > 0:
-        raise ConfigError("expected quat as a rotation, got zeros. Use (0, 0, 0, 1) for none.")
+    require(np.linalg.norm(quat) > 0, "expected quat as a rotation, got zeros. Use (0, 0, 0, 1) for none.")
     rot = np.empty(9)
     mujoco.mju_quat2Mat(rot, np.roll(quat / np.linalg.norm(quat), 1))
     if scale is not None:
         return pos, rot.reshape(3, 3), read_number("scale", scale, range_between(positive=True))
     extent = float(np.ptp(points, axis=0).max())
-    if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        raise ConfigError(
-            f"expected a map in metres, of an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} m, got {extent:.4g}. Pass "
-            f"scale=, the number of metres per unit of the file."
-        )
+    require(
+        MIN_EXTENT <= extent <= MAX_EXTENT,
+        f"expected a map in metres, of an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} m, got {extent:.4g}. Pass "
+        f"scale=, the number of metres per unit of the file.",
+    )
     return pos, rot.reshape(3, 3), 1.0
 
 
@@ -133,11 +132,12 @@ def _read_source(source: MapSource) -> MapFile:
         points = np.asarray(source, np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"expected a path or points, (n_points, 3), got {short_repr(source)}") from error
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ConfigError(f"expected points of a map, (n_points, 3), got an array of shape {points.shape}")
+    require(
+        points.ndim == 2 and points.shape[1] == 3 and len(points),
+        f"expected points of a map, (n_points, 3), got an array of shape {points.shape}",
+    )
     return MapFile(points, None)
 
 
 def _check_count(label: str, n: int, limit: int, remedy: str) -> None:
-    if n > limit:
-        raise ConfigError(f"expected a map of at most {limit} {label}, got {n}. {remedy}")
+    require(n <= limit, f"expected a map of at most {limit} {label}, got {n}. {remedy}")

@@ -18,7 +18,7 @@ from crazysim.arguments import check_flag
 from crazysim.core.data import Objects, SimData, require_data
 from crazysim.core.settings import as_mask, positive_integer
 from crazysim.eager import jit_eager_calls
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
@@ -100,8 +100,7 @@ class Handle:
 
     def _objects(self, data: SimData) -> Objects:
         require_data(data)
-        if not self.movable:
-            raise ConfigError(f"expected objects added with mocap=True, got {self.name!r}, which cannot be moved")
+        require(self.movable, f"expected objects added with mocap=True, got {self.name!r}, which cannot be moved")
         names = data.objects.names if data.objects is not None else ()
         if tuple(names[k] for k in self.rows if k < len(names)) != self.bodies:
             raise ConfigError(
@@ -157,8 +156,7 @@ def require_pose_array(value: ArrayLike, field: str, n: int, size: int, n_worlds
     except (TypeError, ValueError) as error:
         raise ConfigError(f"expected numbers for {field}, got {value!r}") from error
     shapes = [(size,), (n, size)] + ([] if n_worlds is None else [(n_worlds, n, size)])
-    if array.shape not in shapes:
-        raise ConfigError(f"expected {field} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
+    require(array.shape in shapes, f"expected {field} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
     is_on_host = isinstance(array, np.ndarray)
     if is_on_host and (not np.isfinite(array).all() or (field == "quat" and not array.any(axis=-1).all())):
         raise ConfigError(
@@ -205,8 +203,7 @@ class SceneObjects:
     ) -> Handle:
         """Add bodies to a spec, and return their handle; see ``Scene.add``."""
         name = _default_name(source) if name is None else name
-        if not isinstance(name, str) or not name:
-            raise ConfigError(f"expected a non-empty string as name of an object, got {short_repr(name)}")
+        expect(isinstance(name, str) and name, "a non-empty string as name of an object", name)
         numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
         used_names = sorted({*self.movable, *(body.name for body in spec.bodies)} & {name, *names})
@@ -314,8 +311,7 @@ def add_bodies(
             for geom in geoms:
                 body.add_geom(**geom)
         return
-    if options:
-        raise ConfigError(f"expected no settings, which only {', '.join(PRIMITIVES)} have, got {', '.join(options)}")
+    require(not options, f"expected no settings, which only {', '.join(PRIMITIVES)} have, got {', '.join(options)}")
     for k, (name, pose) in enumerate(zip(names, poses, strict=True)):
         body_source = _load_source(source[k] if isinstance(source, list) else source)
         body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)

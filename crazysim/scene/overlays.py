@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import as_rgba
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import UnknownNameError, require
 
 DEFAULT_COLOR = (1.0, 0.0, 0.0, 1.0)
 """Default colour of overlays, RGBA."""
@@ -66,29 +66,34 @@ class Overlays:
 
     def text(self, text: str, corner: str) -> None:
         """Add text to a corner of the image, below earlier text."""
-        if not isinstance(corner, str) or corner not in IMAGE_CORNERS:
-            raise UnknownNameError(f"expected corner {' or '.join(map(repr, IMAGE_CORNERS))}, got {corner!r}")
+        require(
+            isinstance(corner, str) and corner in IMAGE_CORNERS,
+            f"expected corner {' or '.join(map(repr, IMAGE_CORNERS))}, got {corner!r}",
+            UnknownNameError,
+        )
         texts_above = self._texts.get(corner)
         self._texts[corner] = (
             _printable_text(text) if texts_above is None else f"{texts_above}\n{_printable_text(text)}"
         )
 
     def _add(self, geoms: list[tuple], rgba: ArrayLike, emission: float = 0.0) -> None:
-        if len(self) + len(geoms) > self.limit:
-            raise ValueError(
-                f"expected at most {self.limit} overlays in one image, got {len(self) + len(geoms)}. Increase "
-                f"sim.max_visual_geom before drawing."
-            )
+        require(
+            len(self) + len(geoms) <= self.limit,
+            f"expected at most {self.limit} overlays in one image, got {len(self) + len(geoms)}. Increase "
+            f"sim.max_visual_geom before drawing.",
+            ValueError,
+        )
         colors = np.broadcast_to(as_rgba(rgba, len(geoms)).astype(np.float32), (len(geoms), 4))
         self._geoms += [(*geom, color, emission) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:
         """Append the geoms to MuJoCo's scene before it is drawn."""
         for kind, size, start, end_or_label, rgba, emission in self._geoms:
-            if scene.ngeom >= scene.maxgeom:
-                raise ValueError(
-                    f"expected at most {scene.maxgeom} geoms in one image, got more. Increase sim.max_visual_geom."
-                )
+            require(
+                scene.ngeom < scene.maxgeom,
+                f"expected at most {scene.maxgeom} geoms in one image, got more. Increase sim.max_visual_geom.",
+                ValueError,
+            )
             geom = scene.geoms[scene.ngeom]
             mujoco.mjv_initGeom(geom, kind, np.full(3, size), start, np.eye(3).ravel(), rgba)
             geom.emission = emission
@@ -124,13 +129,11 @@ class Overlays:
 
 def _printable_text(text: str, max_length: int | None = None) -> str:
     """Return a text after a check that MuJoCo's font can show it."""
-    if not isinstance(text, str) or not text:
-        raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
+    require(isinstance(text, str) and text, f"expected a string that is not empty as text, got {text!r}")
     unprintable = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})
-    if unprintable:
-        raise ConfigError(f"expected ASCII text, got {text!r} with {''.join(unprintable)!r}")
-    if max_length is not None and (len(text) > max_length or "\n" in text):
-        raise ConfigError(
-            f"expected a label of one line and at most {max_length} characters, got {len(text)}: {text!r}"
-        )
+    require(not unprintable, f"expected ASCII text, got {text!r} with {''.join(unprintable)!r}")
+    require(
+        max_length is None or (len(text) <= max_length and "\n" not in text),
+        f"expected a label of one line and at most {max_length} characters, got {len(text)}: {text!r}",
+    )
     return text

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.settings import as_rgba
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.tables import LENGTH, range_between, read_numbers
 
 DRONE_TOUCH_BITS = {"contype": 0, "conaffinity": 2}
@@ -118,8 +118,10 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
         raise ConfigError(f"expected settings {all_settings} of {name!r}, got: {error}") from error
     for geom in geoms:
         lengths = np.asarray(geom["size"], float)
-        if not np.all((lengths > 0) & (lengths <= LENGTH.high)):
-            raise ConfigError(f"expected positive lengths of {name!r}, in m, up to {LENGTH.high:g}, got {settings}")
+        require(
+            np.all((lengths > 0) & (lengths <= LENGTH.high)),
+            f"expected positive lengths of {name!r}, in m, up to {LENGTH.high:g}, got {settings}",
+        )
         geom["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{geom['type'].upper()}")
         geom["size"] = (*geom["size"], 0, 0)[:3]
         geom |= {"rgba": rgba, **DRONE_TOUCH_BITS}

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim import startup
 from crazysim.core.settings import check_image_size
-from crazysim.errors import ConfigError, RenderError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, RenderError, UnknownNameError, expect, require, short_repr
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
@@ -50,14 +50,18 @@ class ModelRenderer:
         overlays: Overlays,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
         """Return or show an image; see ``Sim.render``."""
-        if not isinstance(mode, str) or mode not in RENDER_MODES:
-            raise UnknownNameError(f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}")
+        require(
+            isinstance(mode, str) and mode in RENDER_MODES,
+            f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}",
+            UnknownNameError,
+        )
         check_image_size(width, height)
-        if self._model.nmat > MAX_MATERIALS:
-            raise RenderError(
-                f"expected at most {MAX_MATERIALS} materials in a scene that is drawn, got {self._model.nmat}. Use "
-                f"rgba= instead of materials for objects of one colour, or fewer drones: the LEDs of a drone take two."
-            )
+        require(
+            self._model.nmat <= MAX_MATERIALS,
+            f"expected at most {MAX_MATERIALS} materials in a scene that is drawn, got {self._model.nmat}. Use "
+            f"rgba= instead of materials for objects of one colour, or fewer drones: the LEDs of a drone take two.",
+            RenderError,
+        )
         cam = self._camera(camera, cam_config)
         if mode == "human":
             if not self._windows:
@@ -103,11 +107,12 @@ class ModelRenderer:
             cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, index
             return cam
         mujoco.mjv_defaultFreeCamera(self._model, cam)
-        if cam_config is not None and not isinstance(cam_config, Mapping):
-            raise ConfigError(
-                f"expected cam_config as a dict, got {short_repr(cam_config)}. "
-                f"Use {{'lookat': (0, 0, 1), 'distance': 3.0}}."
-            )
+        expect(
+            cam_config is None or isinstance(cam_config, Mapping),
+            "cam_config as a dict",
+            cam_config,
+            "Use {'lookat': (0, 0, 1), 'distance': 3.0}.",
+        )
         for key, value in (cam_config or {}).items():
             if key not in FREE_CAMERA_SHAPES:  # wrong values of other fields can make MuJoCo end the process
                 names = ", ".join(FREE_CAMERA_SHAPES)
@@ -173,10 +178,11 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise UnknownNameError(f"expected -1 or a camera of the scene, {', '.join(names[:12])}, got {camera!r}")
         return index
-    if not isinstance(camera, (int, np.integer)) or not -1 <= camera < model.ncam:
-        raise UnknownNameError(
-            f"expected a camera id from 0 to {model.ncam - 1}, or -1 for the free camera, got {camera!r}"
-        )
+    require(
+        isinstance(camera, (int, np.integer)) and -1 <= camera < model.ncam,
+        f"expected a camera id from 0 to {model.ncam - 1}, or -1 for the free camera, got {camera!r}",
+        UnknownNameError,
+    )
     return int(camera)
 
 

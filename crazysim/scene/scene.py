@@ -20,7 +20,7 @@ from crazysim.arguments import check_arguments
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.scene import build, collision, contact_report, depth, mjx, splat_images
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.maps import MAP_RGBA, MapSource, map_spec
@@ -203,11 +203,11 @@ class Scene:
         ``options`` are passed to ``add``.
         """
         n_existing = self.added_objects.count_objects(name)
-        if n_existing not in (0, count):
-            raise ConfigError(
-                f"expected {n_existing} objects {name!r}, which are in the scene already, got {count}: objects stay "
-                f"there when a plugin is removed. Use another name=, or a new simulation."
-            )
+        require(
+            n_existing in (0, count),
+            f"expected {n_existing} objects {name!r}, which are in the scene already, got {count}: objects stay "
+            f"there when a plugin is removed. Use another name=, or a new simulation.",
+        )
         if not n_existing:
             self.add(source, name, count=count, **options)
 
@@ -472,8 +472,11 @@ class Scene:
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
-        if not isinstance(world, (int, np.integer)) or isinstance(world, bool) or not 0 <= world < self.n_worlds:
-            raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {short_repr(world)}")
+        expect(
+            isinstance(world, (int, np.integer)) and not isinstance(world, bool) and 0 <= world < self.n_worlds,
+            f"a world from 0 to {self.n_worlds - 1}",
+            world,
+        )
         self.compile_if_edited()
         sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import RenderError
+from crazysim.errors import RenderError, require
 from crazysim.scene.overlays import Overlays
 
 KEY_NAMES = {
@@ -47,8 +47,11 @@ class SceneWindow:
         with warnings.catch_warnings(action="ignore"):  # the error below replaces GLFW's warning
             self._window = glfw.create_window(width, height, "crazysim", None, None)
         glfw.default_window_hints()
-        if not self._window:
-            raise RenderError("expected a screen that can open a window, got none. Use mode='rgb_array' without one.")
+        require(
+            self._window,
+            "expected a screen that can open a window, got none. Use mode='rgb_array' without one.",
+            RenderError,
+        )
         glfw.make_context_current(self._window)
         glfw.swap_interval(0)  # a simulation that draws often must not wait for the screen
         self._context: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -206,11 +209,12 @@ def require_screen() -> None:
     Raises:
         RenderError: If there is none.
     """
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RenderError(
-            "expected a screen for render('human'), got neither DISPLAY nor WAYLAND_DISPLAY. Use mode='rgb_array' "
-            "without a screen."
-        )
+    require(
+        sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"),
+        "expected a screen for render('human'), got neither DISPLAY nor WAYLAND_DISPLAY. Use mode='rgb_array' "
+        "without a screen.",
+        RenderError,
+    )
 
 
 def _load_glfw() -> Any:
@@ -219,8 +223,11 @@ def _load_glfw() -> Any:
 
     with warnings.catch_warnings(action="ignore"):
         is_initialized = glfw.init()
-    if not is_initialized:
-        raise RenderError("expected a screen, got one that GLFW cannot reach. Use mode='rgb_array' without a screen.")
+    require(
+        is_initialized,
+        "expected a screen, got one that GLFW cannot reach. Use mode='rgb_array' without a screen.",
+        RenderError,
+    )
     return glfw
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import mujoco
 from mujoco.rendering.classic import gl_context
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 QUALITY_VARIABLE = "CRAZYSIM_RENDERING"
 """Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for the lower quality of CPUs."""
@@ -29,8 +29,10 @@ false shadows in small images.
 def uses_cpu_quality() -> bool:
     """Return True if images are drawn with the lower quality for CPUs."""
     quality = os.environ.get(QUALITY_VARIABLE, "")
-    if quality not in ("", "full", "fast"):
-        raise ConfigError(f"expected full or fast in {QUALITY_VARIABLE}, got {quality!r}. Correct it, or unset it.")
+    require(
+        quality in ("", "full", "fast"),
+        f"expected full or fast in {QUALITY_VARIABLE}, got {quality!r}. Correct it, or unset it.",
+    )
     return quality == "fast" or (not quality and has_software_renderer())
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, not_installed, require
 from crazysim.pytree import PyTree
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import CarriedCamera, camera_pose
@@ -81,8 +81,10 @@ def build_splat_fn(
     """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure; see ``Scene.splat_fn``."""
     color = read_numbers("background", background, range_between(0.0, 1.0), ((3,),))
     min_coverage = read_number("min_coverage", min_coverage, range_between(0.0, 1.0))
-    if len({camera.fovy for camera in cameras}) > 1:
-        raise ConfigError("expected cameras of one field of view, got several. Draw them in several functions.")
+    require(
+        len({camera.fovy for camera in cameras}) <= 1,
+        "expected cameras of one field of view, got several. Draw them in several functions.",
+    )
     focal = height / 2 / np.tan(np.deg2rad(cameras[0].fovy) / 2)
     draw = functools.partial(
         _choose_renderer(renderer, platform), focal=float(focal), width=width, height=height, background=color
@@ -91,8 +93,9 @@ def build_splat_fn(
     bodies = [camera.body for camera in cameras]
 
     def splats(data: SimData, gaussians: Gaussians, mocap: MocapPoses = None) -> SplatImage:
-        if data.states.pos.ndim == 1:
-            raise ConfigError("expected data of all worlds or of one world for images, got data of one drone")
+        require(
+            data.states.pos.ndim != 1, "expected data of all worlds or of one world for images, got data of one drone"
+        )
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
         poses = [camera_pose(camera, data) for camera in cameras]
@@ -108,15 +111,17 @@ def build_splat_fn(
 
 def _choose_renderer(renderer: Renderer, platform: str) -> Callable[..., tuple[Array, Array, Array]]:
     """Return ``_draw_with_splax`` or ``_draw_with_jax``."""
-    if not isinstance(renderer, str) or renderer not in RENDERERS:
-        raise ConfigError(f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}")
+    require(
+        isinstance(renderer, str) and renderer in RENDERERS,
+        f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}",
+    )
     if renderer == "plain" or (renderer == "auto" and (platform != "gpu" or not importlib.util.find_spec("splax"))):
         return _draw_with_jax
-    if platform != "gpu":
-        raise ConfigError(
-            f"expected a simulation on a GPU for renderer='splax', got one on {platform!r}. Pass device='gpu', or use "
-            f"renderer='plain'."
-        )
+    require(
+        platform == "gpu",
+        f"expected a simulation on a GPU for renderer='splax', got one on {platform!r}. Pass device='gpu', or use "
+        f"renderer='plain'.",
+    )
     return functools.partial(_draw_with_splax, import_splax())
 
 

@@ -12,7 +12,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.pytree import PyTree
 from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
 from crazysim.scene.maps import read_frame
@@ -148,12 +148,11 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
         )
     values = {field: np.stack([vertex[name] for name in columns], axis=-1) for field, columns in names.items()}
     n, n_rest = len(values["pos"]), sum(name.startswith("f_rest_") for name in vertex)
-    if n_rest + 3 not in [3 * k for k in N_COLORS]:
-        raise ConfigError(
-            f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {n_rest} in {str(path)!r}. Save it again."
-        )
-    if not n:
-        raise ConfigError(f"expected Gaussian splats, got {str(path)!r}, which has none. Save it again.")
+    require(
+        n_rest + 3 in [3 * k for k in N_COLORS],
+        f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {n_rest} in {str(path)!r}. Save it again.",
+    )
+    require(n, f"expected Gaussian splats, got {str(path)!r}, which has none. Save it again.")
     rest = np.array([vertex[f"f_rest_{k}"] for k in range(n_rest)]).reshape(3, n_rest // 3, n)
     values["color"] = np.concatenate([values["color"][:, None], rest.transpose(2, 1, 0)], axis=1)
     values["logit_opacity"] = values["logit_opacity"][:, 0]
