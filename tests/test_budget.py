@@ -23,7 +23,7 @@ BUDGET = {
     "media": 986,
     "plugins": 7332,
     "scene": 3102,
-    "sim": 1236,
+    "sim": 1217,
     "train": 2497,
     "trajectories": 1398,
 }

@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.core.airframes import AirframeSource
 from crazysim.core.population import Population
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.scene.build import read_spec
 
 VehicleKind = AirframeSource | type[Population]
@@ -100,11 +100,12 @@ def remove_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> li
         if match is None or not (body.mocap or len(body.joints)):
             continue
         prefix = match.group(1)
-        if prefix not in kinds:
-            raise UnknownNameError(
-                f"expected a body with one of the prefixes {', '.join(kinds)}, got {body.name!r}. Use "
-                f"kinds={{{prefix!r}: ...}} with an airframe or a population, or a body without joints."
-            )
+        require(
+            prefix in kinds,
+            f"expected a body with one of the prefixes {', '.join(kinds)}, got {body.name!r}. Use "
+            f"kinds={{{prefix!r}: ...}} with an airframe or a population, or a body without joints.",
+            UnknownNameError,
+        )
         vehicles.append((body, Vehicle(body.name, kinds[prefix], np.array(body.pos), np.roll(body.quat, -1))))
     names = [vehicle.name for _, vehicle in vehicles]
     duplicates = [name for name in names if names.count(name) > 1]

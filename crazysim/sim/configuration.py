@@ -32,7 +32,7 @@ from crazysim.core.settings import (
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.models import require_freq, require_support
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, short_repr
 
 if TYPE_CHECKING:
     from crazysim.plugins.estimators import Estimator
@@ -164,11 +164,12 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
         estimator = find_estimator(estimator)
         shorthand_plugins.extend([*estimator.sensors, estimator])
     if aero is not None:
-        if not isinstance(aero, str) or aero != "identified":
-            raise ConfigError(
-                f"expected aero='identified' or None, got {short_repr(aero)}. Use plugins=[RotorAerodynamics()] "
-                f"for the other forces of the air on rotors."
-            )
+        expect(
+            isinstance(aero, str) and aero == "identified",
+            "aero='identified' or None",
+            aero,
+            "Use plugins=[RotorAerodynamics()] for the other forces of the air on rotors.",
+        )
         from crazysim.plugins.effects import Residual
 
         shorthand_plugins.append(Residual())

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.scene.splat_images import SplatImage, view_matrices
 from crazysim.scene.splats import SplatScene
 from crazysim.sim.sim import Sim
@@ -128,10 +128,10 @@ def _image_fn(
     camera_prefix: str,
 ) -> Callable[[SimData], SplatImage]:
     splats = sim.scene.splats
-    if splats is None:
-        raise ConfigError(
-            "expected attached splats, got a simulation without. Call attach_splats(sim, scene=...) first."
-        )
+    require(
+        splats is not None,
+        "expected attached splats, got a simulation without. Call attach_splats(sim, scene=...) first.",
+    )
     try:
         width, height = resolution
     except (TypeError, ValueError):

@@ -18,7 +18,7 @@ from crazysim.engine.ir.program import Program, Slot, UnfusedStage
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 from crazysim.engine.tools import symbolic
-from crazysim.errors import ConfigError, UnknownNameError, not_installed
+from crazysim.errors import ConfigError, UnknownNameError, not_installed, require
 from crazysim.jaxcompat import is_key
 from crazysim.sim.sim import Sim
 
@@ -41,8 +41,11 @@ class VectorLayout:
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
-        if name not in self.sizes:
-            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'no fields'}")
+        require(
+            name in self.sizes,
+            f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'no fields'}",
+            UnknownNameError,
+        )
         names = list(self.sizes)
         start = sum(self.sizes[n] for n in names[: names.index(name)])
         return slice(start, start + self.sizes[name])
@@ -100,11 +103,11 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     except ImportError as error:
         raise ImportError(not_installed("the export needs", "casadi", "casadi")) from error
     data, stages = sim.data, as_stages(sim.step_pipeline)
-    if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
-        raise ConfigError(
-            f"expected a world from 0 to {data.core.n_worlds - 1} and a drone from 0 to {data.core.n_drones - 1}, got "
-            f"world {world} and drone {drone}"
-        )
+    require(
+        0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones,
+        f"expected a world from 0 to {data.core.n_worlds - 1} and a drone from 0 to {data.core.n_drones - 1}, got "
+        f"world {world} and drone {drone}",
+    )
     if len(staged_leaves(data)) > 1 and FEEDFORWARD not in parameters:
         stages = [stage("drone")(_stage_default_feedforward), *stages]
     # Below, a leaf is an index into ``program.leaves``, and a slot is a leaf with the index of one of its elements.
@@ -195,8 +198,10 @@ def _command_field(data: SimData) -> str:
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
     """Return the indices of the leaves requested as parameters."""
     names = [x.name for x in program.leaves]
-    if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
-        raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")
+    require(
+        not isinstance(parameters, str) and len(set(parameters)) == len(parameters),
+        f"expected parameters as a list of distinct names, got {parameters!r}",
+    )
     choices = [
         name
         for leaf, name in enumerate(names)
@@ -206,8 +211,11 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
         and jax.numpy.issubdtype(program.leaves[leaf].dtype, jax.numpy.floating)
     ]
     for name in parameters:
-        if name not in choices:
-            raise UnknownNameError(f"expected a parameter of this step, got {name!r}; use one of {', '.join(choices)}")
+        require(
+            name in choices,
+            f"expected a parameter of this step, got {name!r}; use one of {', '.join(choices)}",
+            UnknownNameError,
+        )
     return [names.index(name) for name in parameters]
 
 

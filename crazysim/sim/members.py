@@ -21,7 +21,7 @@ from crazysim.core.data import command_shape
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import is_on_host, jit_eager_calls
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import PluginRegistry
 from crazysim.pytree import PyTree
@@ -125,8 +125,11 @@ class Member:
             )
         if not isinstance(value, jax.Array):
             value = np.asarray(value, x.dtype)
-            if not np.all(np.isfinite(value)):
-                raise ValueError(f"expected finite numbers as {label}, got NaN or infinity. Check its computation.")
+            require(
+                np.all(np.isfinite(value)),
+                f"expected finite numbers as {label}, got NaN or infinity. Check its computation.",
+                ValueError,
+            )
         return _replace_row(x, self.index, value)
 
     def _record(self) -> PyTree:

@@ -21,7 +21,7 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 from crazysim.tables import read_floats
@@ -143,13 +143,16 @@ class MPPI:
             )
         self.horizon, self.samples = positive_integer("horizon", horizon), positive_integer("samples", samples)
         self.substeps, self.knots = positive_integer("substeps", substeps), positive_integer("knots", knots)
-        if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
-            raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon of at least 2, got {knots} and {horizon}")
+        require(
+            2 <= self.knots <= MAX_KNOTS and self.horizon >= 2,
+            f"expected 2 to {MAX_KNOTS} knots and a horizon of at least 2, got {knots} and {horizon}",
+        )
         is_number = isinstance(temperature, (int, float, np.number)) and not isinstance(temperature, bool)
-        if not is_number or not 0 < temperature < np.inf:
-            raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
-        if not callable(cost):
-            raise ConfigError(f"expected cost as a function, got {short_repr(cost)}. Use tracking_cost.")
+        require(
+            is_number and 0 < temperature < np.inf,
+            f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.",
+        )
+        expect(callable(cost), "cost as a function", cost, "Use tracking_cost.")
         self.temperature, self.cost, self._key = temperature, cost, as_key(seed)
         freq = c.freq if freq is None else positive_integer("freq", freq)
         rates: dict[str, Any] = {
@@ -257,11 +260,11 @@ class MPPI:
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
         """Return the data of the rollouts: the data of the simulation, once for every sample, at step 0."""
         template = self._sim.data
-        if data.plugins.keys() != template.plugins.keys():
-            raise ConfigError(
-                f"expected data with the plugins that the simulation had when MPPI was built, "
-                f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
-            )
+        require(
+            data.plugins.keys() == template.plugins.keys(),
+            f"expected data with the plugins that the simulation had when MPPI was built, "
+            f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them.",
+        )
         names, expected_names = [x.objects.names if x.objects is not None else () for x in (data, template)]
         if names != expected_names:
             raise ConfigError(

@@ -13,7 +13,7 @@ from crazysim.core.data import SimData, require_data
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 
 class Reset:
@@ -46,11 +46,11 @@ class Reset:
             )
             for x in (data, default_data)
         )  # fmt: skip
-        if layout != default_layout:
-            raise ConfigError(
-                "expected data and default_data of one simulation, got those of two, or of two scenes. Use its "
-                "default_data, read after sim.scene.add."
-            )
+        require(
+            layout == default_layout,
+            "expected data and default_data of one simulation, got those of two, or of two scenes. Use its "
+            "default_data, read after sim.scene.add.",
+        )
         mask = as_mask(mask, data.core.steps.shape[:1])
         with keep_programs(enabled=not self._cache_size()):
             return self._compiled(data, default_data, mask)

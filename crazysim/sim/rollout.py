@@ -15,7 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.step import FlatData, Step, scan
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.progress import progress_bar
 from crazysim.pytree import leaf_indices
 
@@ -77,8 +77,10 @@ def rollout(
     """
     n_control_steps = positive_integer("n_control_steps", n_control_steps)
     n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)
-    if n_control_steps % every:
-        raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
+    require(
+        n_control_steps % every == 0,
+        f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it",
+    )
     staged = F.staged_leaves(leaf_indices(data))
     flat = step.flatten(data, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
     if wait and n_substeps > 1:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from crazysim.arguments import check_flag
 from crazysim.core.settings import as_rgba
 from crazysim.drones.body import MAX_LED_DRONES
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import UnknownNameError, require
 from crazysim.scene.overlays import DEFAULT_COLOR
 from crazysim.sim.sim import Sim
 from crazysim.tables import read_floats
@@ -61,8 +61,11 @@ def draw_capsule(
         cylinder: True for flat ends.
     """
     start, end = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
-    if start.shape != (3,) or end.shape != (3,):
-        raise ValueError(f"expected ends of shape (3,), got {start.shape} and {end.shape}")
+    require(
+        start.shape == (3,) and end.shape == (3,),
+        f"expected ends of shape (3,), got {start.shape} and {end.shape}",
+        ValueError,
+    )
     sim.overlays.capsule(start, end, radius, DEFAULT_COLOR if rgba is None else rgba, check_flag("cylinder", cylinder))
 
 
@@ -75,8 +78,7 @@ def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
         text: ASCII text of at most 99 characters.
     """
     pos = np.asarray(point, dtype=float)
-    if pos.shape != (3,):
-        raise ValueError(f"expected a point of shape (3,), got {pos.shape}")
+    require(pos.shape == (3,), f"expected a point of shape (3,), got {pos.shape}", ValueError)
     sim.overlays.label(text, pos)
 
 
@@ -100,10 +102,11 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
         rgba: Colour, 0 to 1, of all drones or of each; None for red. (4,) or (n_drones, 4)
         size: Radius, m.
     """
-    if sim.data.controls.state is None:
-        raise ConfigError(f"expected control='state', whose commands have positions, got control={str(sim.control)!r}")
-    if not 0 <= world < sim.n_worlds:
-        raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world}")
+    require(
+        sim.data.controls.state is not None,
+        f"expected control='state', whose commands have positions, got control={str(sim.control)!r}",
+    )
+    require(0 <= world < sim.n_worlds, f"expected a world from 0 to {sim.n_worlds - 1}, got {world}")
     sim.overlays.points(
         np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float),
         DEFAULT_COLOR if rgba is None else rgba,
@@ -146,6 +149,5 @@ def change_material(
 
 def _check_points(points: ArrayLike) -> np.ndarray:
     array = np.atleast_2d(read_floats("points", points))
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"expected points of shape (n, 3), got {array.shape}")
+    require(array.ndim == 2 and array.shape[1] == 3, f"expected points of shape (n, 3), got {array.shape}", ValueError)
     return array
