@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 593,
     "engine": 5804,
-    "envs": 3896,
+    "envs": 3834,
     "geometry": 1089,
     "lab": 9874,
     "media": 986,

@@ -14,7 +14,7 @@ from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.eager import fetch_rows
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.pytree import scopes
 from crazysim.rotation import clip
 
@@ -55,11 +55,11 @@ class Actions:
             control: Command level.
         """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
-        if self.centre.shape != self.scale.shape or self.centre.ndim not in (1, 2):
-            raise ConfigError(
-                f"expected centre and scale of actions of one shape, (k,) or (n_drones, k), got {self.centre.shape} "
-                f"and {self.scale.shape}"
-            )
+        require(
+            self.centre.shape == self.scale.shape and self.centre.ndim in (1, 2),
+            f"expected centre and scale of actions of one shape, (k,) or (n_drones, k), got {self.centre.shape} "
+            f"and {self.scale.shape}",
+        )
 
     @property
     def size(self) -> int:

@@ -13,7 +13,7 @@ from crazysim.arguments import check_arguments, check_array
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import expect, require
 from crazysim.pytree import PyTree
 
 
@@ -106,11 +106,12 @@ class BraxEnv:
         """
         check_array("action", action)
         shape = (self.sim.n_worlds, self.action_size)
-        if np.shape(action) != shape:
-            raise ValueError(
-                f"expected an action of shape {shape} = (n_worlds, action_size), got {np.shape(action)}. The worlds "
-                f"are batched already: leave out vmap and Brax's wrappers (wrap_env=False)."
-            )
+        require(
+            np.shape(action) == shape,
+            f"expected an action of shape {shape} = (n_worlds, action_size), got {np.shape(action)}. The worlds "
+            f"are batched already: leave out vmap and Brax's wrappers (wrap_env=False).",
+            ValueError,
+        )
         env_state = self.env.step(state.pipeline_state, jnp.reshape(jnp.asarray(action), self._action_shape))
         dtype = state.reward.dtype
         done, reward = env_state.done.astype(dtype), self._mean_over_drones(env_state.reward)
@@ -135,16 +136,16 @@ class BraxEnv:
 
     def _seed_key(self, rng: Array) -> Array:
         """Return the key that seeds all worlds."""
-        if not hasattr(rng, "dtype"):
-            raise ConfigError(f"expected a random key, got {short_repr(rng)}. Use jax.random.key(0).")
+        expect(hasattr(rng, "dtype"), "a random key", rng, "Use jax.random.key(0).")
         n_worlds, is_typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         shape = rng.shape if is_typed else rng.shape[:-1]
-        if shape not in ((), (n_worlds,)):
-            raise ValueError(
-                f"expected one key, or one for each of the {n_worlds} worlds, got "
-                f"{'keys' if is_typed else 'key data'} of shape {rng.shape}. Make the environment with n_worlds "
-                f"equal to Brax's num_envs."
-            )
+        require(
+            shape in ((), (n_worlds,)),
+            f"expected one key, or one for each of the {n_worlds} worlds, got "
+            f"{'keys' if is_typed else 'key data'} of shape {rng.shape}. Make the environment with n_worlds "
+            f"equal to Brax's num_envs.",
+            ValueError,
+        )
         rng = rng if is_typed else jax.random.wrap_key_data(rng)
         return rng[0] if shape else rng
 

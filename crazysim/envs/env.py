@@ -31,7 +31,7 @@ from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_of_data, validate_action, validate_goals
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.jaxcompat import require_unforked_process
 from crazysim.pytree import leaf_indices
 from crazysim.sim.configuration import describe_data
@@ -220,8 +220,7 @@ class Env(ABC):
 
     def _check_state(self, state: EnvState) -> None:
         """Check that a state has the structure of the states of this environment."""
-        if not isinstance(state, EnvState):
-            raise ConfigError(f"expected a state of this environment, got {short_repr(state)}. Use env.reset(key).")
+        expect(isinstance(state, EnvState), "a state of this environment", state, "Use env.reset(key).")
         structure = jax.tree.structure(state)
         if structure in self._known_structures:
             return
@@ -322,21 +321,21 @@ class DroneEnv(Env):
         """
         freq = positive_integer("freq", freq)
         require_installed(sim, task)
-        if sim.freq % freq:
-            raise ConfigError(
-                f"expected an environment freq that divides the simulation's {sim.freq} Hz, got {freq} Hz. Use a "
-                f"divisor."
-            )
-        if sim.control_freq % freq:
-            raise ConfigError(
-                f"expected a freq that divides the rate of {sim.control.value} commands, {sim.control_freq} Hz, got "
-                f"{freq} Hz: some actions would never reach the controller. Use a divisor."
-            )
-        if actions is not None and not isinstance(actions, Actions):
-            raise ConfigError(
-                f"expected actions as Actions, got {short_repr(actions)}. Use None for the usual ones of the command "
-                f"level."
-            )
+        require(
+            sim.freq % freq == 0,
+            f"expected an environment freq that divides the simulation's {sim.freq} Hz, got {freq} Hz. Use a divisor.",
+        )
+        require(
+            sim.control_freq % freq == 0,
+            f"expected a freq that divides the rate of {sim.control.value} commands, {sim.control_freq} Hz, got "
+            f"{freq} Hz: some actions would never reach the controller. Use a divisor.",
+        )
+        expect(
+            actions is None or isinstance(actions, Actions),
+            "actions as Actions",
+            actions,
+            "Use None for the usual ones of the command level.",
+        )
         self._sim, self._task, self.freq = sim, task, freq
         self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
@@ -344,25 +343,25 @@ class DroneEnv(Env):
         """``measure_states(data)``: the data with measured states, for one world, or for all worlds if the task is
         batched; None if the task observes the true states."""
         if check_flag("measured", measured):
-            if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
-                raise ConfigError(
-                    "expected a simulation with a sensor of states for measured=True, got none. Use "
-                    "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
-                )
+            require(
+                any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()),
+                "expected a simulation with a sensor of states for measured=True, got none. Use "
+                "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()]).",
+            )
             measure_world = sim.plugins.measured_states
             self.measure_states = vmap_worlds(measure_world) if task.batched else measure_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
-        if self._max_steps < 1:
-            raise ConfigError(
-                f"expected an episode of at least one environment step, got seconds={task.seconds} at {freq} Hz. Use "
-                f"seconds={1 / freq:g} or more."
-            )
+        require(
+            self._max_steps >= 1,
+            f"expected an episode of at least one environment step, got seconds={task.seconds} at {freq} Hz. Use "
+            f"seconds={1 / freq:g} or more.",
+        )
         sim.plugins.check()
-        if ENV_RECORD_NAME in sim.plugins:
-            raise ConfigError(
-                f"expected no plugin of the name {ENV_RECORD_NAME!r}, which is the name of the environment's record"
-            )
+        require(
+            ENV_RECORD_NAME not in sim.plugins,
+            f"expected no plugin of the name {ENV_RECORD_NAME!r}, which is the name of the environment's record",
+        )
         self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins with a reset
         """The step of the physics."""
         self.episode_reset = EpisodeReset(sim)
@@ -434,11 +433,11 @@ def _set_keys(core: SimCore, key: Array) -> SimCore:
     if key.size == 1:
         return core.replace(rng_key=key.reshape(()))
     block_size, remainder = divmod(core.n_worlds, key.size)
-    if key.ndim != 1 or remainder:
-        raise ConfigError(
-            f"expected one key, or keys of blocks that divide the {core.n_worlds} worlds, got keys of shape "
-            f"{key.shape}. Use for example jax.random.key(0)."
-        )
+    require(
+        key.ndim == 1 and not remainder,
+        f"expected one key, or keys of blocks that divide the {core.n_worlds} worlds, got keys of shape "
+        f"{key.shape}. Use for example jax.random.key(0).",
+    )
     rng_key = jnp.broadcast_to(jnp.repeat(key, block_size)[:, None], (core.n_worlds, core.n_drones))
     return core.replace(rng_key=rng_key, world_id=core.world_id % block_size)
 

@@ -18,7 +18,7 @@ from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
-from crazysim.errors import ConfigError, UnknownNameError, not_installed, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
 from crazysim.tables import read_floats
 
 try:
@@ -43,15 +43,15 @@ class DroneParallelEnv(ParallelEnv):
             render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
             render_size: Width and height of an image, pixels.
         """
-        if env.sim.n_worlds != 1:
-            raise ConfigError(
-                f"expected an environment of one world, got {env.sim.n_worlds} worlds. Make it with n_worlds=1, or use "
-                f"crazysim.envs.DroneVectorEnv."
-            )
-        if env.reset_policy is not None:
-            raise ConfigError(
-                "expected an environment without AutoReset, got one with it. Call reset() after an episode."
-            )
+        require(
+            env.sim.n_worlds == 1,
+            f"expected an environment of one world, got {env.sim.n_worlds} worlds. Make it with n_worlds=1, or use "
+            f"crazysim.envs.DroneVectorEnv.",
+        )
+        require(
+            env.reset_policy is None,
+            "expected an environment without AutoReset, got one with it. Call reset() after an episode.",
+        )
         self.env, self.sim, self.render_mode = env, env.sim, render_mode
         self._renderer = Renderer(env.sim, render_mode, size=render_size)
         self.metadata = {
@@ -108,8 +108,7 @@ class DroneParallelEnv(ParallelEnv):
         Returns:
             Observations, rewards, terminations, truncations and infos, by agent.
         """
-        if self.env_state is None or not self.agents:
-            raise ConfigError("expected a running episode, got none. Call reset() first.")
+        require(self.env_state is not None and self.agents, "expected a running episode, got none. Call reset() first.")
         self.env_state, results = self._step(self.env_state, self._stack_actions(actions))
         obs, reward, terminated, truncated, info = jax.device_get(results)
         if self.render_mode == "human":
@@ -125,8 +124,7 @@ class DroneParallelEnv(ParallelEnv):
 
     def state(self) -> np.ndarray:
         """Return the observations of all drones as one vector: drone after drone, sorted by name for each drone."""
-        if self.env_state is None:
-            raise ConfigError("expected a reset before state(), got none. Call reset() first.")
+        require(self.env_state is not None, "expected a reset before state(), got none. Call reset() first.")
         return np.array(flatten(self.env_state.obs)).ravel()
 
     def render(self) -> np.ndarray | None:
@@ -152,10 +150,7 @@ class DroneParallelEnv(ParallelEnv):
 
     def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
         """Return the validated actions of all agents as one array. (n_drones, k)"""
-        if not isinstance(actions, Mapping):
-            raise ConfigError(
-                f"expected a dict with an action of every drone, got {short_repr(actions)}. Use {{'drone_0': ...}}."
-            )
+        expect(isinstance(actions, Mapping), "a dict with an action of every drone", actions, "Use {'drone_0': ...}.")
         if unknown_agents := [agent for agent in actions if agent not in self.agents]:
             raise UnknownNameError(f"expected actions of {', '.join(self.agents)}, got one of {unknown_agents[0]}")
         if missing_agents := [agent for agent in self.agents if agent not in actions]:
@@ -163,10 +158,8 @@ class DroneParallelEnv(ParallelEnv):
         shape = self.action_spaces[self.agents[0]].shape
         rows = [np.float32(read_floats(f"action of {agent}", actions[agent])) for agent in self.agents]
         for agent, row in zip(self.agents, rows, strict=True):
-            if row.shape != shape:
-                raise ValueError(f"expected an action of {agent} of shape {shape}, got {row.shape}")
-            if not np.isfinite(row).all():
-                raise ConfigError(f"expected a finite action of {agent}, got NaN or infinity")
+            require(row.shape == shape, f"expected an action of {agent} of shape {shape}, got {row.shape}", ValueError)
+            require(np.isfinite(row).all(), f"expected a finite action of {agent}, got NaN or infinity")
         return np.stack(rows)
 
     def _split_by_agent(self, tree: Any) -> dict[str, Any]:

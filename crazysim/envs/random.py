@@ -18,7 +18,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.random import GOLDEN_STRIDE, mix_bits, seed_key, uniform_at
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, short_repr
 
 
 def as_seed(seed: object) -> int | None:
@@ -46,11 +46,12 @@ def read_options(options: object, *names: str) -> dict[str, Any]:
 
 def check_key(key: object) -> None:
     """Check that an argument is a typed random key, or an array of typed random keys."""
-    if not isinstance(key, Array) or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or not key.size:
-        raise ConfigError(
-            f"expected a random key, got {short_repr(key)}. Use jax.random.key(0), or jax.random.wrap_key_data(key) "
-            f"for a key of jax.random.PRNGKey."
-        )
+    expect(
+        isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.size,
+        "a random key",
+        key,
+        "Use jax.random.key(0), or jax.random.wrap_key_data(key) for a key of jax.random.PRNGKey.",
+    )
 
 
 def episode_key(data: SimData, name: str) -> Array:

@@ -19,7 +19,7 @@ from types import ModuleType
 
 from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.storage import MAX_TEXT_BYTES, make_private_folder, open_file, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
@@ -109,11 +109,11 @@ def load_listed_task(reference: str, names: Container[str]) -> type[Task] | str:
         f"Read the code of the task, and name it yourself: --task FILE.py:{name or 'NAME'} in a command, or "
         f"load_policy(folder, task=...)."
     )
-    if reference not in _read_list():
-        raise ConfigError(
-            f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
-            f"others could have made. {remedy}"
-        )
+    require(
+        reference in _read_list(),
+        f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
+        f"others could have made. {remedy}",
+    )
     if location.endswith(".py") and (reason := untrusted_reason(Path(location))):
         raise ConfigError(f"expected a file that only you can write, got {location!r}: {reason}. {remedy}")
     return load_task(reference, names)

@@ -36,7 +36,7 @@ from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
 from crazysim.envs.wrappers.images import CameraImages
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require
 from crazysim.plugins.effects.randomize import Randomize
 from crazysim.plugins.sensors.camera import Camera
 from crazysim.plugins.sensors.image_sensor import ImageSensor
@@ -145,11 +145,12 @@ def make(
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
     if randomize is not None:
-        if not isinstance(randomize, str) or randomize not in RANDOMIZATIONS:
-            raise ConfigError(
-                f"expected randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, got {short_repr(randomize)}. "
-                f"Use effects=[Randomize(...)] for other ranges."
-            )
+        expect(
+            isinstance(randomize, str) and randomize in RANDOMIZATIONS,
+            f"randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}",
+            randomize,
+            "Use effects=[Randomize(...)] for other ranges.",
+        )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, freq=sim_freq, **settings)
     repeated_names = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
@@ -168,10 +169,12 @@ def make(
     if depth_image is None:
         task_camera = task.policy_camera() if camera is None else None
         return env if task_camera is None else CameraImages(env, task_camera, {x: x for x in task_camera.outputs})
-    if not isinstance(depth_image, (tuple, list)) or len(depth_image) != 2:
-        raise ConfigError(
-            f"expected depth_image as width and height in pixels, got {short_repr(depth_image)}. Try (16, 12)."
-        )
+    expect(
+        isinstance(depth_image, (tuple, list)) and len(depth_image) == 2,
+        "depth_image as width and height in pixels",
+        depth_image,
+        "Try (16, 12).",
+    )
     return CameraImages(env, Camera(*depth_image), {"depth": "depth"})
 
 
@@ -189,11 +192,11 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
     Returns:
         Id in Gymnasium's registry, such as ``"crazysim/TwoHoops-v0"``, for ``gymnasium.make_vec``.
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in BUILT_IN_TASKS:
-        raise ConfigError(
-            f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
-            f"Use for example 'two_hoops'."
-        )
+    require(
+        isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", name) and name not in BUILT_IN_TASKS,
+        f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
+        f"Use for example 'two_hoops'.",
+    )
     control = enum_member(Control, "control", control).value
     entry = Entry(_check_class(task), _gymnasium_id(name), control, positive_integer("n_drones", n_drones))
     TASKS[name] = entry
@@ -216,8 +219,9 @@ def entry_of(task: str | Task, is_named: bool = True) -> Entry:
     if isinstance(task, Task):
         entries = (entry for entry in TASKS.values() if entry.task is type(task))
         return next(entries, Entry(_check_class(type(task)), ""))
-    if not isinstance(task, str):
-        raise ConfigError(f"expected the name of a task or a task, got {task!r}. A class has to be called: Task().")
+    require(
+        isinstance(task, str), f"expected the name of a task or a task, got {task!r}. A class has to be called: Task()."
+    )
     if task in TASKS:
         return TASKS[task]
     if is_reference(task):

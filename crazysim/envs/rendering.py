@@ -8,7 +8,7 @@ import numpy as np
 
 from crazysim.core.settings import check_image_size
 from crazysim.envs.state import EnvState
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import expect, require
 from crazysim.sim.sim import Sim
 
 RENDER_MODES = ("rgb_array", "human")
@@ -29,19 +29,24 @@ class Renderer:
             worlds: Worlds to render; None for all.
             size: Width and height of an image, pixels.
         """
-        if mode is not None and (not isinstance(mode, str) or mode not in RENDER_MODES):
-            raise ConfigError(f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}")
+        require(
+            mode is None or (isinstance(mode, str) and mode in RENDER_MODES),
+            f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}",
+        )
         indices = np.arange(sim.n_worlds) if worlds is None else np.asarray(worlds)
         is_index = indices.ndim == 1 and indices.size and np.issubdtype(indices.dtype, np.integer)
-        if not is_index or not np.all((indices >= 0) & (indices < sim.n_worlds)):
-            raise ConfigError(
-                f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {short_repr(worlds)}. "
-                f"Use [0], or None for all."
-            )
-        if not isinstance(size, (tuple, list)) or len(size) != 2:
-            raise ConfigError(
-                f"expected render_size as width and height in pixels, got {short_repr(size)}. Use (640, 480)."
-            )
+        expect(
+            is_index and np.all((indices >= 0) & (indices < sim.n_worlds)),
+            f"render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}",
+            worlds,
+            "Use [0], or None for all.",
+        )
+        expect(
+            isinstance(size, (tuple, list)) and len(size) == 2,
+            "render_size as width and height in pixels",
+            size,
+            "Use (640, 480).",
+        )
         self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), check_image_size(*size)
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
@@ -50,11 +55,11 @@ class Renderer:
         Raises:
             RenderError: If this machine cannot render.
         """
-        if self.mode is None or state is None:
-            raise ConfigError(
-                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. "
-                "Pass render_mode when you make it."
-            )
+        require(
+            self.mode is not None and state is not None,
+            "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. "
+            "Pass render_mode when you make it.",
+        )
         self.sim.data = state.data
         width, height = self.size
         if self.mode == "human":

@@ -17,7 +17,7 @@ from crazysim.engine.step import FlatData, scan
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.jaxcompat import is_key
 from crazysim.pytree import PyTree, select_worlds
 
@@ -97,8 +97,7 @@ def rollout(
         The state and the memory after the last step, and the results of ``keep``, stacked over time, (n_steps, ...).
     """
     n_steps = positive_integer("n_steps", n_steps)
-    if n_steps > MAX_STEPS:
-        raise ConfigError(f"expected n_steps of at most {MAX_STEPS}, got {n_steps}. Use several rollouts.")
+    require(n_steps <= MAX_STEPS, f"expected n_steps of at most {MAX_STEPS}, got {n_steps}. Use several rollouts.")
     check_key(key)
     memory = initial_memory if memory is None else memory
     flat = env.flatten(state)
@@ -134,11 +133,12 @@ def rollout(
 def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
     """Return action, memory and extras of a policy, after checking that the memory keeps its shapes and types."""
     results = policy(obs, memory, key)
-    if not isinstance(results, (tuple, list)) or len(results) != 3:
-        raise ConfigError(
-            f"expected a policy that returns (action, memory, extras), got {short_repr(results)}. A policy without "
-            f"memory returns (action, memory, ()) with the memory that it receives."
-        )
+    expect(
+        isinstance(results, (tuple, list)) and len(results) == 3,
+        "a policy that returns (action, memory, extras)",
+        results,
+        "A policy without memory returns (action, memory, ()) with the memory that it receives.",
+    )
     if _formats(memory) != _formats(results[1]):
         raise ConfigError(
             f"expected a policy that returns a memory of the shapes and types that it receives, {_formats(memory)}, "

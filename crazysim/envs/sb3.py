@@ -19,7 +19,7 @@ from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.rendering import Renderer
 from crazysim.envs.state import EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -101,14 +101,12 @@ class DroneVecEnv(VecEnv):
 
     def step_async(self, actions: ArrayLike) -> None:
         """Store the actions for the next step. (num_envs, n_drones * k)"""
-        if self.state is None:
-            raise ConfigError("expected a reset before the first step, got none. Call reset().")
+        require(self.state is not None, "expected a reset before the first step, got none. Call reset().")
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance all worlds; return observations, rewards, flags that are True where an episode ended, and infos."""
-        if self._actions is None:
-            raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
+        require(self._actions is not None, "expected actions before step_wait(), got none. Call step(actions).")
         self.state, arrays = self._step_fn(self.state, self._actions)
         self._actions = None
         obs, final_obs, reward, done, episode_results = jax.device_get(arrays)
@@ -141,10 +139,10 @@ class DroneVecEnv(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: ArrayLike | None = None, **kwargs: Any) -> list[Any]:
         """Call ``render``, the only method that is supported."""
         del indices
-        if method_name != "render" or args or kwargs:
-            raise ConfigError(
-                f"expected method 'render' without arguments, got {method_name!r}: all worlds are one compiled program"
-            )
+        require(
+            method_name == "render" and not args and not kwargs,
+            f"expected method 'render' without arguments, got {method_name!r}: all worlds are one compiled program",
+        )
         return list(self.get_images())
 
     def env_is_wrapped(self, wrapper_class: type, indices: ArrayLike | None = None) -> list[bool]:

@@ -15,7 +15,7 @@ from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES
 from crazysim.envs.vector import DroneVectorEnv
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 
 class DroneSingleEnv(gymnasium.Env):
@@ -34,10 +34,10 @@ class DroneSingleEnv(gymnasium.Env):
             render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
             render_size: Width and height of an image, pixels.
         """
-        if env.sim.n_worlds != 1:
-            raise ConfigError(
-                f"expected an environment of one world, got {env.sim.n_worlds} worlds. Use gymnasium.make_vec."
-            )
+        require(
+            env.sim.n_worlds == 1,
+            f"expected an environment of one world, got {env.sim.n_worlds} worlds. Use gymnasium.make_vec.",
+        )
         self.vector = DroneVectorEnv(env, AutoresetMode.DISABLED, render_mode, render_size=render_size, numpy=True)
         self.sim, self.render_mode = env.sim, render_mode
         self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": self.vector.metadata["render_fps"]}

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import is_real
 from crazysim.eager import is_traced
 from crazysim.envs.actions import Actions
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.pytree import PyTree, leaf
 from crazysim.tables import read_numbers
 
@@ -275,11 +275,10 @@ def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
     goals = pos if isinstance(pos, Array) else read_numbers("pos", pos)
     goals = goals[:, None] if goals.ndim == 2 else goals
     has_batch_shape = all(n in (1, expected) for n, expected in zip(goals.shape, template.shape[:2], strict=False))
-    if not is_real(goals):
-        raise ConfigError(f"expected goals as real numbers, got type {goals.dtype}. Use float32.")
-    if goals.shape[-1:] != (3,) or not (goals.ndim == 1 or (goals.ndim == 3 and has_batch_shape)):
-        raise ConfigError(
-            f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {template.shape}, got "
-            f"{np.shape(pos)}. Use (1, n_drones, 3) for the same goals in every world."
-        )
+    require(is_real(goals), f"expected goals as real numbers, got type {goals.dtype}. Use float32.")
+    require(
+        goals.shape[-1:] == (3,) and (goals.ndim == 1 or (goals.ndim == 3 and has_batch_shape)),
+        f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {template.shape}, got "
+        f"{np.shape(pos)}. Use (1, n_drones, 3) for the same goals in every world.",
+    )
     return jnp.broadcast_to(jnp.asarray(goals, template.dtype), template.shape)

@@ -19,7 +19,7 @@ from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
 from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState
 from crazysim.envs.task_check import require_finite_start
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import replace_leaves
 
 Output = Callable[[EnvState], Any]
@@ -75,8 +75,7 @@ class EnvStepper:
             actions: Actions of all drones; the axes after the first may be flattened. (n_worlds, ...)
         """
         flat = self._flat
-        if flat is None:
-            raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
+        require(flat is not None, "expected a state before the first step, got none. Assign stepper.state.")
         if self._env.sim.mesh is not None:  # the actions may be on one device
             actions = jax.device_put(actions, NamedSharding(self._env.sim.mesh, PartitionSpec(WORLD_AXIS)))
         carry, fixed_leaves = (

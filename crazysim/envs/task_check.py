@@ -17,7 +17,7 @@ from crazysim.core.sharding import fetch_arrays
 from crazysim.eager import explain_traced_values
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import n_world_axes, scopes, watched_flags
 from crazysim.sim.sim import Sim
 
@@ -28,16 +28,15 @@ REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 
 def require_installed(sim: Sim, task: object) -> None:
     """Check that a task was installed in a simulation."""
-    if not isinstance(sim, Sim):
-        raise ConfigError(f"expected a simulation, got {short_repr(sim)}. Use Sim(), or crazysim.envs.make.")
+    expect(isinstance(sim, Sim), "a simulation", sim, "Use Sim(), or crazysim.envs.make.")
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
-    if task.Record is not None and not isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record):
-        raise ConfigError(
-            f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
-            f"task.install(sim) first, or use crazysim.envs.make."
-        )
+    require(
+        task.Record is None or isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record),
+        f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
+        f"task.install(sim) first, or use crazysim.envs.make.",
+    )
 
 
 def require_finite_start(task: Task, state: EnvState) -> None:
@@ -68,11 +67,11 @@ def check_record(state: EnvState, stepped: EnvState) -> None:
     start_leaves, stepped_leaves = (dict(tree_leaves_with_path(x.record)) for x in (state, stepped))
     for (path, x), scope in zip(start_leaves.items(), leaf_scopes, strict=True):
         name = keystr(path).lstrip(".")
-        if scope in ("batched", "opaque"):
-            raise ConfigError(
-                f"expected {name} to be declared for drones, worlds or as shared, got a field that is {scope!r}. "
-                f'Declare it with leaf("drone"), leaf("world") or leaf("shared").'
-            )
+        require(
+            scope not in ("batched", "opaque"),
+            f"expected {name} to be declared for drones, worlds or as shared, got a field that is {scope!r}. "
+            f'Declare it with leaf("drone"), leaf("world") or leaf("shared").',
+        )
         if scope == "drone" and x.shape[1:2] != (n_drones,):
             raise ConfigError(
                 f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
@@ -109,11 +108,11 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     """
     title = f"task {task.name or type(task).__name__!r}"
     undefined = [name for name in REQUIRED_METHODS if getattr(type(task), name) is getattr(Task, name)]
-    if undefined:
-        raise ConfigError(
-            f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED_METHODS)}, got no "
-            f"{', '.join(undefined)}. {GUIDE} describes each method."
-        )
+    require(
+        not undefined,
+        f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED_METHODS)}, got no "
+        f"{', '.join(undefined)}. {GUIDE} describes each method.",
+    )
     n_worlds, n_drones = data.states.pos.shape[:2]
     batch, batch_name = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)

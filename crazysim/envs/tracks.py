@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 CELL_SIZE = (1.0, 1.2)
 """Size of the cells of a random course, along x and y, m. The start and each gate are in different cells."""
@@ -93,8 +93,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
                 f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m. Start and gates need a cell "
                 f"each. Set wider limits with Track(low=..., high=...), or use fewer gates or obstacles."
             )
-        if n_drones > 8:
-            raise ConfigError(f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
+        require(n_drones <= 8, f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
         return track
     starts = np.asarray(track.start) + start_offsets(n_drones)
     for kind, points, clearance in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):

@@ -22,7 +22,7 @@ from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.jaxcompat import require_unforked_process
 
 
@@ -96,12 +96,14 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         seed = as_seed(seed)
         require_unforked_process()
         state_before = self.state
-        if mask is not None and seed is not None:
-            raise ConfigError(
-                "expected a seed or a reset_mask, got both. Leave the seed out: a seed is for all worlds."
-            )
-        if mask is not None and state_before is None:
-            raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
+        require(
+            mask is None or seed is None,
+            "expected a seed or a reset_mask, got both. Leave the seed out: a seed is for all worlds.",
+        )
+        require(
+            mask is None or state_before is not None,
+            "expected a reset of all worlds before the first reset_mask, got none. Call reset().",
+        )
         super().reset(seed=seed)
         if mask is not None:
             state = self._restart_fn(state_before, mask)
@@ -141,8 +143,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             actions: Actions in [-1, 1]. (num_envs, k), or (num_envs, n_drones, k) with several drones
         """
-        if self._outputs is None:
-            raise ConfigError("expected a reset before the first step, got none. Call reset().")
+        require(self._outputs is not None, "expected a reset before the first step, got none. Call reset().")
         shape = self.action_space.shape or ()
         actions = read_action(actions, shape) if isinstance(actions, jax.Array) else check_actions(actions, shape)
         self._outputs, terminated, truncated = self._stepper(actions)

@@ -20,7 +20,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, nearest_entries, state_of, with_record
 from crazysim.envs.tracks import ranks
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
@@ -105,8 +105,10 @@ class Avoid(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n_poles + self.n_boxes == 0:
-            raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
+        require(
+            self.n_poles + self.n_boxes != 0,
+            "expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.",
+        )
 
     def field(self, n_drones: int) -> Field:
         """Return the dimensions of the field: at least a third of the cells is free, and all drones fit in a row."""

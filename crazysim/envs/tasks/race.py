@@ -24,7 +24,7 @@ from crazysim.envs.tasks.goals import install_rules, pick_entry, with_record
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import device_array, host_array
 from crazysim.sim.sim import Sim
 
@@ -82,11 +82,11 @@ class Race(Task):
     gates."""
 
     def install(self, sim: Sim) -> None:
-        if self.practice and sim.n_drones >= max(self.track.n_gates, 2):
-            raise ConfigError(
-                f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
-                f"gates: drones start behind different gates. Use practice=False."
-            )
+        require(
+            not self.practice or sim.n_drones < max(self.track.n_gates, 2),
+            f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
+            f"gates: drones start behind different gates. Use practice=False.",
+        )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
         stand_height = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]

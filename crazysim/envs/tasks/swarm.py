@@ -20,7 +20,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, on_floor, state_of, with_record
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
@@ -76,8 +76,9 @@ class Swarm(Task):
     """Distance below which a drone is at its goal, m."""
 
     def install(self, sim: Sim) -> None:
-        if sim.n_drones < 2:
-            raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
+        require(
+            sim.n_drones >= 2, f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more."
+        )
         if self.formation is not None:
             as_formation(self.formation, sim.n_drones)
 
@@ -187,8 +188,10 @@ def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndar
         goals = np.asarray(formation, float)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"expected a formation of shape ({n_drones}, 3), got {formation!r}") from error
-    if goals.shape != (n_drones, 3) or not np.all(np.isfinite(goals)):
-        raise ConfigError(f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {goals.shape}")
+    require(
+        goals.shape == (n_drones, 3) and np.all(np.isfinite(goals)),
+        f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {goals.shape}",
+    )
     if goals[:, 2].min() < 0.2:
         raise ConfigError(f"expected a formation at least 0.2 m above the floor, got {goals[:, 2].min()} m")
     separations = np.asarray(separation(jnp.asarray(goals)))

@@ -19,7 +19,7 @@ from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
 from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
 from crazysim.pytree import static
 from crazysim.scene.objects import Handle
@@ -83,11 +83,11 @@ class Transport(BringLoad):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6:
-            raise ConfigError(
-                f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m (length of rod or cable + "
-                f"{MIN_OPENING_MARGIN} m) to 1.6 m, got {self.opening!r}"
-            )
+        require(
+            self.length + MIN_OPENING_MARGIN <= self.opening <= 1.6,
+            f"expected opening from {self.length + MIN_OPENING_MARGIN:g} m (length of rod or cable + "
+            f"{MIN_OPENING_MARGIN} m) to 1.6 m, got {self.opening!r}",
+        )
 
     def install(self, sim: Sim) -> None:
         sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=LOAD_RADIUS))

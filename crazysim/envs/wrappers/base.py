@@ -7,7 +7,7 @@ from typing import Any
 from crazysim.arguments import check_arguments
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.hooks import Hooks
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 
 class Wrapper(Hooks, Env):
@@ -17,11 +17,11 @@ class Wrapper(Hooks, Env):
     def __init__(self, env: Env):
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")
-        if env.reset_policy is not None:
-            raise ConfigError(
-                "expected an environment without AutoReset, got one with it. AutoReset is the outermost wrapper, and "
-                "adapters to other libraries add it themselves."
-            )
+        require(
+            env.reset_policy is None,
+            "expected an environment without AutoReset, got one with it. AutoReset is the outermost wrapper, and "
+            "adapters to other libraries add it themselves.",
+        )
         self.env = env
         name, used_names = self.name or type(self).__name__, {wrapper.name for wrapper in env.wrappers}
         numbered_names = [f"{name} {k}" for k in range(2, len(used_names) + 2)]

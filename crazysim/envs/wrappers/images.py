@@ -9,7 +9,7 @@ from crazysim.core.settings import dividing_rate
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, short_repr
 from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
 
 
@@ -37,8 +37,7 @@ class CameraImages(Wrapper):
         if not isinstance(camera, ImageSensor):
             raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).")
         self.camera = camera
-        if not isinstance(names, (Mapping, type(None))):
-            raise ConfigError(f"expected names as a dict by output, got {short_repr(names)}. Use {{'depth': 'view'}}.")
+        expect(isinstance(names, (Mapping, type(None))), "names as a dict by output", names, "Use {'depth': 'view'}.")
         if unknown_outputs := set(names or {}) - set(camera.outputs):
             raise ConfigError(
                 f"expected names of {', '.join(camera.outputs)}, the outputs of {camera.name!r}, got one of "

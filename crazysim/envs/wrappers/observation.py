@@ -24,7 +24,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.tasks.goals import state_of
 from crazysim.envs.wrappers.action import MAX_FRAMES
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import PyTree, leaf, scopes
 from crazysim.tables import NOT_NEGATIVE, read_number
 
@@ -37,8 +37,7 @@ class Observe(Wrapper):
 
     def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
         super().__init__(env)
-        if not callable(fn):
-            raise ConfigError(f"expected a function (obs, data) -> obs, got {short_repr(fn)}")
+        expect(callable(fn), "a function (obs, data) -> obs", fn)
         self.fn = fn
 
     def after_reset(self, state: EnvState) -> EnvState:
@@ -50,11 +49,12 @@ class Observe(Wrapper):
     def _observe(self, state: EnvState) -> EnvState:
         """Return the state with the observations of ``fn``, after checking that they are a dict."""
         obs = self.fn(state.obs, state.data)
-        if not isinstance(obs, Mapping) or not obs:
-            raise ConfigError(
-                f"expected the function of {self.name!r} to return a dict of names to arrays, got {short_repr(obs)}. "
-                f"Use for example {{'vector': flatten(obs)}}."
-            )
+        expect(
+            isinstance(obs, Mapping) and obs,
+            f"the function of {self.name!r} to return a dict of names to arrays",
+            obs,
+            "Use for example {'vector': flatten(obs)}.",
+        )
         for name, x in obs.items():
             check_array(f"observation {name!r} of {self.name!r}", x)
         return state.replace(obs={name: jnp.asarray(x) for name, x in obs.items()})
@@ -80,10 +80,10 @@ class PrivilegedObservation(Observe):
         self._plugins = [plugin for plugin in plugins if type(plugin).influence is not Plugin.influence]
 
     def _add_privileged(self, obs: Obs, data: SimData) -> Obs:
-        if PRIVILEGED in obs:
-            raise ConfigError(
-                f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Use another name in the task."
-            )
+        require(
+            PRIVILEGED not in obs,
+            f"expected observations without {PRIVILEGED!r}, got {', '.join(obs)}. Use another name in the task.",
+        )
         params = zip(jax.tree.leaves(data.params), jax.tree.leaves(scopes(data.params)), self._scales, strict=True)
         drone_params = [(x / scale).reshape(len(x), -1) for x, scope, scale in params if scope == "drone"]
         effects = vmap_drones(lambda drone: [plugin.bound(drone).observations(drone) for plugin in self._plugins])(data)
@@ -100,10 +100,7 @@ class ObservationNoise(Wrapper):
 
     def __init__(self, env: Env, std: dict[str, float]):
         super().__init__(env)
-        if not isinstance(std, Mapping):
-            raise ConfigError(
-                f"expected std as a dict of numbers by name, got {short_repr(std)}. Use for example {{'pos': 0.01}}."
-            )
+        expect(isinstance(std, Mapping), "std as a dict of numbers by name", std, "Use for example {'pos': 0.01}.")
         self.std = {name: read_number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
 
     def after_reset(self, state: EnvState) -> EnvState:
@@ -140,8 +137,7 @@ class Normalize(Wrapper):
 
     def __init__(self, env: Env, stats: dict[str, RunningStats] | None = None):
         super().__init__(env)
-        if not isinstance(stats, (Mapping, type(None))):
-            raise ConfigError(f"expected stats as a dict of RunningStats by name, or None, got {short_repr(stats)}")
+        expect(isinstance(stats, (Mapping, type(None))), "stats as a dict of RunningStats by name, or None", stats)
         self.stats = stats
 
     def after_reset(self, state: EnvState) -> EnvState:

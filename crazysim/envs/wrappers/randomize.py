@@ -14,7 +14,7 @@ from crazysim.core.stage import Axes
 from crazysim.envs.env import Env
 from crazysim.envs.random import episode_key
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import scopes
 
 
@@ -28,11 +28,14 @@ class RandomizeWith(Wrapper):
 
     def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
         super().__init__(env)
-        if not callable(fn):
-            raise ConfigError(f"expected a function (data, key) -> data, got {short_repr(fn)}")
+        expect(callable(fn), "a function (data, key) -> data", fn)
         params = (params,) if isinstance(params, str) else params
-        if not isinstance(params, (tuple, list)) or not all(isinstance(name, str) for name in params):
-            raise ConfigError(f"expected params as names of parameters, got {short_repr(params)}. Use ('mass',).")
+        expect(
+            isinstance(params, (tuple, list)) and all(isinstance(name, str) for name in params),
+            "params as names of parameters",
+            params,
+            "Use ('mass',).",
+        )
         sim_params = env.sim.data.params
         fields = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
         if unknown_params := [name for name in params if fields.get(name) is None]:
@@ -50,17 +53,17 @@ class RandomizeWith(Wrapper):
 
     def after_spawn(self, data: SimData) -> SimData:
         randomised = self.fn(data, episode_key(data, "randomize"))
-        if jax.tree.structure(randomised) != jax.tree.structure(data):
-            raise ConfigError(
-                f"expected the function of RandomizeWith to return the data that it gets with other values, got a "
-                f"{type(randomised).__name__}. Use data.replace(params=...)."
-            )
+        require(
+            jax.tree.structure(randomised) == jax.tree.structure(data),
+            f"expected the function of RandomizeWith to return the data that it gets with other values, got a "
+            f"{type(randomised).__name__}. Use data.replace(params=...).",
+        )
         axes = Axes(data)
         leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)
         shared_names = [name for name, scope, x, y in leaves if scope in ("shared", "opaque") and y is not x]
-        if shared_names:
-            raise ConfigError(
-                f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that get a "
-                f"value per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
-            )
+        require(
+            not shared_names,
+            f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that get a "
+            f"value per drone in params=, as in RandomizeWith(env, fn, params=('mass',)).",
+        )
         return randomised
