@@ -155,7 +155,7 @@ class Population(Plugin):
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
             step = functools.partial(self._integrate, self.scheme(sim.integrator))
-            placements.append(StagePlacement(Stage(step, self.name, name=name), before="increment_steps", name=name))
+            placements.append(StagePlacement(Stage(step, self.name, name=name), before="measurements", name=name))
         return placements
 
     def with_poses(self, record: R, pos: Array, quat: Array) -> R:

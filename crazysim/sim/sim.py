@@ -363,7 +363,7 @@ class Sim:
         self.data = shard(self.data, mesh)
         self.default_data = shard(default, mesh)
         self._scene.shard(mesh)
-        self.plugins.mark_changed()  # images need other kernels
+        self.plugins.is_stale = True  # images need other kernels
         self._queries = SceneQueries(self._scene)
         self.build_step_fn()
         return self.data
@@ -399,7 +399,7 @@ class Sim:
         Objects that it moved, such as loads, stay in the scene where they are.
 
         Raises:
-            ConfigError: If one of its stages has been replaced since, or another plugin needs it; nothing is removed.
+            ConfigError: If another plugin needs it, or you have replaced one of its stages; nothing is removed.
         """
         self.plugins.remove(plugin)
 

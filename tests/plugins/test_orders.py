@@ -19,6 +19,7 @@ from crazysim import (
     ContactLog,
     ContactResponse,
     Downwash,
+    DroneCollisions,
     FreeBodies,
     GroundEffect,
     Kalman,
@@ -35,7 +36,7 @@ from crazysim import (
     Wind,
     make,
 )
-from crazysim.core.pipeline import insert_fn_after, remove_fn, replace_fn
+from crazysim.core.pipeline import insert_fn_after, prepend_fn, remove_fn, replace_fn
 from crazysim.envs import DroneEnv
 from crazysim.plugins.sensors import BatteryVoltage, MultiRanger
 from crazysim.scene import build
@@ -230,6 +231,63 @@ def test_states_settings_and_edits_of_the_pipeline_survive_an_object():
     sim.scene.add("box", pos=[0, 3, 0])
     assert sim.data.plugins["contacts"].object_names == ("wall:0", "box:0")
     np.testing.assert_array_equal(sim.data.plugins["contacts"].objects, [[[True, False]]])
+
+
+def test_edits_are_replayed_when_plugins_come_and_go():
+    """An inserted stage stays between its neighbours, a removed one stays away, a wrapped one calls the user's."""
+
+    def first(data):
+        return data
+
+    def count(data):
+        return data
+
+    def controller(data):
+        called.append(data)
+        return data
+
+    called, sim = [], Sim(plugins=[Battery()], control="attitude", engine="plain")
+    pipeline = sim.step_pipeline
+    prepend_fn(pipeline, first)
+    insert_fn_after(pipeline, "integration", count)
+    remove_fn(pipeline, "clip_floor_pos")
+    replace_fn(pipeline, controller, "attitude_controller")
+    sim.add(Latency(2))
+    sim.add(ContactResponse(iterations=2))
+    sim.remove("battery")
+    sim.step()
+    assert sim.step_pipeline is pipeline
+    names = ["first", "latency", "attitude_controller", "clip_rotor_vel_cmd", "integration", "count"]
+    assert list(pipeline) == [*names, "contact_response", "increment_steps"]
+    assert called
+    sim.remove("latency")
+    sim.remove("contact_response")
+    remove_fn(pipeline, "first")
+    sim.add(Wind())
+    names = ["attitude_controller", "clip_rotor_vel_cmd", "integration", "count", "increment_steps"]
+    assert list(pipeline) == names
+    assert pipeline["attitude_controller"] is controller
+
+
+def test_a_stage_stays_where_it_was_inserted_when_its_neighbours_go():
+    sim = Sim(plugins=[IMU(), MotionCapture(), ContactResponse()])
+    for k, anchor in enumerate(("integration", "contact_response", "imu", "motion_capture_begin")):
+        insert_fn_after(sim.step_pipeline, anchor, lambda data: data, f"mine_{k}")
+    for name in list(sim.plugins):
+        sim.remove(name)
+    names = ["integration", "mine_0", "clip_floor_pos", "mine_1", "mine_2", "mine_3", "increment_steps"]
+    assert list(sim.step_pipeline)[2:] == names
+
+
+@pytest.mark.parametrize("make_plugin", [DroneCollisions, ContactResponse, lambda: FreeBodies(1, size=0.05)])
+def test_sensors_measure_behind_stages_that_move_drones(make_plugin):
+    """Whatever was added first: an impact within a step is in the IMU's measurement of that step."""
+    sims = [Sim(n_drones=2), Sim(n_drones=2)]
+    sims[0].add(IMU())
+    for sim in sims:
+        sim.add(make_plugin())
+    sims[1].add(IMU())
+    assert list(sims[0].step_pipeline) == list(sims[1].step_pipeline)
 
 
 def test_data_from_before_an_object_are_completed_when_they_are_assigned():

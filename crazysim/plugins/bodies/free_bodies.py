@@ -167,7 +167,7 @@ class FreeBodies(Population):
         body_contacts = BodyContacts(sim, self)
         name, reason = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
         contact = Stage(lambda data: body_contacts.respond(data), "batch", name=name, unfused_reason=reason)
-        return [*super().stages(sim), StagePlacement(contact, before="increment_steps", name=name)]
+        return [*super().stages(sim), StagePlacement(contact, before="measurements", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         body = self.read(data)

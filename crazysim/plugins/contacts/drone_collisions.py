@@ -87,4 +87,4 @@ class DroneCollisions(Plugin):
             return self.write(data.replace(states=states), record.replace(**changes))
 
         solve = Stage(vmap_worlds(solve_world), "batch", unfused_reason="it solves the contacts of all worlds at once")
-        return [StagePlacement(solve, before="increment_steps")]
+        return [StagePlacement(solve, before="measurements")]

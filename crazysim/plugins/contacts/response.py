@@ -96,7 +96,7 @@ class ContactResponse(Plugin):
             states, record = select_airframe(results, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
-        placements = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
+        placements = [StagePlacement(Stage(respond, "drone"), before="measurements", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
         can_touch_drones = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
         for plugin in plugins:
@@ -146,7 +146,7 @@ class ContactResponse(Plugin):
             stages.append((Stage(respond_to_drones, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
             if can_touch_each_other:
                 stages.append((Stage(respond_to_loads, "world"), f"{self.name}_between_{plugin.name}"))
-        return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in stages]
+        return [StagePlacement(stage, before="measurements", name=name) for stage, name in stages]
 
 
 def _respond_to_contacts(

@@ -72,7 +72,7 @@ class Terrain(Plugin):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
         stop_stage = Stage(self.stop_drones, scope, batched=True, unfused_reason=UNFUSED_REASON, ground=ground_below)
-        return [StagePlacement(stop_stage, before="increment_steps", replaces="clip_floor_pos")]
+        return [StagePlacement(stop_stage, before="measurements", replaces="clip_floor_pos")]
 
     def stop_drones(self, data: SimData) -> SimData:
         """Return the data with drones that are below the ground, or on it and not rising, on the ground at rest."""

@@ -127,7 +127,7 @@ class Hook(CollidingPlugin, Plugin):
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [
             StagePlacement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
-            StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
+            StagePlacement(Stage(self.stop_at_floor, "drone"), "measurements", name=f"{self.name}_floor"),
         ]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:

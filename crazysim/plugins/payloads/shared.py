@@ -147,7 +147,7 @@ class SharedLoad(PointLoad, Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that stops the load at the floor, and with ``rk4`` the stage of the cables' impulses."""
-        placements = [StagePlacement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
+        placements = [StagePlacement(Stage(self.stop_at_floor, "world"), "measurements", name=f"{self.name}_floor")]
         if self.cable and find_integrator(sim) is rk4:
             placements.append(StagePlacement(Stage(self.become_taut, "world"), "integration", name=f"{self.name}_taut"))
         return placements

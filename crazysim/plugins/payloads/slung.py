@@ -73,7 +73,7 @@ class SlungLoad(PointLoad, Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that stops loads at the floor, and for cables with ``rk4`` the stage of their impulses."""
-        placements = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
+        placements = [StagePlacement(Stage(self.stop_at_floor, "drone"), "measurements", name=f"{self.name}_floor")]
         method = find_integrator(sim)
         if self.cable and method is rk4:
             placements.append(StagePlacement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
