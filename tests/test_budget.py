@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 9874,
     "media": 986,
-    "plugins": 7332,
+    "plugins": 7349,
     "scene": 3102,
     "sim": 1217,
     "train": 2497,
