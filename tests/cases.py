@@ -287,7 +287,7 @@ def _documented_shapes(record):
     body = ast.parse(inspect.getsource(record)).body[0].body
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign):
-            if field.target.id == "name" or "ClassVar" in ast.unparse(field.annotation):
+            if field.target.id in ("_", "name") or "ClassVar" in ast.unparse(field.annotation):
                 continue
             assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"
             shape = re.search(r"\(([\w, ]*)\)$", text.value.value)

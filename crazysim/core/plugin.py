@@ -145,8 +145,9 @@ def param(
         sparse: As in ``crazysim.pytree.leaf``.
         keep: False for a number that only ``bind`` reads, to calculate others; it is None in ``data.plugins``.
     """
-    number_type = np.int32 if whole and dtype is None else dtype
-    declaration = Setting(range_between(low, high, positive), True, per_axis, number_type, shapes)
+    declaration = Setting(
+        range_between(low, high, positive), True, per_axis, np.int32 if whole and dtype is None else dtype, shapes
+    )
     metadata: dict[str, Any] = {"setting": declaration}
     if keep:
         metadata |= _leaf_metadata(scope, core, sparse=sparse, dtype=dtype, airframe=airframe)
@@ -159,6 +160,7 @@ def state(
     scope: Scope = "drone",
     dtype: DTypeLike | None = None,
     optional: bool = False,
+    sparse: bool = False,
     scratch: bool = False,
     init: Literal[False] = False,  # noqa: ARG001
 ) -> Any:
@@ -169,11 +171,16 @@ def state(
         scope: ``"drone"`` or ``"world"``.
         dtype: Type; None for the type of the states.
         optional: True for a state that is None unless ``bind`` gives it a value.
+        sparse: As in ``crazysim.pytree.leaf``.
         scratch: As in ``crazysim.pytree.leaf``.
         init: For type checkers: users do not set states.
     """
-    metadata = _leaf_metadata(scope, core, scratch=scratch, dtype=dtype, optional=optional)
-    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
+    return dataclasses.field(
+        default=None,
+        kw_only=True,
+        repr=False,
+        metadata=_leaf_metadata(scope, core, sparse=sparse, scratch=scratch, dtype=dtype, optional=optional),
+    )
 
 
 def derived(
@@ -184,19 +191,25 @@ def derived(
     init: Literal[False] = False,  # noqa: ARG001
 ) -> Any:
     """Declare a parameter that ``bind`` calculates from others, None by default; ``init`` as for ``state``."""
-    metadata = _leaf_metadata(scope, core, sparse=sparse, dtype=None, optional=True)
-    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
+    return state(core, scope=scope, optional=True, sparse=sparse)
+
+
+def nested(*, default: PyTree | None) -> Any:
+    """Declare a record with numbers and states of its own, which ``bind`` makes, from what the user wrote if any."""
+    return dataclasses.field(
+        default=default, repr=default is not None, metadata={"static": False, "setting": Setting(is_parameter=True)}
+    )
 
 
 def _leaf_metadata(scope: Scope, core: CoreShape, **details: Any) -> dict[str, Any]:
     fixed_core = None if any(isinstance(n, str) for n in core) or scope == "shared" else core
-    metadata = {"scope": scope, CORE_NDIM_KEY: len(core), "core": fixed_core, "shape": core}
-    return {"sparse": False, "scratch": False, **metadata, **details}
+    declared = {"scope": scope, CORE_NDIM_KEY: len(core), "core": fixed_core, "shape": core}
+    return {"sparse": False, "scratch": False} | declared | details
 
 
 def _declare_static_fields(cls: type) -> None:
     """Make every new field without a declaration static; a field of a base class keeps its declaration."""
-    inherited = {f.name: f.metadata for base in reversed(cls.__mro__[1:])
+    inherited = {f.name: f for base in reversed(cls.__mro__[1:])
                  for f in vars(base).get("__dataclass_fields__", {}).values()}  # fmt: skip
     for name, hint in inspect.get_annotations(cls).items():
         if "ClassVar" in str(hint) or name == "_":
@@ -205,7 +218,9 @@ def _declare_static_fields(cls: type) -> None:
         if not isinstance(field, dataclasses.Field):
             field = dataclasses.field(default=field)
             setattr(cls, name, field)
-        metadata = {**inherited.get(name, {}), **field.metadata}
+        # A positional field would stand where the base class has it, in front of the fields of the new class.
+        field.kw_only = getattr(inherited.get(name), "kw_only", False) or field.kw_only
+        metadata = {**getattr(inherited.get(name), "metadata", {}), **field.metadata}
         if not metadata.keys() & {"scope", "static"}:
             metadata["static"] = True
         field.metadata = MappingProxyType(metadata)
@@ -302,8 +317,8 @@ def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
-def _bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any]) -> Array | None:
-    """Return the array of a field for all worlds."""
+def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any]) -> Array | None:
+    """Return the array of a field for all worlds; ``name`` is its name in messages."""
     scope, dtype = metadata["scope"], metadata["dtype"] or sim.data.states.pos.dtype
     core = tuple([sim.data.states.rotor_vel.shape[-1] if n == "rotors" else n for n in metadata["shape"]])
     declaration = metadata.get("setting", Setting())
@@ -328,7 +343,7 @@ Requirement = type | Callable[[Simulation, Any], None]
 @dataclass_transform(
     frozen_default=True,
     eq_default=False,
-    field_specifiers=(param, state, derived, parameter, setting, dataclasses.field),
+    field_specifiers=(param, state, derived, nested, parameter, setting, dataclasses.field),
 )
 class Plugin(PyTree):
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
@@ -411,7 +426,7 @@ class Plugin(PyTree):
         for field in dataclasses.fields(self):
             name = field.name
             if "scope" in field.metadata and values.get(name) is None:
-                bound.setdefault(name, _bind_leaf(sim, name, getattr(self, name), field.metadata))
+                bound.setdefault(name, bind_leaf(sim, name, getattr(self, name), field.metadata))
             elif not field.metadata.get("keep", True):
                 bound.setdefault(name, None)
         return self.replace(**bound)
@@ -458,8 +473,8 @@ class Plugin(PyTree):
 
     @classmethod
     def has_arrays(cls) -> bool:
-        """True if the class declares numbers or states."""
-        return any("scope" in f.metadata for f in dataclasses.fields(cls))
+        """True if the class declares numbers, states or records of them."""
+        return not all(f.metadata.get("static") for f in dataclasses.fields(cls))
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return what ``data.plugins`` has for all worlds: the plugin with arrays, or None if it needs none.

@@ -28,13 +28,13 @@ from crazysim.plugins.sensors.barometer import (
     pressure_at,
 )
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
-from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight, range_deviation
+from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
 from crazysim.plugins.sensors.gps import GPS
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.magnetometer import Magnetometer
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.plugins.sensors.triad import TriadData
+from crazysim.plugins.sensors.triad import Triad
 from crazysim.pytree import PyTree, leaf
 
 INITIAL_STD = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
@@ -246,7 +246,7 @@ def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
     return lambda data: is_tick(data, sensor.freq or data.core.freq)
 
 
-def _bias_walk(triad: TriadData, dt: float) -> Array:
+def _bias_walk(triad: Triad, dt: float) -> Array:
     """Return the variance of the change of a bias in an interval, approximating its wander as a random walk. (3,)"""
     return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
 
@@ -258,20 +258,23 @@ def _finalize(estimate: Estimate) -> Estimate:
 
 def _combined_std(*deviations: Array | float, min_std: float = MIN_STD) -> Array:
     """Return the standard deviation of a sum of independent errors, at least ``min_std``. (...)"""
-    return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(min_std * min_std)))
+    return _std(sum(x * x for x in deviations), min_std)
+
+
+def _std(variance: Array | float, min_std: float = MIN_STD) -> Array:
+    return jnp.sqrt(variance + jnp.asarray(min_std * min_std))
 
 
 def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record = sensor.read(data)
-    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), _combined_std(record.noise)))
-    return updates.update_quat(estimate, sensor.part(data, "quat"), _combined_std(record.angle_noise))
+    pos_std, angle_std = (_std(sensor.read(data).variance(name)) for name in ("pos", "quat"))
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std))
+    return updates.update_quat(estimate, sensor.part(data, "quat"), angle_std)
 
 
 def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record = sensor.read(data)
-    std = _combined_std(record.noise, record.drift)
-    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), std))
-    return updates.update_vel(estimate, sensor.part(data, "vel"), _combined_std(record.vel_noise))
+    pos_std, vel_std = (_std(sensor.read(data).variance(name)) for name in ("pos", "vel"))
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std))
+    return updates.update_vel(estimate, sensor.part(data, "vel"), vel_std)
 
 
 def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -279,8 +282,8 @@ def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: E
     altitude = estimate.pos[2:] + record.altitude
     predicted_pressure = pressure_at(altitude)
     slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted_pressure / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
-    std = _combined_std(record.noise, record.drift, record.offset_spread, min_std=100 * MIN_STD)
     error = sensor.part(data, "pressure") - predicted_pressure
+    std = _std(record.variance("pressure"), 100 * MIN_STD)
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 
@@ -296,12 +299,12 @@ def _update_by_magnetometer(sensor: Magnetometer, imu: IMU, data: SimData, estim
 def _update_by_optical_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
     scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
-    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _combined_std(record.noise[0]))
+    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _std(record.variance("flow")[0]))
 
 
 def _update_by_time_of_flight(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, distance = sensor.read(data), sensor.latest(data)
-    std = _combined_std(record.noise + range_deviation(distance, record.far_noise))
+    std = _combined_std(record.deviation(distance))
     updated = updates.update_ray(estimate, distance[0], std[0])
     return error_state.select_estimate(distance[0] < record.max_range[0], updated, estimate)
 

@@ -5,45 +5,26 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, parameter
+from crazysim.core.plugin import Param, Simulation, derived, param
 from crazysim.core.random import normal, uniform
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import Samples, Sensor
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.pytree import device_array
 
 SWEEP_TILTS = -math.pi / 6, math.pi / 6
 """Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.
 2021, arXiv:2104.11523)."""
 MAX_SINE = 1 - 1e-4
 """Limit of the argument of the arcsine in a sweep angle, which keeps gradients finite."""
-
-
-class UWBData(PyTree):
-    """Measurements and parameters of ultra-wideband ranging."""
-
-    samples: Samples
-    """Measurements."""
-    anchors: Array = leaf("shared", 2)
-    """Positions of the anchors, world frame, m. (n_anchors, 3)"""
-    pos: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Position of the antenna relative to the centre of mass, body frame, m. (3,)"""
-    bias: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Error of every distance, m. (1,)"""
-    noise: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Standard deviation of a distance, m. (1,)"""
-    outliers: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Probability that a distance is measured along a detour, 0 to 1. (1,)"""
-    detour: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Mean length of a detour, m. (1,)"""
 
 
 class UWB(Sensor):
@@ -53,18 +34,18 @@ class UWB(Sensor):
     signals. All anchors are measured at the same time.
     """
 
-    anchors: ArrayLike = parameter()
+    anchors: Param = param(core=("anchors", 3), scope="shared")
     """Positions of the anchors, world frame, m. (n_anchors, 3)"""
-    noise: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of a distance, m; a difference has sqrt(2) times as much. () or (n_worlds, n_drones)"""
-    bias: ArrayLike = parameter(default=0.0)
-    """Constant error of every distance, m; it cancels in differences. () or (n_worlds, n_drones)"""
-    outliers: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
-    """Probability that a distance is measured along a detour, 0 to 1. () or (n_worlds, n_drones)"""
-    detour: ArrayLike = parameter(default=1.0, low=0.0)
-    """Mean length of a detour, m. () or (n_worlds, n_drones)"""
-    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Position of the antenna relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    noise: Param = param(default=0.0, low=0.0, sparse=True)
+    """Standard deviation of a distance, m; a difference has sqrt(2) times as much. (1,)"""
+    bias: Param = param(default=0.0, sparse=True)
+    """Constant error of every distance, m; it cancels in differences. (1,)"""
+    outliers: Param = param(default=0.0, low=0.0, high=1.0, sparse=True)
+    """Probability that a distance is measured along a detour, 0 to 1. (1,)"""
+    detour: Param = param(default=1.0, low=0.0, sparse=True)
+    """Mean length of a detour, m. (1,)"""
+    pos: Param = param(default=(0.0, 0.0, 0.0), core=(3,), sparse=True)
+    """Position of the antenna relative to the centre of mass, body frame, m. (3,)"""
     _: dataclasses.KW_ONLY
     tdoa: bool = False
     """True for differences of distances."""
@@ -74,49 +55,31 @@ class UWB(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        n = len(np.asarray(self.anchors))
+        n = np.shape(self.anchors)[0]
         return {"difference": n - 1} if self.tdoa else {"distance": n}
 
-    def record(self, sim: Simulation) -> UWBData:
-        anchors = _point_array("anchors", self.anchors, 2 if self.tdoa else 1)
-        return self.fill_record(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
+    def bind(self, sim: Simulation) -> UWB:
+        return self.with_arrays(sim, anchors=_point_array(sim, "anchors", self.anchors, 2 if self.tdoa else 1))
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, (n_anchors,), or their differences from the first, (n_anchors - 1,), m."""
         return self._to_measurement(self._distances(data))
 
-    def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
+    def measure(self, data: SimData, key: Array) -> tuple[Array, UWB]:
         distance = self._distances(data)
         keys, shape, dtype = jax.random.split(key), distance.shape, distance.dtype
         random_numbers = uniform(keys[0], (*shape, 2), dtype)
-        detour = jnp.where(
-            random_numbers[:, 1] < record.outliers, -record.detour * jnp.log(1 - random_numbers[:, 0]), 0.0
-        )
-        distance = distance + record.bias + detour + record.noise * normal(keys[1], shape, dtype)
-        return self._to_measurement(distance), record
+        detour = jnp.where(random_numbers[:, 1] < self.outliers, -self.detour * jnp.log(1 - random_numbers[:, 0]), 0.0)
+        distance = distance + self.bias + detour + self.noise * normal(keys[1], shape, dtype)
+        return self._to_measurement(distance), self
 
     def _distances(self, data: SimData) -> Array:
         """Return the distances of one antenna from the anchors, m. (n_anchors,)"""
-        record, s = self.read(data), data.states
-        return rotation.safe_norm(rotation.rotate(s.quat, record.pos, s.pos) - record.anchors)[:, 0]
+        s = data.states
+        return rotation.safe_norm(rotation.rotate(s.quat, self.pos, s.pos) - self.anchors)[:, 0]
 
     def _to_measurement(self, distance: Array) -> Array:
         return distance[1:] - distance[0] if self.tdoa else distance
-
-
-class LighthouseData(PyTree):
-    """Measurements and parameters of lighthouses."""
-
-    samples: Samples
-    """Measurements."""
-    stations: Array = leaf("shared", 2)
-    """Positions of the base stations, world frame, m. (n_stations, 3)"""
-    quat: Array = leaf("shared", 2)
-    """Attitudes of the base stations, station to world, unit, xyzw. (n_stations, 4)"""
-    diodes: Array = leaf("shared", 2)
-    """Positions of the photodiodes relative to the centre of mass, body frame, m. (n_diodes, 3)"""
-    noise: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Standard deviation of an angle, rad. (1,)"""
 
 
 class Lighthouse(Sensor):
@@ -128,15 +91,17 @@ class Lighthouse(Sensor):
     diodes out of view are zero. Objects do not hide diodes.
     """
 
-    stations: ArrayLike = parameter()
+    stations: Param = param(core=("stations", 3), scope="shared")
     """Positions of the base stations, world frame, m. (n_stations, 3)"""
-    rpy: ArrayLike = parameter()
+    rpy: Param = param(core=("stations", 3), scope="shared", keep=False)
     """Roll, pitch and yaw of the base stations, world frame, rad. (n_stations, 3)"""
-    noise: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of an angle, rad. () or (n_worlds, n_drones)"""
-    diodes: ArrayLike = parameter(default=((0.0, 0.0, 0.0),))
+    noise: Param = param(default=0.0, low=0.0, sparse=True)
+    """Standard deviation of an angle, rad. (1,)"""
+    diodes: Param = param(default=((0.0, 0.0, 0.0),), core=("diodes", 3), scope="shared")
     """Positions of the photodiodes relative to the centre of mass, body frame, m. (n_diodes, 3)"""
     _: dataclasses.KW_ONLY
+    quat: Array = derived(("stations", 4), scope="shared")
+    """Attitudes of the base stations, station to world, unit, xyzw. (n_stations, 4)"""
     freq: int | None = 50
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     name: str = "lighthouse"
@@ -144,40 +109,33 @@ class Lighthouse(Sensor):
     @property
     def channels(self) -> Mapping[str, int]:
         """Names and lengths of the parts of a measurement, which are sorted by station, then diode, then plane."""
-        n = len(np.asarray(self.stations)) * len(np.asarray(self.diodes))
+        n = np.shape(self.stations)[0] * np.shape(self.diodes)[0]
         return {"angle": 2 * n, "visible": n}
 
-    def record(self, sim: Simulation) -> LighthouseData:
-        stations, rpy = _point_array("stations", self.stations, 1), _point_array("rpy", self.rpy, 1)
+    def bind(self, sim: Simulation) -> Lighthouse:
+        stations, rpy, diodes = (
+            _point_array(sim, name, getattr(self, name), 1) for name in ("stations", "rpy", "diodes")
+        )
         if stations.shape != rpy.shape:
             raise ConfigError(f"expected rpy of shape {stations.shape}, one for each station, got {rpy.shape}")
-        dtype = sim.data.states.pos.dtype
-        return self.fill_record(
-            sim,
-            LighthouseData,
-            stations=device_array(stations, dtype),
-            quat=jax.jit(rotation.from_rpy)(device_array(rpy, dtype)),
-            diodes=device_array(_point_array("diodes", self.diodes, 1), dtype),
-        )
+        return self.with_arrays(sim, stations=stations, quat=jax.jit(rotation.from_rpy)(rpy), diodes=diodes)
 
     def ideal(self, data: SimData) -> Array:
         """Return the angles, rad, and 1 where a diode is in view, else 0. (3 n_stations n_diodes,)"""
-        record, s = self.read(data), data.states
-        diodes = rotation.rotate(s.quat, record.diodes, s.pos)
-        offset = diodes - record.stations[:, None]
-        station_frame_pos = rotation.rotate_inverse(record.quat[:, None], offset)
+        s = data.states
+        offset = rotation.rotate(s.quat, self.diodes, s.pos) - self.stations[:, None]
+        station_frame_pos = rotation.rotate_inverse(self.quat[:, None], offset)
         angle = jnp.stack([sweep_angle(station_frame_pos, tilt) for tilt in SWEEP_TILTS], axis=-1)
         is_above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
         is_visible = (station_frame_pos[..., 0] > 0) & is_above
         angle = jnp.where(is_visible[..., None], angle, 0.0)
         return jnp.concatenate([angle.reshape(-1), is_visible.astype(angle.dtype).reshape(-1)])
 
-    def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, LighthouseData]:
-        truth = self.ideal(data)
-        n = truth.shape[0] // 3
-        visibility = jnp.repeat(truth[2 * n :], 2)
-        angle = truth[: 2 * n] + visibility * record.noise * normal(key, (2 * n,), truth.dtype)
-        return jnp.concatenate([angle, truth[2 * n :]]), record
+    def measure(self, data: SimData, key: Array) -> tuple[Array, Lighthouse]:
+        truth, n = self.ideal(data), self.channels["angle"]
+        deviation = jnp.repeat(truth[n:], 2) * self.noise
+        angle = truth[:n] + deviation * normal(key, (n,), truth.dtype)
+        return jnp.concatenate([angle, truth[n:]]), self
 
 
 def sweep_angle(pos: Array, tilt: float) -> Array:
@@ -193,9 +151,9 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
     return rotation.safe_arctan2(pos[..., 1], pos[..., 0]) + jnp.arcsin(sine)
 
 
-def _point_array(name: str, value: ArrayLike, min_points: int) -> np.ndarray:
+def _point_array(sim: Simulation, name: str, value: Any, min_points: int) -> Array:
     """Return the checked setting ``name`` as an array of vectors. (n, 3)"""
     points = np.asarray(value, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < min_points or not np.isfinite(points).all():
         raise ConfigError(f"expected {name} as at least {min_points} finite vectors (n, 3), got {points.tolist()}")
-    return points
+    return device_array(points, sim.data.states.pos.dtype)

@@ -11,7 +11,7 @@ from jax import Array
 from crazysim.core.random import normal
 from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import quantise
+from crazysim.plugins.sensors.errors import quantise
 
 D435_WIDTH, D435_HFOV = 848, 90.0
 """Image width at which a RealSense D435 measures best, pixels; its horizontal field of view, degrees (Intel, *Subpixel

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, StagePlacement, drone_array, parameter
-from crazysim.core.random import normal, uniform
-from crazysim.core.stage import Stage
+from crazysim.core.plugin import Param, Simulation, StagePlacement, derived, drone_array, nested, param, state
+from crazysim.core.random import drone_key, normal, uniform
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.plugins.effects.moving_air import require_rotors, rotor_positions
-from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting_quat
-from crazysim.plugins.sensors.triad import Triad, TriadData
-from crazysim.pytree import PyTree, leaf
+from crazysim.plugins.sensors.sensor import Sensor, mounting_quat
+from crazysim.plugins.sensors.triad import Triad
 
 RAD_PER_DEGREE = math.pi / 180
 STANDARD_GRAVITY = 9.80665
@@ -102,31 +99,6 @@ MPU6050: dict[str, Any] = {
 ``MPU9250``. The corner of the accelerometer is assumed to equal the gyroscope's."""
 
 
-class IMUData(PyTree):
-    """State and parameters of the inertial measurement unit of every drone."""
-
-    samples: Samples
-    """Measurements."""
-    gyro: TriadData
-    """Errors of the gyroscope, rad/s."""
-    accel: TriadData
-    """Errors of the accelerometer, m/s^2."""
-    vel: Array = leaf("drone", 1, (3,))
-    """Velocity before the step, world frame, m/s. (n_worlds, n_drones, 3)"""
-    ang_vel: Array = leaf("drone", 1, (3,))
-    """Angular velocity before the step, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    pos: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Position of the accelerometer relative to the centre of mass, body frame, m. (3,)"""
-    quat: Array = leaf("parameter", 1, (4,), sparse=True)
-    """Attitude of the sensor, sensor to body, unit, xyzw. (4,)"""
-    imbalance: Array | None = leaf("parameter", 1)
-    """Imbalance of each rotor, kg m; None without vibration. (n_rotors,)"""
-    rotor_pos: Array | None = leaf("parameter", 2)
-    """Positions of the rotors, body frame, m; None without vibration. (n_rotors, 3)"""
-    phase: Array | None = leaf("drone", 1)
-    """Angle of each rotor, rad; None without vibration. (n_worlds, n_drones, n_rotors)"""
-
-
 class IMU(Sensor):
     """Gyroscope, rad/s, and accelerometer, m/s^2, in the sensor's frame.
 
@@ -135,19 +107,31 @@ class IMU(Sensor):
     rotor shakes the drone with the centrifugal force ``imbalance w^2``.
     """
 
-    gyro: Triad = parameter(default=Triad())
+    gyro: Triad = nested(default=Triad())
     """Errors of the gyroscope, rad/s."""
-    accel: Triad = parameter(default=Triad())
+    accel: Triad = nested(default=Triad())
     """Errors of the accelerometer, m/s^2."""
-    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Position of the accelerometer relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    pos: Param = param(default=(0.0, 0.0, 0.0), core=(3,), sparse=True)
+    """Position of the accelerometer relative to the centre of mass, body frame, m. (3,)"""
+    rpy: Param = param(default=(0.0, 0.0, 0.0), core=(3,), keep=False)
     """Roll, pitch and yaw of the sensor in the body frame, rad. (3,) or (n_worlds, n_drones, 3)"""
-    imbalance: ArrayLike | None = parameter(default=None, low=0.0)
+    imbalance: Param = param(default=None, core=("rotors",), low=0.0)
     """Mass of a rotor times the distance of its centre of mass from its axis, kg m; None for no vibration.
-    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    (n_rotors,)"""
     _: dataclasses.KW_ONLY
+    vel: Array = state((3,))
+    """Velocity before the step, world frame, m/s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = state((3,))
+    """Angular velocity before the step, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    quat: Array = derived((4,), sparse=True)
+    """Attitude of the sensor, sensor to body, unit, xyzw. (4,)"""
+    rotor_pos: Array | None = derived(("rotors", 3))
+    """Positions of the rotors, body frame, m; None without vibration. (n_rotors, 3)"""
+    phase: Array | None = state(("rotors",), optional=True)
+    """Angle of each rotor, rad; None without vibration. (n_worlds, n_drones, n_rotors)"""
     name: str = "imu"
+
+    channels: ClassVar = {"gyro": 3, "accel": 3}
 
     @classmethod
     def crazyflie(cls, **settings: Any) -> IMU:
@@ -169,75 +153,64 @@ class IMU(Sensor):
         """Return a common unit of small drones; see ``MPU6050``. Other settings are passed on."""
         return cls(**(MPU6050 | settings))
 
-    @property
-    def channels(self) -> Mapping[str, int]:
-        return {"gyro": 3, "accel": 3}
-
-    def record(self, sim: Simulation) -> IMUData:
-        has_vibration = self.imbalance is not None
-        if has_vibration:
+    def bind(self, sim: Simulation) -> IMU:
+        gyro, accel = self.gyro.bind(sim, "gyro"), self.accel.bind(sim, "accel")
+        numbers: dict[str, Any] = {"gyro": gyro, "accel": accel, "quat": mounting_quat(sim, self.rpy)}
+        if self.imbalance is not None:
             require_rotors(sim, "vibration")
-        return self.fill_record(
-            sim,
-            IMUData,
-            gyro=self.gyro.record(sim, "gyro"),
-            accel=self.accel.record(sim, "accel"),
-            quat=mounting_quat(sim, self.rpy),
-            rotor_pos=rotor_positions(sim) if has_vibration else None,
-            phase=drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if has_vibration else None,
-        )
+            phase = drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1])
+            numbers |= {"rotor_pos": rotor_positions(sim), "phase": phase}
+        return self.with_arrays(sim, **numbers)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         stages = super().stages(sim)
         condition = next(p.stage for p in stages if p.name is None).when  # type: ignore[attr-defined]
-        velocity_stage = StagePlacement(Stage(self._store_velocities, "drone", condition), name=f"{self.name}_before")
-        return [velocity_stage, *stages]
+        return [StagePlacement(self.stage(self._store_velocities, when=condition), name=f"{self.name}_before"), *stages]
 
     def ideal(self, data: SimData) -> Array:
         """Return the measurement without errors, for a drone that does not accelerate. (6,)"""
-        record, s = self.read(data), data.states
-        zero = jnp.zeros_like(s.vel)
-        force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, record.pos)
-        return _to_sensor_frame(record.quat, s.ang_vel, force)
+        s, zero = data.states, jnp.zeros_like(data.states.vel)
+        force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, self.pos)
+        return _to_sensor_frame(self.quat, s.ang_vel, force)
 
     def reset_episode(self, data: SimData) -> SimData:
-        record, truth, keys = self.read(data), self.ideal(data), jax.random.split(self.episode_key(data))
+        truth, keys = self.ideal(data), jax.random.split(drone_key(data, f"{self.name}_begin"))
         noise = normal(keys[0], (12, 2), truth.dtype)
-        gyro, accel = record.gyro.draw_errors(truth[:3], noise[:, 0]), record.accel.draw_errors(truth[3:], noise[:, 1])
-        record = record.replace(gyro=gyro, accel=accel)
-        if record.phase is not None:
-            phase = 2 * math.pi * uniform(keys[1], record.phase.shape, truth.dtype)
-            record = record.replace(phase=phase)
-        return self.write(data, record)
+        gyro, accel = self.gyro.draw_errors(truth[:3], noise[:, 0]), self.accel.draw_errors(truth[3:], noise[:, 1])
+        sensor = self.replace(gyro=gyro, accel=accel)
+        if self.phase is not None:
+            sensor = sensor.replace(phase=2 * math.pi * uniform(keys[1], self.phase.shape, truth.dtype))
+        return self.write(data, sensor)
 
-    def measure(self, data: SimData, record: IMUData, key: Array) -> tuple[Array, IMUData]:
-        s, freq, dt = data.states, data.core.freq, self.interval(data)
+    def measure(self, data: SimData, key: Array) -> tuple[Array, IMU]:
+        sensor, s, freq, dt = self, data.states, data.core.freq, self.interval(data)
         ang_vel = s.ang_vel
-        acc, ang_acc = freq * (s.vel - record.vel), freq * (s.ang_vel - record.ang_vel)
-        if record.phase is not None:
+        acc, ang_acc = freq * (s.vel - self.vel), freq * (s.ang_vel - self.ang_vel)
+        if self.phase is not None:
             speed = RPM_TO_RAD_S * s.rotor_vel
-            phase = record.phase + dt * speed
+            phase = self.phase + dt * speed
             phase = phase - 2 * math.pi * jnp.floor(phase / (2 * math.pi))
             p = data.params
-            shake_force, torque, momentum = vibration(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
+            shake_force, torque, momentum = vibration(self.imbalance, speed, phase, self.rotor_pos)  # type: ignore[arg-type]
             acc = acc + rotation.rotate(s.quat, shake_force) / p.mass
             ang_acc = ang_acc + rotation.matvec(p.J_inv, torque)
             ang_vel = ang_vel + rotation.matvec(p.J_inv, momentum)
-            record = record.replace(phase=phase)
-        force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, record.pos)
-        truth = _to_sensor_frame(record.quat, ang_vel, force)
+            sensor = self.replace(phase=phase)
+        force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, self.pos)
+        truth = _to_sensor_frame(self.quat, ang_vel, force)
         noise = normal(key, (9, 2), truth.dtype)
-        rates, gyro = record.gyro.measure(truth[:3], noise[:, 0], dt)
-        forces, accel = record.accel.measure(truth[3:], noise[:, 1], dt)
-        return jnp.concatenate([rates, forces]), record.replace(gyro=gyro, accel=accel)
+        rates, gyro = self.gyro.measure(truth[:3], noise[:, 0], dt)
+        forces, accel = self.accel.measure(truth[3:], noise[:, 1], dt)
+        return jnp.concatenate([rates, forces]), sensor.replace(gyro=gyro, accel=accel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        return {"ang_vel": rotation.rotate(self.read(data).quat, self.part(data, "gyro"))}
+        self = self.read(data)
+        return {"ang_vel": rotation.rotate(self.quat, self.part(data, "gyro"))}
 
     def _store_velocities(self, data: SimData) -> SimData:
         """Store the velocities of one drone before the step."""
         s = data.states
-        return self.write(data, self.read(data).replace(vel=s.vel, ang_vel=s.ang_vel))
+        return self.write(data, self.replace(vel=s.vel, ang_vel=s.ang_vel))
 
 
 def specific_force(quat: Array, acc: Array, ang_vel: Array, ang_acc: Array, gravity: Array, pos: Array) -> Array:

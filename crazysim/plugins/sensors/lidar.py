@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from crazysim.core.random import normal, uniform
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.errors import quantise
 from crazysim.plugins.sensors.image_sensor import ImageSensor
-from crazysim.plugins.sensors.sensor import quantise
 
 VLP16_ELEVATIONS = tuple(range(15, -16, -2))
 """Elevations of the 16 rows, degrees (VLP-16 User Manual, 63-9243 revision D, table 9-1)."""

@@ -8,50 +8,35 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, parameter
-from crazysim.core.random import normal
+from crazysim.core.plugin import Param, Simulation, param
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import Battery
 from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.plugins.sensors.range_finder import RangeFinderData
-from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
-from crazysim.pytree import PyTree, leaf
+from crazysim.plugins.sensors.errors import Chain, Link, Rounded, White
+from crazysim.plugins.sensors.range_finder import RangeFinder
+from crazysim.plugins.sensors.sensor import Sensor
 
 ELECTRICAL_SPEED_STEP = 100.0
 """Step of the electrical speed in telemetry, rpm, as in flight logs of IDSIA's Crazyflies (2025)."""
 
 
-class NoisyData(PyTree):
-    """Measurements with white noise and a resolution."""
-
-    samples: Samples
-    """Measurements."""
-    noise: Array = leaf("parameter", 1, (1,), sparse=True)
-    """Standard deviation of a measurement, in its unit. (1,)"""
-    resolution: Array | None = leaf("parameter", 1, (1,))
-    """Step to which measurements are rounded, in their unit; None for no rounding. (1,)"""
-
-
 class NoisySensor(Sensor):
     """Base class of sensors that measure the true value plus white noise, rounded."""
 
-    kind: ClassVar[type[PyTree]] = NoisyData
-    noise: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of a measurement, in its unit. () or (n_worlds, n_drones)"""
-    resolution: ArrayLike | None = parameter(default=None, positive=True)
-    """Step to which measurements are rounded, in their unit; None for no rounding. () or (n_worlds, n_drones)"""
+    noise: Param = param(default=0.0, low=0.0, sparse=True)
+    """Standard deviation of a measurement, in its unit. (1,)"""
+    resolution: Param = param(default=None, positive=True)
+    """Step to which measurements are rounded, in their unit; None for no rounding. (1,)"""
     _: dataclasses.KW_ONLY
     name: str = "noisy"
 
-    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
-        truth = self.ideal(data)
-        value = truth + record.noise * normal(key, truth.shape, truth.dtype)
-        return quantise(value, record.resolution), record
+    @property
+    def chains(self) -> Mapping[str, Link]:
+        return dict.fromkeys(self.channels, Chain(White("noise"), Rounded("resolution")))
 
 
 class RotorSpeeds(NoisySensor):
@@ -76,12 +61,12 @@ class RotorSpeeds(NoisySensor):
     def channels(self) -> Mapping[str, int]:
         return {"speed": self.n_rotors}
 
-    def record(self, sim: Simulation) -> PyTree:
+    def bind(self, sim: Simulation) -> RotorSpeeds:
         require_rotors(sim, "measuring rotor speeds")
         n_rotors = sim.data.states.rotor_vel.shape[-1]
         if self.n_rotors != n_rotors:
             raise ConfigError(f"expected n_rotors = {n_rotors} as the drones have, got {self.n_rotors}")
-        return super().record(sim)
+        return self.with_arrays(sim)
 
     def ideal(self, data: SimData) -> Array:
         """Return the rotor speeds, rpm. (n_rotors,)"""
@@ -101,13 +86,11 @@ class BatteryVoltage(NoisySensor):
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     name: str = "battery_voltage"
 
-    @property
-    def channels(self) -> Mapping[str, int]:
-        return {"voltage": 1}
+    channels: ClassVar = {"voltage": 1}
 
-    def record(self, sim: Simulation) -> PyTree:
+    def bind(self, sim: Simulation) -> BatteryVoltage:
         self.check_plugins(sim)
-        return super().record(sim)
+        return self.with_arrays(sim)
 
     def check_plugins(self, sim: Simulation) -> None:
         if not isinstance(sim.data.plugins.get(self.battery), Battery):
@@ -137,13 +120,13 @@ class MultiRanger(NoisySensor):
     def channels(self) -> Mapping[str, int]:
         return {"distance": self.n_rays}
 
-    def record(self, sim: Simulation) -> PyTree:
+    def bind(self, sim: Simulation) -> MultiRanger:
         self.check_plugins(sim)
-        return super().record(sim)
+        return self.with_arrays(sim)
 
     def check_plugins(self, sim: Simulation) -> None:
         range_finder = sim.data.plugins.get(self.range_finder)
-        if not isinstance(range_finder, RangeFinderData):
+        if not isinstance(range_finder, RangeFinder):
             raise ConfigError(
                 f"expected a RangeFinder named {self.range_finder!r}, got none. Use sim.add(RangeFinder()) first."
             )
@@ -156,7 +139,7 @@ class MultiRanger(NoisySensor):
         """Return the distances, m. (n_rays,)"""
         return data.plugins[self.range_finder].distance
 
-    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
-        value, record = super().measure(data, record, key)
+    def measure(self, data: SimData, key: Array) -> tuple[Array, MultiRanger]:
+        value, sensor = super().measure(data, key)
         max_range = data.plugins[self.range_finder].max_range
-        return jnp.where(self.ideal(data) < max_range, rotation.clip(value, 0.0, max_range), max_range), record
+        return jnp.where(self.ideal(data) < max_range, rotation.clip(value, 0.0, max_range), max_range), sensor

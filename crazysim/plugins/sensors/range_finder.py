@@ -10,15 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, drone_array, param, state
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import age_at, sampling_period
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import MAX_UNROLLED_GEOMS, RayKernels, cast_rays, raise_to_floor
@@ -34,20 +33,6 @@ MULTI_RANGER_DIRECTIONS = {
 RAY_COLOR = (0.1, 0.8, 0.2, 1.0)
 
 
-class RangeFinderData(PyTree):
-    """Measurements of the range finders, and their rays."""
-
-    distance: Array = leaf("drone", 1)
-    """Distance along each ray, m; ``max_range`` where nothing is nearer, and before the first measurement. (n_worlds,
-    n_drones, n_rays)"""
-    direction: Array = leaf("shared", 2)
-    """Unit directions of the rays, body frame. (n_rays, 3)"""
-    max_range: Array = leaf("shared", 0)
-    """Largest distance measured, m. ()"""
-    taken_step: Array = leaf("drone", 1)
-    """Step in which the distances were measured, negative before the first one. (n_worlds, n_drones, 1)"""
-
-
 class RangeFinder(Plugin):
     """Rays from the centre of mass of every drone that measure distances.
 
@@ -57,30 +42,37 @@ class RangeFinder(Plugin):
     MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER_DIRECTIONS
     """Directions of a multi-ranger deck by name, body frame."""
 
-    directions: ArrayLike | None = parameter(default=None)
+    directions: Param = param(default=None, core=("rays", 3), keep=False)
     """Directions, body frame, of any length; None for ``MULTI_RANGER``. (n_rays, 3)"""
-    max_range: float = parameter(default=4.0, positive=True, shapes=((),))
-    """Largest distance measured, m."""
+    max_range: Param = param(default=4.0, core=(), scope="shared", positive=True, shapes=((),))
+    """Largest distance measured, m. ()"""
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     drones: bool = False
     """True to measure distances to other drones too."""
     visible: bool = False
     """True to draw the rays into images."""
+    direction: Array = derived(("rays", 3), scope="shared")
+    """Unit directions of the rays, body frame. (n_rays, 3)"""
+    distance: Array = state(("rays",))
+    """Distance along each ray, m; ``max_range`` where nothing is nearer, and before the first measurement. (n_worlds,
+    n_drones, n_rays)"""
+    taken_step: Array = state(dtype=np.int32)
+    """Step in which the distances were measured, negative before the first one. (n_worlds, n_drones, 1)"""
     name: str = "range_finder"
 
-    def record(self, sim: Simulation) -> RangeFinderData:
+    def bind(self, sim: Simulation) -> RangeFinder:
         rays = np.asarray(
             list(MULTI_RANGER_DIRECTIONS.values()) if self.directions is None else self.directions, np.float64
         )
         if rays.ndim != 2 or rays.shape[1] != 3 or not rays.any(axis=-1).all():
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        return RangeFinderData(
-            drone_array(sim, self.max_range, len(rays)),
-            device_array(rays),
-            device_array(float(self.max_range)),
-            device_array(np.full((sim.n_worlds, sim.n_drones, 1), -1), np.int32),
+        return self.with_arrays(
+            sim,
+            direction=device_array(rays),
+            distance=drone_array(sim, self.max_range, len(rays)),
+            taken_step=device_array(np.full((sim.n_worlds, sim.n_drones, 1), -1), np.int32),
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
@@ -114,7 +106,8 @@ class RangeFinder(Plugin):
             """Measure distances, with loads at their current positions."""
             movers_present = {name: plugin for name, plugin in movers_by_name.items() if plugin.name in data.plugins}
             current_data = with_moved_objects(data, movers_present)
-            return self.write(data, self._measure(model, current_data, scope == "drone", scene.ray_kernels))
+            measured = self.bound(data)._measure(model, current_data, scope == "drone", scene.ray_kernels)
+            return self.write(data, measured)
 
         def measure_if_due(data: SimData) -> SimData:
             """Measure in a call that is skipped if no world is due."""
@@ -128,7 +121,7 @@ class RangeFinder(Plugin):
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
-        return {"distance": self.read(data).distance}
+        return {"distance": self.distance}
 
     def age(self, data: SimData) -> Array:
         """Return the time since the distances were measured, s; infinite before the first ones. (..., 1)"""
@@ -144,22 +137,20 @@ class RangeFinder(Plugin):
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
             sim.scene.renderer.overlays.line(points, RAY_COLOR, 2.0, 2.0)
 
-    def _measure(
-        self, model: CollisionModel, data: SimData, is_single_drone: bool, kernels: RayKernels
-    ) -> RangeFinderData:
-        """Return the record with the distances of one drone, of one world, or of all worlds."""
-        record, states = self.read(data), data.states
+    def _measure(self, model: CollisionModel, data: SimData, is_single_drone: bool, kernels: RayKernels) -> RangeFinder:
+        """Return the plugin with the distances of one drone, of one world, or of all worlds."""
+        states = data.states
         pos, quat = (states.pos[None], states.quat[None]) if is_single_drone else (states.pos, states.quat)
-        direction = rotation.rotate(quat[..., None, :], record.direction)
+        direction = rotation.rotate(quat[..., None, :], self.direction)
         n_drones, n_rays = direction.shape[-3:-1]
         origin = jnp.broadcast_to(raise_to_floor(model, pos)[..., None, :], direction.shape)
         ignored_drones = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
         origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
         hits = cast_rays(
-            model, data, origin, direction, ignored_drones, self.drones, kernels=kernels, limit=record.max_range
+            model, data, origin, direction, ignored_drones, self.drones, kernels=kernels, limit=self.max_range
         )
         taken_step = jnp.broadcast_to(data.core.steps[..., None], (*pos.shape[:-1], 1))
-        return record.replace(
-            distance=jnp.minimum(hits.distance, record.max_range).reshape(record.distance.shape),
-            taken_step=taken_step.reshape(record.taken_step.shape),
+        return self.replace(
+            distance=jnp.minimum(hits.distance, self.max_range).reshape(self.distance.shape),
+            taken_step=taken_step.reshape(self.taken_step.shape),
         )

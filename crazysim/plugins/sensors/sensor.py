@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, drone_array, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, drone_array, nested, param
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
-from crazysim.core.stage import Stage, is_tick
+from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.errors import Link, draw_noise
 from crazysim.pytree import PyTree, device_array, leaf
-
-R = TypeVar("R", bound=PyTree)
 
 MAX_ROWS = 64
 """Largest number of measurements of one sensor in transit."""
@@ -54,14 +53,15 @@ class Samples(PyTree):
 class Sensor(Plugin):
     """Base class of sensors that measure at a rate; measurements may arrive late or never.
 
-    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``reset_episode`` if some
-    errors are drawn once an episode, with ``episode_key``. Its record has a field ``samples``. Measurements are of the
-    state after the step. The record has the latest measurement that has arrived; measurements that arrive after a newer
-    one are discarded.
+    A subclass defines ``channels``, ``ideal`` and ``chains``, or overrides ``measure`` if its measurement is not a true
+    value with errors. Measurements are of the state after the step. ``samples`` has the latest measurement that has
+    arrived; measurements that arrive after a newer one are discarded.
     """
 
-    kind: ClassVar[type[PyTree]]
-    """Class of the record."""
+    channels: ClassVar[Mapping[str, int]] = {}
+    """Names and lengths of the parts of a measurement, in their order."""
+    chains: ClassVar[Mapping[str, Link]] = {}
+    """Errors by channel, for channels that have any; see ``crazysim.plugins.sensors.errors``."""
     reset_before: ClassVar[str | None] = "increment_steps"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
     state of the first measurement."""
@@ -69,44 +69,66 @@ class Sensor(Plugin):
     _: dataclasses.KW_ONLY
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
-    delay: ArrayLike = parameter(default=0.0, low=0.0, high=MAX_DELAY)
+    delay: Param = param(default=0.0, low=0.0, high=MAX_DELAY, keep=False)
     """Time from measurement to arrival, s, rounded to steps. () or (n_worlds, n_drones)"""
-    jitter: ArrayLike = parameter(default=0.0, low=0.0, high=MAX_DELAY)
+    jitter: Param = param(default=0.0, low=0.0, high=MAX_DELAY, keep=False)
     """Largest random addition to the delay, s, uniform from zero. () or (n_worlds, n_drones)"""
-    dropout: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
+    dropout: Param = param(default=0.0, low=0.0, high=1.0, keep=False)
     """Probability that a measurement is lost, 0 to 1. () or (n_worlds, n_drones)"""
     max_delay: float | None = setting(default=None, low=0.0, high=MAX_DELAY)
-    """Largest sum of delay and jitter to which the record can be changed later, s; None for ``delay`` plus
+    """Largest sum of delay and jitter to which the sensor can be changed later, s; None for ``delay`` plus
     ``jitter``."""
+    samples: Samples | None = nested(default=None)
+    """Measurements that have arrived or are in transit, with delay and losses."""
     name: str = "sensor"
-
-    @property
-    def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement, in their order."""
-        raise NotImplementedError
 
     def ideal(self, data: SimData) -> Array:
         """Return the measurement without errors, of one drone. (k,)"""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} needs a method ideal(data)")
 
-    def measure(self, data: SimData, record: Any, key: Array) -> tuple[Array, Any]:
-        """Return a measurement of one drone, (k,), and the record of the plugin after it."""
-        raise NotImplementedError
+    def measure(self, data: SimData, key: Array) -> tuple[Array, Self]:
+        """Return a measurement of one drone, (k,), and the sensor after it."""
+        return self.with_errors(self.ideal(data), key, self.interval(data))
 
-    def episode_key(self, data: SimData) -> Array:
-        """Return the random key of one drone for the errors that stay the same in an episode. ()"""
-        return drone_key(data, f"{self.name}_begin")
+    def with_errors(self, truth: Array, key: Array, dt: float) -> tuple[Array, Self]:
+        """Return a measurement of one drone with its errors, (k,), and the sensor after it.
 
-    def record(self, sim: Simulation) -> PyTree:
-        if not hasattr(self, "kind"):
-            raise NotImplementedError(f"{type(self).__name__} needs kind, the class of its record, or a method record")
-        return self.fill_record(sim, self.kind)
+        Args:
+            truth: The measurement without errors. (k,)
+            key: Random key of the drone at this step.
+            dt: Time since the last measurement, s.
+        """
+        parts, changes = self.split(truth), {}
+        noise = draw_noise(key, {name: x.n_step(len(parts[name])) for name, x in self.chains.items()}, truth.dtype)
+        for name, chain in self.chains.items():
+            parts[name], new = chain.step(self, parts[name], noise[name], dt)
+            changes |= new
+        return jnp.concatenate(list(parts.values())), self.replace(**changes)
 
-    def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        return super().fill_record(sim, kind, samples=self.samples(sim), **fields)
+    def variance(self, channel: str) -> Array | float:
+        """Return the variance of the errors of a channel; for the sensor in ``data.plugins``."""
+        return self.chains[channel].variance(self)
 
-    def samples(self, sim: Simulation) -> Samples:
-        """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
+    def reset_episode(self, data: SimData) -> SimData:
+        truth, changes = self.split(self.ideal(data)), {}
+        counts = {name: chain.n_start(len(truth[name])) for name, chain in self.chains.items()}
+        noise = draw_noise(drone_key(data, f"{self.name}_begin"), counts, data.states.pos.dtype)
+        for name, chain in self.chains.items():
+            changes |= chain.start(self, truth[name], noise[name])
+        return self.write(data, self.replace(**changes))
+
+    @property
+    def resets_episode(self) -> bool:
+        is_overridden = type(self).reset_episode is not Sensor.reset_episode
+        return is_overridden or any(chain.n_start(1) for chain in self.chains.values())
+
+    def with_arrays(self, sim: Simulation, **values: Any) -> Self:
+        return super().with_arrays(sim, samples=self.first_samples(sim), **values)
+
+    def first_samples(self, sim: Simulation) -> Samples:
+        """Return ``samples`` before the first measurement; check the common settings."""
+        if not self.channels:
+            raise NotImplementedError(f"{type(self).__name__} needs channels, such as channels = {{'pos': 3}}")
         period = sampling_period(self, sim)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * sim.data.core.freq / period + 0.5) + 2 if max_delay > 0 else 0
@@ -115,39 +137,34 @@ class Sensor(Plugin):
                 f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
                 f"{max_delay} s. Use a shorter delay or a lower freq=."
             )
-        can_lose = bool(np.any(np.asarray(self.dropout)))
-        transit = {}
-        if n_rows:
-            transit = {
-                "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, max_delay),
-                "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, max_delay),
-                "queue": drone_array(sim, 0.0, n_rows, k),
-                "arrival_steps": device_array(np.full((*shape, n_rows), NEVER_ARRIVES), np.int32),
-            }
+        delay, jitter = (
+            check_parameter(sim, name, getattr(self, name), (1,), 0.0, max_delay) for name in ("delay", "jitter")
+        )
+        dropout = check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0)
         return Samples(
             value=drone_array(sim, 0.0, k),
             taken_step=device_array(np.full((*shape, 1), -1), np.int32),
-            delay=transit.get("delay"),
-            jitter=transit.get("jitter"),
-            dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if can_lose else None,
-            queue=transit.get("queue"),
-            arrival_steps=transit.get("arrival_steps"),
+            delay=delay if n_rows else None,
+            jitter=jitter if n_rows else None,
+            dropout=dropout if np.any(dropout) else None,
+            queue=drone_array(sim, 0.0, n_rows, k) if n_rows else None,
+            arrival_steps=device_array(np.full((*shape, n_rows), NEVER_ARRIVES), np.int32) if n_rows else None,
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
         condition = None if sampling_period(self, sim) == 1 else lambda data: is_tick(data, self.freq or data.core.freq)
-        placements.append(StagePlacement(Stage(self._take_measurement, "drone", condition), before=end))
+        placements.append(StagePlacement(self.stage(self._take_measurement, when=condition), before=end))
         if self.is_late:
             placements.append(
-                StagePlacement(Stage(self._deliver_measurement, "drone"), before=end, name=f"{self.name}_arrival")
+                StagePlacement(self.stage(self._deliver_measurement), before=end, name=f"{self.name}_arrival")
             )
         return placements
 
     def latest(self, data: SimData) -> Array:
         """Return the latest measurement of one drone; before the first arrives, one without errors. (k,)"""
-        samples = self.read(data).samples
-        return jnp.where(samples.taken_step >= 0, samples.value, self.ideal(data))
+        self = self.read(data)
+        return jnp.where(self.samples.taken_step >= 0, self.samples.value, self.ideal(data))
 
     def part(self, data: SimData, channel: str) -> Array:
         """Return one of the ``channels`` of the latest measurement of one drone. (k,)"""
@@ -175,7 +192,7 @@ class Sensor(Plugin):
     @property
     def is_late(self) -> bool:
         """True if measurements arrive after a delay."""
-        return bool(self._max_delay)
+        return bool(self._max_delay) if self.samples is None else self.samples.queue is not None
 
     @property
     def _max_delay(self) -> float:
@@ -187,8 +204,9 @@ class Sensor(Plugin):
     def _take_measurement(self, data: SimData) -> SimData:
         """Take a measurement of one drone, and put it into the queue; without delay, it becomes the latest one."""
         key, step = drone_key(data, self.name), data.core.steps
-        value, record = self.measure(data, self.read(data), key)
-        samples, is_lost, jitter_fraction = record.samples, False, 0.0
+        value, sensor = self.measure(data, key)
+        samples: Any = self.samples
+        is_lost, jitter_fraction = False, 0.0
         if samples.dropout is not None or samples.queue is not None:
             random_numbers = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
             is_lost = False if samples.dropout is None else random_numbers[:1] < samples.dropout
@@ -207,18 +225,18 @@ class Sensor(Plugin):
             queue = jnp.concatenate([value[None], samples.queue[:-1]])
             arrival_steps = jnp.concatenate([arrival_step, samples.arrival_steps[:-1]])
             samples = samples.replace(queue=queue, arrival_steps=arrival_steps)
-        return self.write(data, record.replace(samples=samples))
+        return self.write(data, sensor.replace(samples=samples))
 
     def _deliver_measurement(self, data: SimData) -> SimData:
         """Replace the latest measurement of one drone by the newest one that has arrived."""
-        record, step = self.read(data), data.core.steps
-        samples, period = record.samples, data.core.freq // (self.freq or data.core.freq)
+        samples: Any = self.samples
+        step, period = data.core.steps, data.core.freq // (self.freq or data.core.freq)
         value, taken_step = samples.value, samples.taken_step
         for row in reversed(range(samples.arrival_steps.shape[0])):  # the newest one last, so that it is kept
             has_arrived = samples.arrival_steps[row] <= step
             value = jnp.where(has_arrived, samples.queue[row], value)
             taken_step = jnp.where(has_arrived, step - step % period - row * period, taken_step)
-        return self.write(data, record.replace(samples=samples.replace(value=value, taken_step=taken_step)))
+        return self.write(data, self.replace(samples=samples.replace(value=value, taken_step=taken_step)))
 
 
 def age_at(data: SimData, taken_step: Array) -> Array:
@@ -241,32 +259,3 @@ def mounting_quat(sim: Simulation, rpy: ArrayLike) -> Array:
         rpy: Roll, pitch and yaw of the sensor's frame in the body frame, rad. (3,) or (n_worlds, n_drones, 3)
     """
     return jax.jit(rotation.from_rpy)(check_parameter(sim, "rpy", rpy, (3,)))
-
-
-def quantise(x: Array, resolution: Array | None) -> Array:
-    """Return the nearest multiple of a resolution, with the gradient of ``x``; ``x`` itself for None. (...)"""
-    return x if resolution is None else _nearest_multiple(x, resolution)
-
-
-@jax.custom_jvp
-def _nearest_multiple(x: Array, resolution: Array) -> Array:
-    return resolution * jnp.round(x / resolution)
-
-
-@_nearest_multiple.defjvp
-def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    return _nearest_multiple(*primals), tangents[0]
-
-
-def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:
-    """Return a first-order Gauss-Markov process one interval later; the variance is exact for any interval.
-
-    Args:
-        state: Value of the process. (..., k)
-        deviation: Standard deviation of the process. (..., k)
-        time: Correlation time of the process, s. (..., k)
-        dt: Length of the interval, s.
-        noise: Standard normal numbers. (..., k)
-    """
-    decay = jnp.exp(-dt / time)
-    return decay * state + deviation * rotation.safe_sqrt((1 - decay) * (1 + decay)) * noise

@@ -4,52 +4,97 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.core.plugin import Simulation, check_parameter, drone_array
-from crazysim.core.settings import check_settings, setting
-from crazysim.plugins.sensors.sensor import gauss_markov_step, quantise
-from crazysim.pytree import PyTree, leaf
+from crazysim.core.plugin import Param, Simulation, bind_leaf, check_parameter, derived, drone_array, param, state
+from crazysim.core.settings import check_settings
+from crazysim.plugins.sensors.errors import Changes, Link, gauss_markov_step, quantise
+from crazysim.pytree import PyTree, static
 
 
-class TriadData(PyTree):
-    """Errors of the three axes of every sensor, in the unit u of the measurement."""
+class Triad(PyTree):
+    """Errors of a three-axis sensor, in the unit u of the measurement.
 
-    bias: Array = leaf("drone", 1)
-    """Current bias without the wandering part, u. (n_worlds, n_drones, 3)"""
-    scale: Array = leaf("drone", 1)
-    """Relative error of the scale in this episode, 1. (n_worlds, n_drones, 3)"""
-    misalignment: Array = leaf("drone", 1)
-    """Rotation of the axes in this episode, rad. (n_worlds, n_drones, 3)"""
-    wander: Array = leaf("drone", 1)
-    """Wandering part of the bias, u. (n_worlds, n_drones, 3)"""
-    filtered: Array | None = leaf("drone", 1)
-    """Output of the low-pass filter, u; None without a filter. (n_worlds, n_drones, 3)"""
-    noise: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Density of the white noise, one-sided, u/sqrt(Hz). (3,)"""
-    random_walk: Array = leaf("parameter", 1, (3,), sparse=True)
+    Each setting is one number for all axes, (3,), or (n_worlds, n_drones, 3). The Allan deviation of a measurement is
+    ``noise / sqrt(2 t)`` from white noise, ``random_walk sqrt(t / 3)`` from the random walk, and at most
+    0.62 ``instability``, at ``t = 1.89 correlation_time``, from the wandering bias.
+    """
+
+    _: dataclasses.KW_ONLY
+    noise: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, sparse=True)
+    """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square after an ideal
+    low-pass filter is ``noise sqrt(bandwidth)``. (3,)"""
+    bias: Param = param(default=0.0, core=(3,), scope="drone", per_axis=True)
+    """Bias without the wandering part, u; as a setting, its mean at the beginning of an episode.
+    (n_worlds, n_drones, 3)"""
+    bias_spread: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, keep=False)
+    """Standard deviation of the bias at the beginning of an episode, u."""
+    random_walk: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, sparse=True)
     """Standard deviation of the random walk of the bias after 1 s, u/sqrt(s). (3,)"""
-    instability: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Standard deviation of the wandering part of the bias, u. (3,)"""
-    correlation_time: Array = leaf("parameter", 1, (1,))
-    """Correlation time of the wandering part, s. (1,)"""
-    mean: Array = leaf("parameter", 1, (9,), sparse=True)
-    """Means of bias, scale error and misalignment at the beginning of an episode. (9,)"""
-    spread: Array = leaf("parameter", 1, (9,), sparse=True)
-    """Standard deviations of bias, scale error and misalignment at the beginning of an episode. (9,)"""
-    bandwidth: Array | None = leaf("parameter", 1, (1,))
-    """Corner frequency of the low-pass filter, Hz; None without a filter. (1,)"""
-    limit: Array | None = leaf("parameter", 1, (3,))
+    instability: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, sparse=True)
+    """Standard deviation of the wandering bias, a first-order Gauss-Markov process, u. (3,)"""
+    correlation_time: Param = param(default=100.0, positive=True)
+    """Correlation time of the wandering bias, s. (1,)"""
+    scale: Param = param(default=0.0, core=(3,), scope="drone", per_axis=True)
+    """Relative error of the scale in this episode, 1; as a setting, its mean. (n_worlds, n_drones, 3)"""
+    scale_spread: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, keep=False)
+    """Standard deviation of the relative error of the scale between episodes, 1."""
+    misalignment: Param = param(default=0.0, core=(3,), scope="drone", per_axis=True)
+    """Small rotation of the axes relative to the mounting in this episode, rad; as a setting, its mean.
+    (n_worlds, n_drones, 3)"""
+    misalignment_spread: Param = param(default=0.0, core=(3,), low=0.0, per_axis=True, keep=False)
+    """Standard deviation of this rotation between episodes, rad."""
+    bandwidth: Param = param(default=None, positive=True)
+    """Corner frequency of a first-order low-pass filter, Hz; None for no filter. (1,)"""
+    limit: Param = param(default=None, core=(3,), positive=True, per_axis=True)
     """Largest magnitude of a measurement, u; None for no limit. (3,)"""
-    resolution: Array | None = leaf("parameter", 1, (3,))
-    """Step to which measurements are rounded, u; None for no rounding. (3,)"""
+    resolution: Param = param(default=None, core=(3,), positive=True, per_axis=True)
+    """Step to which measurements are rounded, u; None for no rounding. Gradients ignore the rounding. (3,)"""
+    mean: Array = derived((9,), sparse=True)
+    """Means of bias, scale error and misalignment at the beginning of an episode. (9,)"""
+    spread: Array = derived((9,), sparse=True)
+    """Standard deviations of bias, scale error and misalignment at the beginning of an episode. (9,)"""
+    wander: Array = state((3,))
+    """Wandering part of the bias, u. (n_worlds, n_drones, 3)"""
+    filtered: Array | None = state((3,), optional=True)
+    """Output of the low-pass filter, u; None without a filter. (n_worlds, n_drones, 3)"""
+    is_bound: bool = static(default=False, repr=False)
+    """True for errors in ``data.plugins``, with arrays."""
 
-    def draw_errors(self, truth: Array, noise: Array) -> TriadData:
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.is_bound is not True:
+            check_settings(self)
+
+    def bind(self, sim: Simulation, name: str) -> Triad:
+        """Return the errors with arrays, before the first measurement; ``name`` is the sensor's name in messages."""
+
+        def join_fields(*fields: str) -> Array:
+            parts = [
+                np.asarray(check_parameter(sim, f"{x} of {name}", getattr(self, x), (3,), per_axis=True))
+                for x in fields
+            ]
+            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
+            parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
+            return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
+
+        bound: dict[str, Any] = {
+            field.name: bind_leaf(sim, f"{field.name} of {name}", getattr(self, field.name), field.metadata)
+            if "scope" in field.metadata
+            else None
+            for field in dataclasses.fields(self)
+        }
+        bound["mean"] = join_fields("bias", "scale", "misalignment")
+        bound["spread"] = join_fields("bias_spread", "scale_spread", "misalignment_spread")
+        bound["filtered"] = None if self.bandwidth is None else drone_array(sim, 0.0, 3)
+        return self.replace(**(bound | {"is_bound": True}))
+
+    def draw_errors(self, truth: Array, noise: Array) -> Triad:
         """Return the errors of one sensor in an episode.
 
         Args:
@@ -67,7 +112,7 @@ class TriadData(PyTree):
         misaligned = truth - rotation.cross(self.misalignment, truth)
         return misaligned + self.scale * misaligned + self.bias + self.wander
 
-    def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, TriadData]:
+    def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, Triad]:
         """Return the next measurement of one sensor, u (3,), and the errors after it.
 
         Args:
@@ -89,79 +134,22 @@ class TriadData(PyTree):
         return value, triad
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Triad:
-    """Errors of a three-axis sensor, in the unit u of the measurement.
+@dataclasses.dataclass(frozen=True)
+class TriadErrors(Link):
+    """The errors of a ``Triad``, which is a field of the sensor."""
 
-    Each setting is one number for all axes, (3,), or (n_worlds, n_drones, 3). The Allan deviation of a measurement is
-    ``noise / sqrt(2 t)`` from white noise, ``random_walk sqrt(t / 3)`` from the random walk, and at most
-    0.62 ``instability``, at ``t = 1.89 correlation_time``, from the wandering bias.
-    """
+    triad: str
+    """Name of the field."""
 
-    noise: ArrayLike = setting(default=0.0, low=0.0)
-    """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square after an ideal
-    low-pass filter is ``noise sqrt(bandwidth)``."""
-    bias: ArrayLike = 0.0
-    """Mean of the bias at the beginning of an episode, u."""
-    bias_spread: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of the bias at the beginning of an episode, u."""
-    random_walk: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of the random walk of the bias after 1 s, u/sqrt(s)."""
-    instability: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of the wandering bias, a first-order Gauss-Markov process, u."""
-    correlation_time: ArrayLike = setting(default=100.0, positive=True)
-    """Correlation time of the wandering bias, s. () or (n_worlds, n_drones)"""
-    scale: ArrayLike = 0.0
-    """Mean relative error of the scale, 1."""
-    scale_spread: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of the relative error of the scale between episodes, 1."""
-    misalignment: ArrayLike = 0.0
-    """Mean of a small rotation of the axes relative to the mounting, rad."""
-    misalignment_spread: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation of this rotation between episodes, rad."""
-    bandwidth: ArrayLike | None = setting(default=None, positive=True)
-    """Corner frequency of a first-order low-pass filter, Hz; None for no filter. () or (n_worlds, n_drones)"""
-    limit: ArrayLike | None = setting(default=None, positive=True)
-    """Largest magnitude of a measurement, u; None for no limit."""
-    resolution: ArrayLike | None = setting(default=None, positive=True)
-    """Step to which measurements are rounded, u; None for no rounding. Gradients ignore the rounding."""
+    def n_start(self, k: int) -> int:
+        return 12
 
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_settings(self)
+    def n_step(self, k: int) -> int:
+        return 9
 
-    def record(self, sim: Simulation, name: str) -> TriadData:
-        """Return the record before the first measurement; ``name`` is the sensor's name in messages."""
+    def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
+        return {self.triad: getattr(sensor, self.triad).draw_errors(truth, noise)}
 
-        def read_vector(field: str) -> Array:
-            return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), per_axis=True)
-
-        def join_fields(*fields: str) -> Array:
-            parts = [np.asarray(read_vector(field)) for field in fields]
-            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
-            parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
-            return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
-
-        def read_optional(field: str, n: int) -> Array | None:
-            value = getattr(self, field)
-            setting_name = f"{field} of {name}"
-            return None if value is None else check_parameter(sim, setting_name, value, (n,), per_axis=True)
-
-        mean = join_fields("bias", "scale", "misalignment")
-        means = drone_array(sim, mean, 9)
-        return TriadData(
-            bias=means[..., :3],
-            scale=means[..., 3:6],
-            misalignment=means[..., 6:],
-            wander=drone_array(sim, 0.0, 3),
-            filtered=None if self.bandwidth is None else drone_array(sim, 0.0, 3),
-            noise=read_vector("noise"),
-            random_walk=read_vector("random_walk"),
-            instability=read_vector("instability"),
-            correlation_time=check_parameter(sim, f"correlation_time of {name}", self.correlation_time, (1,)),
-            mean=mean,
-            spread=join_fields("bias_spread", "scale_spread", "misalignment_spread"),
-            bandwidth=read_optional("bandwidth", 1),
-            limit=read_optional("limit", 3),
-            resolution=read_optional("resolution", 3),
-        )
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        x, triad = getattr(sensor, self.triad).measure(x, noise, dt)
+        return x, {self.triad: triad}

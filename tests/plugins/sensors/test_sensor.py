@@ -1,17 +1,14 @@
 """Rate, delay, jitter and loss of measurements, with a sensor that measures the number of the step."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, PyTree, Sim
-from crazysim.plugins.sensors import Samples, Sensor
-
-
-class ClockData(PyTree):
-    samples: Samples
+from crazysim import ConfigError, Sim
+from crazysim.plugins.sensors import Sensor
 
 
 class Clock(Sensor):
@@ -20,18 +17,13 @@ class Clock(Sensor):
     _: dataclasses.KW_ONLY
     name: str = "clock"
 
-    @property
-    def channels(self):
-        return {"step": 1}
-
-    def record(self, sim):
-        return ClockData(self.samples(sim))
+    channels: ClassVar = {"step": 1}
 
     def ideal(self, data):
         return jnp.full(1, -7.0)
 
-    def measure(self, data, record, key):
-        return data.core.steps[None].astype(jnp.float32), record
+    def measure(self, data, key):
+        return data.core.steps[None].astype(jnp.float32), self
 
 
 def record_clock(n_steps, n_worlds=1, n_drones=1, **settings):
@@ -113,15 +105,16 @@ def test_another_delay_up_to_max_delay_compiles_nothing():
     ({"delay": 0.02, "max_delay": 0.01}, "expected delay"),
     ({"max_delay": -1.0}, "expected max_delay of Clock to be from 0 to 100, got -1"),
     ({"dropout": 1.5}, "expected dropout"),
+    *[({name: np.zeros((2, 1))}, f"expected {name} .*got shape \\(2, 1\\)") for name in ("delay", "jitter", "dropout")],
 ])  # fmt: skip
 def test_law_09_wrong_settings(settings, message):
     with pytest.raises(ConfigError, match=message):
         record_clock(0, **settings)
 
 
-def test_a_sensor_without_a_record_is_an_error_that_names_it():
+def test_a_sensor_without_channels_is_an_error_that_names_it():
     class Incomplete(Sensor):
         """Defines nothing."""
 
-    with pytest.raises(NotImplementedError, match="Incomplete needs kind, the class of its record"):
+    with pytest.raises(NotImplementedError, match="Incomplete needs channels"):
         Sim().add(Incomplete())

@@ -1,0 +1,195 @@
+"""Errors of measurements: links that turn the true part of a measurement into the measured one.
+
+A sensor declares them by channel, with the names of its numbers and states::
+
+    chains: ClassVar = {"pos": Chain(GaussMarkov("drift", "drift_error", "drift_time"), White("noise"))}
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.random import normal
+
+Changes = dict[str, Any]
+"""New values of fields of a sensor, by name."""
+
+
+class Link:
+    """An error of a measurement of k numbers, of one drone; settings are names of fields of the sensor.
+
+    A subclass overrides what it needs. Independent standard normal numbers are drawn for it: ``n_start`` when an
+    episode begins, ``n_step`` for each measurement.
+    """
+
+    def n_start(self, k: int) -> int:
+        return 0
+
+    def n_step(self, k: int) -> int:
+        return 0
+
+    def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
+        """Return the states of the error at the beginning of an episode."""
+        return {}
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        """Return ``x`` with the error, and the states of the error, ``dt`` seconds after the last measurement."""
+        return x, {}
+
+    def variance(self, sensor: Any) -> Array | float:
+        """Return the variance of the error."""
+        return 0.0
+
+
+class Chain(Link):
+    """Errors that follow each other."""
+
+    def __init__(self, *links: Link):
+        self.links = links
+
+    def n_start(self, k: int) -> int:
+        return sum(link.n_start(k) for link in self.links)
+
+    def n_step(self, k: int) -> int:
+        return sum(link.n_step(k) for link in self.links)
+
+    def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
+        changes = {}
+        for link, n in [(link, link.n_start(len(truth))) for link in self.links]:
+            changes |= link.start(sensor, truth, noise[:n])
+            noise = noise[n:]
+        return changes
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        changes = {}
+        for link, n in [(link, link.n_step(len(x))) for link in self.links]:
+            x, new = link.step(sensor, x, noise[:n], dt)
+            noise, changes = noise[n:], changes | new
+        return x, changes
+
+    def variance(self, sensor: Any) -> Array | float:
+        return sum(link.variance(sensor) for link in self.links)
+
+
+@dataclasses.dataclass(frozen=True)
+class White(Link):
+    """Noise that is independent from measurement to measurement."""
+
+    deviation: str
+    """Standard deviation."""
+
+    def n_step(self, k: int) -> int:
+        return k
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        return x + getattr(sensor, self.deviation) * noise, {}
+
+    def variance(self, sensor: Any) -> Array:
+        return getattr(sensor, self.deviation) ** 2
+
+
+class Turned(White):
+    """Small rotations of an attitude, xyzw, about the axes of the body, rad."""
+
+    def n_step(self, k: int) -> int:
+        return 3
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        half_rotvec = 0.5 * getattr(sensor, self.deviation) * noise
+        quat = rotation.multiply(x, jnp.concatenate([half_rotvec, jnp.ones_like(half_rotvec[:1])]))
+        return quat / jnp.sqrt(rotation.dot(quat, quat)), {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Constant(White):
+    """An offset that is drawn when an episode begins, and stays."""
+
+    state: str
+    """The offset."""
+
+    def n_start(self, k: int) -> int:
+        return k
+
+    def n_step(self, k: int) -> int:
+        return 0
+
+    def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
+        return {self.state: getattr(sensor, self.deviation) * noise}
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        return x + getattr(sensor, self.state), {}
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussMarkov(Constant):
+    """An offset that wanders: a first-order Gauss-Markov process, stationary from the start."""
+
+    time: str
+    """Correlation time, s."""
+
+    def n_step(self, k: int) -> int:
+        return k
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        offset, deviation, time = (getattr(sensor, name) for name in (self.state, self.deviation, self.time))
+        offset = gauss_markov_step(offset, deviation, time, dt, noise)
+        return x + offset, {self.state: offset}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rounded(Link):
+    """Rounding to multiples of a resolution, which gradients ignore."""
+
+    resolution: str
+    """The resolution, whose value is None for no rounding."""
+
+    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
+        return quantise(x, getattr(sensor, self.resolution)), {}
+
+    def variance(self, sensor: Any) -> Array | float:
+        resolution = getattr(sensor, self.resolution)
+        return 0.0 if resolution is None else resolution**2 / 12
+
+
+def draw_noise(key: Array, counts: Mapping[str, int], dtype: Any) -> dict[str, Array]:
+    """Return standard normal numbers by name. (n,) each"""
+    noise, parts = normal(key, (sum(counts.values()),), dtype), {}
+    for name, n in counts.items():
+        parts[name], noise = noise[:n], noise[n:]
+    return parts
+
+
+def quantise(x: Array, resolution: Array | None) -> Array:
+    """Return the nearest multiple of a resolution, with the gradient of ``x``; ``x`` itself for None. (...)"""
+    return x if resolution is None else _nearest_multiple(x, resolution)
+
+
+@jax.custom_jvp
+def _nearest_multiple(x: Array, resolution: Array) -> Array:
+    return resolution * jnp.round(x / resolution)
+
+
+@_nearest_multiple.defjvp
+def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    return _nearest_multiple(*primals), tangents[0]
+
+
+def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:
+    """Return a first-order Gauss-Markov process one interval later; the variance is exact for any interval.
+
+    Args:
+        state: Value of the process. (..., k)
+        deviation: Standard deviation of the process. (..., k)
+        time: Correlation time of the process, s. (..., k)
+        dt: Length of the interval, s.
+        noise: Standard normal numbers. (..., k)
+    """
+    decay = jnp.exp(-dt / time)
+    return decay * state + deviation * rotation.safe_sqrt((1 - decay) * (1 + decay)) * noise
