@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from crazysim.core.settings import dividing_rate
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, expect, short_repr
 from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
+from crazysim.plugins.sensors.sensor import rate_in
 
 
 class CameraImages(Wrapper):
@@ -48,9 +48,7 @@ class CameraImages(Wrapper):
         used_names = {name for wrapper in env.wrappers if isinstance(wrapper, CameraImages) for name in wrapper.shapes}
         if duplicates := used_names & self.shapes.keys():
             raise ConfigError(f"expected cameras of different names, got images {min(duplicates)!r} twice. Use name=.")
-        freq = env.base.freq
-        rate = freq if camera.freq is None else dividing_rate(f"freq of {camera.name!r}", camera.freq, freq)
-        self._period = sim.freq // rate
+        self._period = sim.freq // rate_in(camera, env.base.freq)
         """Physics steps from one image to the next."""
         camera.check(sim, self._period)
         self._is_immediate = self._period == env.n_substeps and camera.latency == 0

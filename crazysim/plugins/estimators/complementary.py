@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array, parameter
-from crazysim.core.settings import dividing_rate
+from crazysim.core.settings import default_rates
 from crazysim.core.stage import Stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
@@ -22,7 +22,7 @@ from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.barometer import Barometer
 from crazysim.plugins.sensors.flow_deck import TimeOfFlight
 from crazysim.plugins.sensors.imu import IMU
-from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.plugins.sensors.sensor import Sensor, rate_in
 from crazysim.pytree import PyTree, leaf
 
 HEIGHT_FREQ = 100
@@ -101,8 +101,8 @@ class Complementary(Estimator):
         return self.fill_record(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        period = freq // dividing_rate("freq", self.freq, freq)
-        height_period = freq // dividing_rate("rate of the height", HEIGHT_FREQ, freq)
+        period = freq // rate_in(self, freq)
+        height_period = freq // default_rates(freq, {"rate of the height": HEIGHT_FREQ})["rate of the height"]
 
         def update_attitude(data: SimData) -> SimData:
             """Update the attitude and the inertial velocity of one drone."""

@@ -12,14 +12,13 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
-from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
-from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.plugins.sensors.sensor import Sensor, rate_in
 from crazysim.pytree import PyTree, device_array
 
 R = TypeVar("R", bound=PyTree)
@@ -82,7 +81,7 @@ class ErrorStateFilter(Estimator):
         Args:
             freq: Steps of the simulation per second, Hz.
         """
-        period = freq // dividing_rate("freq", self.freq, freq)
+        period = freq // rate_in(self, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 
     def fusion_stages(self) -> list[tuple[str, Stage]]:

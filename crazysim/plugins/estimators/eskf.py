@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, is_tick
+from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
@@ -114,7 +114,7 @@ class ESKF(ErrorStateFilter):
             *(
                 (
                     f"{sensor.name}_path",
-                    Stage(self._path_start_fn(sensor, period), "drone", _sampling_predicate(sensor)),
+                    Stage(self._path_start_fn(sensor, period), "drone", sensor.is_sampled),
                 )
                 for sensor in self.aiding_sensors
                 if sensor.is_late
@@ -217,7 +217,7 @@ class ESKF(ErrorStateFilter):
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
-        interval, (first, end) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
+        interval, (first, end) = data.core.freq // sensor.rate(data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
         row, age = paths[first], (steps - taken_step) // interval  # age in measurements of the sensor
         for k in range(first + 1, end):
@@ -239,11 +239,6 @@ def _n_rows_in_transit(sensor: Sensor, data: SimData) -> int:
     """Return the number of measurements of one sensor that can be in transit."""
     arrival_steps = sensor.read(data).samples.arrival_steps
     return 0 if arrival_steps is None else arrival_steps.shape[-1]
-
-
-def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
-    """Return the condition of a stage that runs in the steps in which a sensor measures; it is None for every step."""
-    return lambda data: is_tick(data, sensor.freq or data.core.freq)
 
 
 def _bias_walk(triad: Triad, dt: float) -> Array:

@@ -24,7 +24,7 @@ from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
-from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, sampling_period
+from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
@@ -257,7 +257,7 @@ class ImageSensor(Plugin):
         return record.replace(taken_step=delivered_index * period)
 
     def record(self, sim: Simulation) -> ImageData:
-        period = sampling_period(self, sim)
+        period = sim.data.core.freq // rate_in(self, sim.data.core.freq)
         self.check(sim, period)
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
@@ -270,7 +270,7 @@ class ImageSensor(Plugin):
         return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        period, latency = sampling_period(self, sim), self._latency_steps(sim.data)
+        period, latency = sim.data.core.freq // rate_in(self, sim.data.core.freq), self._latency_steps(sim.data)
         take_images = self.image_fn(sim)
 
         def update_record(data: SimData) -> SimData:

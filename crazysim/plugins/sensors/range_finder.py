@@ -16,7 +16,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, drone_array, param, state
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import age_at, sampling_period
+from crazysim.plugins.sensors.sensor import age_at, rate_in
 from crazysim.pytree import device_array
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
@@ -96,7 +96,7 @@ class RangeFinder(Plugin):
                 len(drone_geoms.geoms) * len(drone_geoms.drones or range(sim.n_drones)) for drone_geoms in model.drones
             )
         scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or movers_by_name else "drone"
-        period, scene = sampling_period(self, sim), sim.scene
+        period, scene = sim.data.core.freq // rate_in(self, sim.data.core.freq), sim.scene
 
         def is_due(data: SimData) -> Array:
             """Return True for worlds that measure in this step."""

@@ -17,7 +17,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, drone_array, nested, param
 from crazysim.core.random import drone_key, uniform
-from crazysim.core.settings import dividing_rate, setting
+from crazysim.core.settings import default_rates, dividing_rate, setting
 from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.errors import Link, draw_noise
@@ -129,9 +129,9 @@ class Sensor(Plugin):
         """Return ``samples`` before the first measurement; check the common settings."""
         if not self.channels:
             raise NotImplementedError(f"{type(self).__name__} needs channels, such as channels = {{'pos': 3}}")
-        period = sampling_period(self, sim)
+        freq = self.rate(sim.data.core.freq)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
-        n_rows = math.floor(max_delay * sim.data.core.freq / period + 0.5) + 2 if max_delay > 0 else 0
+        n_rows = math.floor(max_delay * freq + 0.5) + 2 if max_delay > 0 else 0
         if n_rows > MAX_ROWS:
             raise ConfigError(
                 f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
@@ -153,7 +153,7 @@ class Sensor(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
-        condition = None if sampling_period(self, sim) == 1 else lambda data: is_tick(data, self.freq or data.core.freq)
+        condition = None if self.rate(sim.data.core.freq) == sim.data.core.freq else self.is_sampled
         placements.append(StagePlacement(self.stage(self._take_measurement, when=condition), before=end))
         if self.is_late:
             placements.append(
@@ -185,9 +185,17 @@ class Sensor(Plugin):
     def observations(self, data: SimData) -> dict[str, Array]:
         return self.split(self.latest(data))
 
+    def rate(self, freq: int) -> int:
+        """Return the measurements per second in a simulation of ``freq`` steps per second, Hz."""
+        return rate_in(self, freq)
+
     def interval(self, data: SimData) -> float:
         """Return the time between measurements, s."""
-        return 1 / (self.freq or data.core.freq)
+        return 1 / self.rate(data.core.freq)
+
+    def is_sampled(self, data: SimData) -> Array | None:
+        """Return True where the sensor measures in this step; None if it measures in every step."""
+        return is_tick(data, self.rate(data.core.freq))
 
     @property
     def is_late(self) -> bool:
@@ -230,7 +238,7 @@ class Sensor(Plugin):
     def _deliver_measurement(self, data: SimData) -> SimData:
         """Replace the latest measurement of one drone by the newest one that has arrived."""
         samples: Any = self.samples
-        step, period = data.core.steps, data.core.freq // (self.freq or data.core.freq)
+        step, period = data.core.steps, data.core.freq // self.rate(data.core.freq)
         value, taken_step = samples.value, samples.taken_step
         for row in reversed(range(samples.arrival_steps.shape[0])):  # the newest one last, so that it is kept
             has_arrived = samples.arrival_steps[row] <= step
@@ -245,10 +253,20 @@ def age_at(data: SimData, taken_step: Array) -> Array:
     return jnp.where(taken_step >= 0, (steps - 1 - taken_step) / data.core.freq, jnp.inf)
 
 
-def sampling_period(sensor: Any, sim: Simulation) -> int:
-    """Return the number of steps between measurements of a plugin with ``freq`` and ``name``."""
-    steps = sim.data.core.freq
-    return 1 if sensor.freq is None else steps // dividing_rate(f"freq of {sensor.name!r}", sensor.freq, steps)
+def rate_in(plugin: Any, freq: int) -> int:
+    """Return the rate of a plugin with ``freq`` and ``name`` in a simulation, Hz: the number of steps for None.
+
+    The default of its class becomes the largest divisor up to it; any other rate has to divide the number of steps.
+
+    Args:
+        plugin: The plugin.
+        freq: Steps of the simulation per second, Hz.
+    """
+    if plugin.freq is None:
+        return freq
+    if plugin.freq == type(plugin).freq:
+        return default_rates(freq, {"freq": plugin.freq}, f" of {plugin.name!r}")["freq"]
+    return dividing_rate(f"freq of {plugin.name!r}", plugin.freq, freq)
 
 
 def mounting_quat(sim: Simulation, rpy: ArrayLike) -> Array:

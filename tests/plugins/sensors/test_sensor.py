@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
-from crazysim.plugins.sensors import Sensor
+from crazysim import ConfigError, RangeFinder, Sim
+from crazysim.plugins.sensors import Barometer, Camera, Sensor
 
 
 class Clock(Sensor):
@@ -93,6 +93,16 @@ def test_another_delay_up_to_max_delay_compiles_nothing():
     assert sim.step_fn is step
     sim.step(8)
     assert np.asarray(sim.plugins.observations(sim.data)["clock.step"]).item() == 22
+
+
+def test_a_default_rate_adapts_and_a_rate_of_the_user_is_refused():
+    assert [Barometer().rate(freq) for freq in (500, 250, 240, 30)] == [50, 50, 48, 30]
+    sim = Sim(control="attitude", freq=250, estimator="complementary", plugins=[RangeFinder(), Camera(2, 1)])
+    assert sim.plugins["complementary"].freq == 250
+    with pytest.raises(ConfigError, match="expected freq of 'barometer' to divide freq = 250 Hz, got 60"):
+        Sim(freq=250, plugins=[Barometer(freq=60)])
+    with pytest.raises(ConfigError, match="divisor near 50 Hz, the default of freq of 'barometer'"):
+        Barometer().rate(251)
 
 
 @pytest.mark.parametrize("settings, message", [
