@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.beacons import UWB, Lighthouse
     from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
-    from crazysim.plugins.sensors.errors import Chain, Constant, GaussMarkov, Link, Rounded, Turned, White
+    from crazysim.plugins.sensors.errors import Constant, GaussMarkov, Link, Rounded, Turned, White
     from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
     from crazysim.plugins.sensors.gps import GPS
     from crazysim.plugins.sensors.image_sensor import ImageData, ImageSensor
@@ -30,7 +30,6 @@ __all__ = [
     "Barometer",
     "BatteryVoltage",
     "Camera",
-    "Chain",
     "Constant",
     "Distortion",
     "GaussMarkov",
@@ -65,7 +64,6 @@ __getattr__ = lazy_getattr(
         "Link": f"{__name__}.errors",
         "GaussMarkov": f"{__name__}.errors",
         "Constant": f"{__name__}.errors",
-        "Chain": f"{__name__}.errors",
         "GPS": f"{__name__}.gps",
         "IMU": f"{__name__}.imu",
         "Barometer": f"{__name__}.barometer",

@@ -10,7 +10,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, param, state
-from crazysim.plugins.sensors.errors import Chain, Constant, GaussMarkov, Rounded, White
+from crazysim.plugins.sensors.errors import Constant, GaussMarkov, Rounded, White
 from crazysim.plugins.sensors.sensor import Sensor
 
 SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE_RATE = 101325.0, 288.15, 0.0065
@@ -45,12 +45,12 @@ class Barometer(Sensor):
 
     channels: ClassVar = {"pressure": 1, "height": 1}
     chains: ClassVar = {
-        "pressure": Chain(
+        "pressure": [
             Constant("offset_spread", "offset"),
             GaussMarkov("drift", "drift_error", "drift_time"),
             White("noise"),
             Rounded("resolution"),
-        )
+        ]
     }
 
     def ideal(self, data: SimData) -> Array:

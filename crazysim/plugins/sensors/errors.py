@@ -8,32 +8,25 @@ A sensor declares them by channel, with the names of its numbers and states::
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.core.random import normal
 
 Changes = dict[str, Any]
 """New values of fields of a sensor, by name."""
 
 
 class Link:
-    """An error of a measurement of k numbers, of one drone; settings are names of fields of the sensor.
+    """An error of a measurement of one drone; its settings are names of fields of the sensor."""
 
-    A subclass overrides what it needs. Independent standard normal numbers are drawn for it: ``n_start`` when an
-    episode begins, ``n_step`` for each measurement.
-    """
-
-    def n_start(self, k: int) -> int:
-        return 0
-
-    def n_step(self, k: int) -> int:
-        return 0
+    n_start: ClassVar[float] = 0
+    """Standard normal numbers that it draws when an episode begins, per component of the measurement."""
+    n_step: ClassVar[float] = 0
+    """Standard normal numbers that it draws for each measurement, per component."""
 
     def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
         """Return the states of the error at the beginning of an episode."""
@@ -48,45 +41,13 @@ class Link:
         return 0.0
 
 
-class Chain(Link):
-    """Errors that follow each other."""
-
-    def __init__(self, *links: Link):
-        self.links = links
-
-    def n_start(self, k: int) -> int:
-        return sum(link.n_start(k) for link in self.links)
-
-    def n_step(self, k: int) -> int:
-        return sum(link.n_step(k) for link in self.links)
-
-    def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
-        changes = {}
-        for link, n in [(link, link.n_start(len(truth))) for link in self.links]:
-            changes |= link.start(sensor, truth, noise[:n])
-            noise = noise[n:]
-        return changes
-
-    def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
-        changes = {}
-        for link, n in [(link, link.n_step(len(x))) for link in self.links]:
-            x, new = link.step(sensor, x, noise[:n], dt)
-            noise, changes = noise[n:], changes | new
-        return x, changes
-
-    def variance(self, sensor: Any) -> Array | float:
-        return sum(link.variance(sensor) for link in self.links)
-
-
 @dataclasses.dataclass(frozen=True)
 class White(Link):
     """Noise that is independent from measurement to measurement."""
 
     deviation: str
     """Standard deviation."""
-
-    def n_step(self, k: int) -> int:
-        return k
+    n_step = 1
 
     def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
         return x + getattr(sensor, self.deviation) * noise, {}
@@ -98,8 +59,7 @@ class White(Link):
 class Turned(White):
     """Small rotations of an attitude, xyzw, about the axes of the body, rad."""
 
-    def n_step(self, k: int) -> int:
-        return 3
+    n_step = 3 / 4  # three angles for four components
 
     def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
         half_rotvec = 0.5 * getattr(sensor, self.deviation) * noise
@@ -113,12 +73,7 @@ class Constant(White):
 
     state: str
     """The offset."""
-
-    def n_start(self, k: int) -> int:
-        return k
-
-    def n_step(self, k: int) -> int:
-        return 0
+    n_start, n_step = 1, 0
 
     def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
         return {self.state: getattr(sensor, self.deviation) * noise}
@@ -133,9 +88,7 @@ class GaussMarkov(Constant):
 
     time: str
     """Correlation time, s."""
-
-    def n_step(self, k: int) -> int:
-        return k
+    n_step = 1
 
     def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
         offset, deviation, time = (getattr(sensor, name) for name in (self.state, self.deviation, self.time))
@@ -156,14 +109,6 @@ class Rounded(Link):
     def variance(self, sensor: Any) -> Array | float:
         resolution = getattr(sensor, self.resolution)
         return 0.0 if resolution is None else resolution**2 / 12
-
-
-def draw_noise(key: Array, counts: Mapping[str, int], dtype: Any) -> dict[str, Array]:
-    """Return standard normal numbers by name. (n,) each"""
-    noise, parts = normal(key, (sum(counts.values()),), dtype), {}
-    for name, n in counts.items():
-        parts[name], noise = noise[:n], noise[n:]
-    return parts
 
 
 def quantise(x: Array, resolution: Array | None) -> Array:

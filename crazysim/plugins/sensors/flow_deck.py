@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, param
 from crazysim.core.random import normal
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.sensors.errors import Chain, Rounded, White, quantise
+from crazysim.plugins.sensors.errors import Rounded, White, quantise
 from crazysim.plugins.sensors.sensor import Sensor
 
 PIXELS_PER_RADIAN = 35.0 / 0.71674
@@ -50,7 +50,7 @@ class OpticalFlow(Sensor):
     name: str = "optical_flow"
 
     channels: ClassVar = {"flow": 2}
-    chains: ClassVar = {"flow": Chain(White("noise"), Rounded("resolution"))}
+    chains: ClassVar = {"flow": [White("noise"), Rounded("resolution")]}
 
     def ideal(self, data: SimData) -> Array:
         """Return the motion of the image, pixels per interval. (2,)"""

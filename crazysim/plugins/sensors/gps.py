@@ -11,7 +11,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, param, state
-from crazysim.plugins.sensors.errors import Chain, GaussMarkov, White
+from crazysim.plugins.sensors.errors import GaussMarkov, White
 from crazysim.plugins.sensors.sensor import Sensor
 
 
@@ -37,8 +37,8 @@ class GPS(Sensor):
 
     channels: ClassVar = {"pos": 3, "vel": 3}
     chains: ClassVar = {
-        "pos": Chain(GaussMarkov("drift", "drift_error", "drift_time"), White("noise")),
-        "vel": White("vel_noise"),
+        "pos": [GaussMarkov("drift", "drift_error", "drift_time"), White("noise")],
+        "vel": [White("vel_noise")],
     }
 
     def ideal(self, data: SimData) -> Array:

@@ -38,7 +38,7 @@ class Magnetometer(Sensor):
     name: str = "magnetometer"
 
     channels: ClassVar = {"field": 3}
-    chains: ClassVar = {"field": TriadErrors("errors")}
+    chains: ClassVar = {"field": [TriadErrors("errors")]}
 
     def bind(self, sim: Simulation) -> Magnetometer:
         field = np.asarray(self.field)

@@ -45,7 +45,7 @@ class MotionCapture(Sensor):
     name: str = "motion_capture"
 
     channels: ClassVar = {"pos": 3, "quat": 4, "vel": 3}
-    chains: ClassVar = {"pos": White("noise"), "quat": Turned("angle_noise")}
+    chains: ClassVar = {"pos": [White("noise")], "quat": [Turned("angle_noise")]}
 
     def bind(self, sim: Simulation) -> MotionCapture:
         return self.with_arrays(sim, quat=mounting_quat(sim, self.rpy))

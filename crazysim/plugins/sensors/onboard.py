@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import Battery
 from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.plugins.sensors.errors import Chain, Link, Rounded, White
+from crazysim.plugins.sensors.errors import Link, Rounded, White
 from crazysim.plugins.sensors.range_finder import RangeFinder
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -35,8 +35,8 @@ class NoisySensor(Sensor):
     name: str = "noisy"
 
     @property
-    def chains(self) -> Mapping[str, Link]:
-        return dict.fromkeys(self.channels, Chain(White("noise"), Rounded("resolution")))
+    def chains(self) -> Mapping[str, Sequence[Link]]:
+        return {name: [White("noise"), Rounded("resolution")] for name in self.channels}
 
 
 class RotorSpeeds(NoisySensor):

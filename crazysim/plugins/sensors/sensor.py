@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import jax
@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, drone_array, nested, param
-from crazysim.core.random import drone_key, uniform
+from crazysim.core.random import drone_key, normal, uniform
 from crazysim.core.settings import default_rates, dividing_rate, setting
 from crazysim.core.stage import is_tick
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.errors import Link, draw_noise
+from crazysim.plugins.sensors.errors import Link
 from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_ROWS = 64
@@ -60,7 +60,7 @@ class Sensor(Plugin):
 
     channels: ClassVar[Mapping[str, int]] = {}
     """Names and lengths of the parts of a measurement, in their order."""
-    chains: ClassVar[Mapping[str, Link]] = {}
+    chains: ClassVar[Mapping[str, Sequence[Link]]] = {}
     """Errors by channel, for channels that have any; see ``crazysim.plugins.sensors.errors``."""
     reset_before: ClassVar[str | None] = "increment_steps"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
@@ -99,28 +99,34 @@ class Sensor(Plugin):
             dt: Time since the last measurement, s.
         """
         parts, changes = self.split(truth), {}
-        noise = draw_noise(key, {name: x.n_step(len(parts[name])) for name, x in self.chains.items()}, truth.dtype)
-        for name, chain in self.chains.items():
-            parts[name], new = chain.step(self, parts[name], noise[name], dt)
+        for name, link, noise in self._draw("n_step", key, truth.dtype):
+            parts[name], new = link.step(self, parts[name], noise, dt)
             changes |= new
         return jnp.concatenate(list(parts.values())), self.replace(**changes)
 
-    def variance(self, channel: str) -> Array | float:
-        """Return the variance of the errors of a channel; for the sensor in ``data.plugins``."""
-        return self.chains[channel].variance(self)
-
     def reset_episode(self, data: SimData) -> SimData:
         truth, changes = self.split(self.ideal(data)), {}
-        counts = {name: chain.n_start(len(truth[name])) for name, chain in self.chains.items()}
-        noise = draw_noise(drone_key(data, f"{self.name}_begin"), counts, data.states.pos.dtype)
-        for name, chain in self.chains.items():
-            changes |= chain.start(self, truth[name], noise[name])
+        for name, link, noise in self._draw("n_start", drone_key(data, f"{self.name}_begin"), data.states.pos.dtype):
+            changes |= link.start(self, truth[name], noise)
         return self.write(data, self.replace(**changes))
+
+    def _draw(self, n: str, key: Array, dtype: Any) -> Iterator[tuple[str, Link, Array]]:
+        """Yield channel, link and random numbers of every link; ``n`` is the name of their number per component."""
+        links = [(name, link) for name, chain in self.chains.items() for link in chain]
+        counts = [round(getattr(link, n) * self.channels[name]) for name, link in links]
+        noise = normal(key, (max(1, sum(counts)),), dtype)
+        for (name, link), count in zip(links, counts, strict=True):
+            yield name, link, noise[:count]
+            noise = noise[count:]
+
+    def variance(self, channel: str) -> Array | float:
+        """Return the variance of the errors of a channel; for the sensor in ``data.plugins``."""
+        return sum(link.variance(self) for link in self.chains[channel])
 
     @property
     def resets_episode(self) -> bool:
         is_overridden = type(self).reset_episode is not Sensor.reset_episode
-        return is_overridden or any(chain.n_start(1) for chain in self.chains.values())
+        return is_overridden or any(link.n_start for chain in self.chains.values() for link in chain)
 
     def with_arrays(self, sim: Simulation, **values: Any) -> Self:
         return super().with_arrays(sim, samples=self.first_samples(sim), **values)

@@ -141,11 +141,7 @@ class TriadErrors(Link):
     triad: str
     """Name of the field."""
 
-    def n_start(self, k: int) -> int:
-        return 12
-
-    def n_step(self, k: int) -> int:
-        return 9
+    n_start, n_step = 4, 3
 
     def start(self, sensor: Any, truth: Array, noise: Array) -> Changes:
         return {self.triad: getattr(sensor, self.triad).draw_errors(truth, noise)}
