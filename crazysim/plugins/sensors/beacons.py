@@ -55,6 +55,7 @@ class UWB(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
         n = np.shape(self.anchors)[0]
         return {"difference": n - 1} if self.tdoa else {"distance": n}
 

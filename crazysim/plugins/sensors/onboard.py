@@ -36,6 +36,7 @@ class NoisySensor(Sensor):
 
     @property
     def chains(self) -> Mapping[str, Sequence[Link]]:
+        """White noise and rounding of every channel."""
         return {name: [White("noise"), Rounded("resolution")] for name in self.channels}
 
 
@@ -59,6 +60,7 @@ class RotorSpeeds(NoisySensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
         return {"speed": self.n_rotors}
 
     def bind(self, sim: Simulation) -> RotorSpeeds:
@@ -118,6 +120,7 @@ class MultiRanger(NoisySensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
         return {"distance": self.n_rays}
 
     def bind(self, sim: Simulation) -> MultiRanger:
