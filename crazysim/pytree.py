@@ -32,6 +32,7 @@ def leaf(
     *,
     sparse: bool = False,
     scratch: bool = False,
+    airframe: Any = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Declare an array field, or a dict of such arrays.
@@ -50,10 +51,11 @@ def leaf(
             changes.
         scratch: True for an array that only carries numbers from one stage of a step to another. Its values are not
             kept after the step.
+        airframe: Dotted path or function of the airframe that gives the value, in ``AirframeParams``.
         default: Default value of the field.
     """
     metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}
-    return dataclasses.field(default=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata | {"airframe": airframe})
 
 
 def static(**kwargs: Any) -> Any:

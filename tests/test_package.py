@@ -63,7 +63,6 @@ def test_a_star_import_needs_no_optional_package(module, monkeypatch):
 
 
 ALIASES = {
-    "control.parameters": ["dynamics.parameter_tables"],
     "dynamics.parameters": ["dynamics.parameter_tables"],
     "exception": ["errors"],
     "sim.data": ["control", "core.controls", "core.data", "sim.crazyflow"],

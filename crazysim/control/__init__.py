@@ -10,13 +10,13 @@ from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude_controller import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.levels import COMMAND_FIELDS, Control, command_size
 from crazysim.control.mellinger import Mellinger
+from crazysim.control.parameters import load_fn_params, load_params
 from crazysim.control.pid import PID
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.control.switch import Switch
-from crazysim.dynamics.parameter_tables import load_controller_fn_params as load_fn_params
-from crazysim.dynamics.parameter_tables import load_controller_params as load_params
+from crazysim.dynamics.models import AirframeParams
 from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ __all__ = [
     "INDI",
     "LQR",
     "PID",
+    "AirframeParams",
     "AllocationParams",
     "AttitudeParams",
     "Auto",

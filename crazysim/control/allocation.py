@@ -9,41 +9,30 @@ from jax import Array
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import clip, matvec
 
 
-class AllocationParams(PyTree):
+class AllocationParams(AirframeParams):
     """Parameters of the allocation, each shared by all drones or with one value per drone."""
 
-    thrust_min: Array = leaf("parameter", 1)
+    thrust_min: Array = leaf("parameter", 1, (1,), airframe="rotors.thrust_min")
     """Minimum thrust of a rotor that is on, N. (1,)"""
-    thrust_max: Array = leaf("parameter", 1)
+    thrust_max: Array = leaf("parameter", 1, (1,), airframe="rotors.thrust_max")
     """Maximum thrust of one rotor, N. (1,)"""
-    torque_arms: Array = leaf("parameter", 1)
+    torque_arms: Array = leaf("parameter", 1, (3,), airframe=lambda airframe: torque_arms(airframe))
     """Torque per thrust about x and y (the arm) and about z (drag torque over thrust), m. (3,)"""
-    rpm2thrust: Array = leaf("parameter", 2)
+    rpm2thrust: Array = leaf("parameter", 2, airframe="rotors.thrust_curve")
     """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
-    allocation_matrix: Array = leaf("parameter", 2)
+    allocation_matrix: Array = leaf("parameter", 2, airframe=allocation_matrix)
     """Matrix from collective thrust, and torque divided by ``torque_arms``, to rotor thrusts, 1. (n_rotors, 4)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
     weight: Array | None = leaf("parameter", 1, (1,), default=None)
     """Weight, N, to which roll and pitch torque may raise the collective thrust in ``crazysim.control.priority``; None
     for no such limit. (1,)"""
-
-    @staticmethod
-    def create(airframe: Airframe) -> AllocationParams:
-        """Return the parameters of an airframe, shared by all drones."""
-        curve = airframe.value("rotors.thrust_curve")
-        return AllocationParams(
-            thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
-            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            torque_arms=as_parameter(torque_arms(airframe)),
-            rpm2thrust=as_parameter(curve.reshape(-1, 3)),
-            allocation_matrix=as_parameter(allocation_matrix(airframe)),
-        )
 
 
 def hover_rotor_vel(airframe: Airframe) -> np.ndarray:

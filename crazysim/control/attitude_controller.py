@@ -6,71 +6,45 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.gains import require_gains
+from crazysim.control.allocation import torque_arms
+from crazysim.control.gains import Gains
 from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
-from crazysim.drones import Airframe
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import matvec
 
-_GAINS = ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
-KEYS = (
-    *(f"controller.attitude.{key}" for key in _GAINS),
-    *(f"controller.{key}" for key in ("torque_pwm_max", "thrust2torque", "pwm_min", "pwm_max")),
-    "rotors.thrust_max",
-)
-"""Values of an airframe that these controllers need."""
 
-
-class AttitudeParams(PyTree):
+class AttitudeParams(Gains, controller="crazyflow", needs=("controller.thrust2torque",)):
     """Gains and parameters of the attitude and body-rate controllers, each shared or one per drone."""
 
-    kR: Array = leaf("parameter", 1)
+    kR: Array = leaf("parameter", 1, (3,), airframe="controller.attitude.kR")
     """Gain on the rotation error, PWM. (3,)"""
-    kw: Array = leaf("parameter", 1)
+    kw: Array = leaf("parameter", 1, (3,), airframe="controller.attitude.kw")
     """Gain on the error of the body rates, PWM s/rad. (3,)"""
-    ki_m: Array = leaf("parameter", 1)
+    ki_m: Array = leaf("parameter", 1, (3,), airframe="controller.attitude.ki_m")
     """Gain on the integral of the negative rotation error, PWM/(rad s). (3,)"""
-    kd_omega: Array = leaf("parameter", 1)
+    kd_omega: Array = leaf("parameter", 1, (3,), airframe="controller.attitude.kd_omega")
     """Gain on the derivative of the error of the body rates, PWM s^2/rad. (3,)"""
-    int_err_max: Array = leaf("parameter", 1)
+    int_err_max: Array = leaf("parameter", 1, (3,), airframe="controller.attitude.int_err_max")
     """Limit of the integral of the rotation error, rad s. (3,)"""
-    torque_pwm_max: Array = leaf("parameter", 1)
+    torque_pwm_max: Array = leaf("parameter", 1, (3,), airframe="controller.torque_pwm_max")
     """Limit of the torque command, PWM. (3,)"""
-    thrust_max: Array = leaf("parameter", 1)
+    thrust_max: Array = leaf("parameter", 1, (1,), airframe="rotors.thrust_max")
     """Maximum thrust of one rotor, N. (1,)"""
-    pwm_min: Array = leaf("parameter", 1)
+    pwm_min: Array = leaf("parameter", 1, (1,), airframe="controller.pwm_min")
     """Minimum PWM of a rotor that is on. (1,)"""
-    pwm_max: Array = leaf("parameter", 1)
+    pwm_max: Array = leaf("parameter", 1, (1,), airframe="controller.pwm_max")
     """Maximum PWM. (1,)"""
-    torque_arms: Array = leaf("parameter", 1)
+    torque_arms: Array = leaf("parameter", 1, (3,), airframe=torque_arms)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
-    mixing_matrix: Array = leaf("parameter", 2)
+    mixing_matrix: Array = leaf("parameter", 2, airframe=lambda airframe: airframe.mixing_matrix)
     """Matrix from rotor thrusts to torque divided by ``torque_arms``, 1. (3, n_rotors)"""
-    torque_allocation: Array = leaf("parameter", 2)
+    # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the least-norm
+    # allocation of a quadrotor in X. Other layouts get the same factors.
+    torque_allocation: Array = leaf("parameter", 2, airframe=lambda x: allocation_matrix(x)[:, 1:] * [2.0, 2.0, 4.0])
     """Matrix from torque commands to PWM of the rotors, with the firmware's factor 1/2 for roll and pitch, 1.
     (n_rotors, 3)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
-
-    @staticmethod
-    def create(airframe: Airframe) -> AttitudeParams:
-        """Return the shared parameters of an airframe."""
-        require_gains(airframe, KEYS, "crazyflow")
-        yaw_arm = airframe.value("controller.thrust2torque", ())
-        # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the
-        # least-norm allocation of a quadrotor in X. Other layouts get the same factors.
-        allocation = allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
-        gains = {key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,))) for key in _GAINS}
-        return AttitudeParams(
-            **gains,
-            torque_pwm_max=as_parameter(airframe.value("controller.torque_pwm_max", (3,))),
-            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            pwm_min=as_parameter(airframe.value("controller.pwm_min", ())),
-            pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
-            torque_arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
-            mixing_matrix=as_parameter(airframe.mixing_matrix),
-            torque_allocation=as_parameter(allocation),
-        )
 
 
 def attitude2force_torque(

@@ -44,7 +44,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams, hover_torque_arms, wrench_matrix
+from crazysim.control.allocation import hover_torque_arms, wrench_matrix
 from crazysim.control.bandwidth import (
     YAW_RATE_RATIO,
     fastest_rotor_rate,
@@ -55,10 +55,10 @@ from crazysim.control.bandwidth import (
 from crazysim.control.fitted_auto import FittedAuto
 from crazysim.control.flatness import MIN_HEADING_SINE, MIN_SPECIFIC_THRUST
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
+from crazysim.control.position import PositionMemory, PositionParams, keep_upright, position_params, specific_force
 from crazysim.control.priority import prioritized_thrusts
-from crazysim.control.protocol import Controller, DroneData, FlightState
-from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
+from crazysim.control.protocol import Controller, DroneData, FlightState, zeros
+from crazysim.control.rigid_body_params import RigidBodyParams, limited_allocation
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
@@ -92,13 +92,13 @@ degrees, the direction of the tilt error is undefined."""
 class AutoParams(RigidBodyParams):
     """Gains and parameters of the default controller, each shared or one per drone."""
 
-    mixing_matrix: Array = leaf("parameter", 2)
+    mixing_matrix: Array = leaf("parameter", 2, airframe=lambda airframe: wrench_matrix(airframe)[1:])
     """Rotor thrusts to body torque, m. (3, n_rotors)"""
-    stiffness: Array = leaf("parameter", 1)
+    stiffness: Array = leaf("parameter", 1, (3,))
     """Angular acceleration per rotation error, 1/s^2. (3,)"""
-    damping: Array = leaf("parameter", 1)
+    damping: Array = leaf("parameter", 1, (3,))
     """Angular acceleration per body rate, 1/s. (3,)"""
-    torque_max: Array = leaf("parameter", 1)
+    torque_max: Array = leaf("parameter", 1, (3,))
     """Largest unknown torque that is compensated, N m. (3,)"""
     observer: Array = leaf("parameter", 1, (1,))
     """Weight of a new measurement in the estimate of unknown torques, 1. (1,)"""
@@ -112,63 +112,18 @@ class AutoParams(RigidBodyParams):
     position: PositionParams | None
     """Gains and limits of the position loop; None without a position loop."""
 
-    @staticmethod
-    def create(airframe: Airframe, freq: int, outer_freq: int | None) -> AutoParams:
-        """Return the shared parameters of an airframe.
-
-        A controller that runs every 1/freq s acts half a period late, and its input is up to one period old. Both
-        delays are added to the lag of the rotors.
-
-        Args:
-            airframe: The airframe.
-            freq: Rate of the controller, Hz.
-            outer_freq: Rate of the position loop, Hz; its command is half a period old on average. None without a
-                position loop.
-        """
-        lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * max_gain_ratios(airframe)
-        needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
-        lead = max(min(needed_rate / lag_rate, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        loop_rate = 1 / (1 / (lead * lag_rate) + 1.5 / freq)
-        axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
-        stiffness, damping = STIFFNESS_RATIO * axis_rates**2, DAMPING_RATIO * axis_rates
-        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2]), momentum_per_torque(airframe)
-        body = rigid_body_params(airframe)
-        allocation: AllocationParams = body.pop("allocation")
-        position = None
-        if outer_freq is not None:
-            position = PositionParams.create(airframe, delay + 0.5 / outer_freq, outer_freq)
-        return AutoParams(
-            **body,
-            allocation=allocation.replace(torque_arms=as_parameter(hover_torque_arms(airframe))),
-            mixing_matrix=as_parameter(wrench_matrix(airframe)[1:]),
-            stiffness=as_parameter(stiffness),
-            damping=as_parameter(damping),
-            torque_max=as_parameter(MAX_COMPENSATED_ERROR * np.diag(airframe.inertia) * stiffness),
-            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(axis_rates) / freq)),
-            lead=as_parameter(lead),
-            reaction=as_parameter(reaction),
-            drag_torque_share=as_parameter(1 / (1 + lead * lag_rate * reaction)),
-            position=position,
-        )
-
 
 class AutoTarget(PyTree):
     """Result and memory of the position loop."""
 
     position: PositionMemory
     """Memory of the position loop."""
-    quat: Array = leaf("drone", 1)
+    quat: Array = leaf("drone", 1, (4,))
     """Attitude that leads to the setpoint, body to world, unit, xyzw. (n_worlds, n_drones, 4)"""
-    ang_vel: Array = leaf("drone", 1)
+    ang_vel: Array = leaf("drone", 1, (3,))
     """Body rates of that attitude, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    thrust: Array = leaf("drone", 1)
+    thrust: Array = leaf("drone", 1, (1,))
     """Collective thrust that leads to the setpoint once the attitude is reached, N. (n_worlds, n_drones, 1)"""
-
-    @staticmethod
-    def create() -> AutoTarget:
-        """Return the target of one drone before the first setpoint."""
-        level, zeros = as_parameter([0.0, 0.0, 0.0, 1.0]), as_parameter(np.zeros(3))
-        return AutoTarget(PositionMemory.create(), level, zeros, as_parameter(np.zeros(1)))
 
 
 class AutoMemory(PyTree):
@@ -176,20 +131,10 @@ class AutoMemory(PyTree):
 
     target: AutoTarget | None
     """Result and memory of the position loop; None at command levels below ``state``."""
-    momentum: Array = leaf("drone", 1)
+    momentum: Array = leaf("drone", 1, (3,))
     """Angular momentum expected at this tick from the known torques, body frame, N m s. (n_worlds, n_drones, 3)"""
-    torque: Array = leaf("drone", 1)
+    torque: Array = leaf("drone", 1, (3,))
     """Estimated unknown torque, body frame, N m. (n_worlds, n_drones, 3)"""
-
-    @staticmethod
-    def create(follows_setpoints: bool) -> AutoMemory:
-        """Return the memory of one drone before the first tick.
-
-        Args:
-            follows_setpoints: True at the command level ``state``.
-        """
-        zeros = as_parameter(np.zeros(3))
-        return AutoMemory(AutoTarget.create() if follows_setpoints else None, zeros, zeros)
 
 
 def quat_error(quat: Array) -> Array:
@@ -276,10 +221,35 @@ class Auto(Controller):
         return memory.replace(target=AutoTarget(position_memory, attitude, matvec(to_body, ang_vel), thrust))
 
     def params(self, airframe: Airframe) -> AutoParams:
-        return AutoParams.create(airframe, self.freq, self.outer_freq)
+        # A controller that runs every 1/freq s acts half a period late, and its input is up to one period old. Both
+        # delays are added to the lag of the rotors. The command of the position loop is half a period old on average.
+        freq, outer_freq = self.freq, self.outer_freq
+        lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * max_gain_ratios(airframe)
+        needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
+        lead = max(min(needed_rate / lag_rate, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        loop_rate = 1 / (1 / (lead * lag_rate) + 1.5 / freq)
+        axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
+        stiffness, reaction = STIFFNESS_RATIO * axis_rates**2, momentum_per_torque(airframe)
+        position = None
+        if outer_freq is not None:
+            delay = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2])
+            position = position_params(airframe, delay + 0.5 / outer_freq, outer_freq)
+        return AutoParams.create(
+            airframe,
+            allocation=limited_allocation(airframe, torque_arms=hover_torque_arms(airframe)),
+            stiffness=stiffness,
+            damping=DAMPING_RATIO * axis_rates,
+            torque_max=MAX_COMPENSATED_ERROR * np.diag(airframe.inertia) * stiffness,
+            observer=1 - np.exp(-OBSERVER_RATE_RATIO * np.max(axis_rates) / freq),
+            lead=lead,
+            reaction=reaction,
+            drag_torque_share=1 / (1 + lead * lag_rate * reaction),
+            position=position,
+        )
 
     def memory(self, airframe: Airframe) -> AutoMemory:
-        return AutoMemory.create(follows_setpoints=self.has_outer)
+        target = zeros(AutoTarget, position=zeros(PositionMemory), quat=as_parameter([0.0, 0.0, 0.0, 1.0]))
+        return zeros(AutoMemory, target=target if self.has_outer else None)
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AutoMemory, params: AutoParams

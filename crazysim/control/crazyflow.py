@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from crazysim.control import attitude_controller, state_controller
 from crazysim.control.attitude_controller import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.gains import require_gains
 from crazysim.control.levels import Control
@@ -22,22 +20,22 @@ from crazysim.pytree import PyTree, leaf
 class StateMemory(PyTree):
     """Memory of the state controller."""
 
-    pos_err_i: Array = leaf("drone", 1)
+    pos_err_i: Array = leaf("drone", 1, (3,))
     """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
 
 
 class AttitudeMemory(PyTree):
     """Memory of the attitude and body-rate controller."""
 
-    ang_vel_des: Array = leaf("drone", 1)
+    ang_vel_des: Array = leaf("drone", 1, (3,))
     """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
-    r_int_error: Array = leaf("drone", 1)
+    r_int_error: Array = leaf("drone", 1, (3,))
     """Integral of the negative rotation error, rad s. (n_worlds, n_drones, 3)"""
-    prev_ang_vel: Array = leaf("drone", 1)
+    prev_ang_vel: Array = leaf("drone", 1, (3,))
     """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
 
 
-class CrazyflowState(Controller):
+class CrazyflowState(Controller, memory=StateMemory):
     """State controller of Crazyflow (``state2attitude``), for the level ``state``."""
 
     name: ClassVar[str] = "crazyflow"
@@ -50,12 +48,8 @@ class CrazyflowState(Controller):
     """Controller that follows the attitude commands; None with fitted dynamics, which take attitude commands."""
 
     def params(self, airframe: Airframe) -> StateParams:
-        keys = (*state_controller.KEYS, *(() if self.inner is None else attitude_controller.KEYS))
-        require_gains(airframe, keys, self.name)
+        require_gains(airframe, StateParams, *([] if self.inner is None else [AttitudeParams]))
         return StateParams.create(airframe)
-
-    def memory(self, airframe: Airframe) -> StateMemory:
-        return StateMemory(_zeros())
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: StateMemory, params: StateParams
@@ -65,7 +59,7 @@ class CrazyflowState(Controller):
         return attitude_cmd, StateMemory(pos_err_i)
 
 
-class Crazyflow(Controller):
+class Crazyflow(Controller, params=AttitudeParams, memory=AttitudeMemory):
     """Cascade of Crazyflow, with gains from the airframe's table ``[controller]``.
 
     It follows attitudes (``attitude2force_torque``) and body rates (``body_rate2force_torque``). At the level
@@ -84,12 +78,6 @@ class Crazyflow(Controller):
         if control == Control.state:
             return CrazyflowState(inner=None if fitted_model else self)
         return self if fitted_model is None and control in self.levels else None
-
-    def params(self, airframe: Airframe) -> AttitudeParams:
-        return AttitudeParams.create(airframe)
-
-    def memory(self, airframe: Airframe) -> AttitudeMemory:
-        return AttitudeMemory(_zeros(), _zeros(), _zeros())
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AttitudeMemory, params: AttitudeParams
@@ -117,7 +105,3 @@ class Crazyflow(Controller):
                 params=params,
             )
         return wrench, AttitudeMemory(ang_vel_des, r_int_error, s.ang_vel)
-
-
-def _zeros() -> Array:
-    return np.zeros(3)  # type: ignore[return-value]  # the simulation moves it to its device

@@ -49,7 +49,7 @@ class CFirmwareMemory(PyTree):
     """Memory of the library, as 32-bit integers. (n_worlds, n_drones, n_words)"""
 
 
-class CFirmware(Controller):
+class CFirmware(Controller, params=AllocationParams):
     """Controller that a compiled library computes, for all drones of all worlds in one call.
 
     The library runs on the host, between the kernels of the step, so a simulation on a GPU waits for it. Steps with it
@@ -85,9 +85,6 @@ class CFirmware(Controller):
     def _copy_path(self) -> str:
         """Path of the copy that is loaded."""
         return copy_library(self.library)
-
-    def params(self, airframe: Airframe) -> AllocationParams:
-        return AllocationParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> CFirmwareMemory:
         library = _open_library(self._copy_path)

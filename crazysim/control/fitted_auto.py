@@ -10,54 +10,31 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
+from crazysim.control.position import PositionMemory, PositionParams, keep_upright, position_params, specific_force
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.fitted import Params
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.dynamics.models import AirframeParams
+from crazysim.pytree import leaf
 from crazysim.rotation import dot, matvec
 
 
-class FittedParams(PyTree):
+class FittedParams(AirframeParams):
     """Gains of the position loop, and the attitude response that it assumes, each shared or one per drone."""
 
     model: Params
     """Parameters of the fitted model that the controller assumes."""
-    angle_ratio: Array = leaf("parameter", 1)
+    angle_ratio: Array = leaf("parameter", 1, (3,))
     """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, dimensionless. (3,)"""
-    lead: Array = leaf("parameter", 1)
+    lead: Array = leaf("parameter", 1, (2,))
     """Factors on jerk (s) and on snap (s^2). They advance the attitude command by the delay of the response. (2,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
 
-    @staticmethod
-    def create(airframe: Airframe, dynamics: Dynamics, freq: int) -> FittedParams:
-        """Return the shared parameters of an airframe.
 
-        The delay below the position loop is the delay of the attitude (damping over stiffness) or of the thrust,
-        whichever is larger, plus 1.5 periods of the controller.
-
-        Args:
-            airframe: The airframe.
-            dynamics: Fitted model.
-            freq: Rate of the controller, Hz.
-        """
-        model = Params.create(airframe, dynamics)
-        attitude_delay = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
-        delays = [attitude_delay]
-        if model.thrust_dyn_coef is not None:
-            delays.append(1 / float(np.max(model.thrust_dyn_coef)))
-        return FittedParams(
-            model=model,
-            angle_ratio=as_parameter(-model.rpy_coef / model.cmd_rpy_coef),
-            lead=as_parameter([attitude_delay + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
-            position=PositionParams.create(airframe, max(delays) + 1.5 / freq, freq),
-        )
-
-
-class FittedAuto(Controller):
+class FittedAuto(Controller, memory=PositionMemory):
     """Position loop of ``Auto`` above the attitude response of a fitted model."""
 
     name: ClassVar[str] = "auto"
@@ -69,10 +46,20 @@ class FittedAuto(Controller):
     """Rate of the controller, Hz."""
 
     def params(self, airframe: Airframe) -> FittedParams:
-        return FittedParams.create(airframe, self.dynamics, self.freq)
-
-    def memory(self, airframe: Airframe) -> PositionMemory:
-        return PositionMemory.create()
+        # The delay below the position loop is that of the attitude (damping over stiffness) or of the thrust, whichever
+        # is larger, plus 1.5 periods of the controller.
+        model = Params.create(airframe, self.dynamics)
+        attitude_delay = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
+        delay = attitude_delay
+        if model.thrust_dyn_coef is not None:
+            delay = max(delay, 1 / float(np.max(model.thrust_dyn_coef)))
+        return FittedParams.create(
+            airframe,
+            model=model,
+            angle_ratio=-model.rpy_coef / model.cmd_rpy_coef,
+            lead=[attitude_delay + 0.5 / self.freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))],
+            position=position_params(airframe, delay + 1.5 / self.freq, self.freq),
+        )
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams

@@ -13,13 +13,13 @@ from crazysim.control.bandwidth import Bandwidth, bandwidth
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.levels import Control
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller, DroneData
-from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
+from crazysim.control.protocol import Controller, DroneData, zeros
+from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip, cross, dot, matvec
 
 Gains = Literal["bandwidth", "airframe"]
@@ -33,41 +33,21 @@ MAX_INTEGRAL_RATIO = 0.5
 class GeometricMemory(PyTree):
     """Memory of geometric control with an integral."""
 
-    acc: Array = leaf("drone", 1)
+    acc: Array = leaf("drone", 1, (3,))
     """Acceleration by the integral of the position error, world frame, m/s^2. (n_worlds, n_drones, 3)"""
 
 
 class GeometricParams(RigidBodyParams):
     """Gains and parameters of geometric control, each shared or one per drone."""
 
-    kr: Array = leaf("parameter", 1)
+    kr: Array = leaf("parameter", 1, (3,))
     """Gain on the position error, N/m. (3,)"""
-    kv: Array = leaf("parameter", 1)
+    kv: Array = leaf("parameter", 1, (3,))
     """Gain on the velocity error, N s/m. (3,)"""
-    kR: Array = leaf("parameter", 1)
+    kR: Array = leaf("parameter", 1, (3,))
     """Gain on the rotation error, N m. (3,)"""
-    kw: Array = leaf("parameter", 1)
+    kw: Array = leaf("parameter", 1, (3,))
     """Gain on the error of the body rates, N m s. (3,)"""
-
-    @staticmethod
-    def create(airframe: Airframe, freq: int, gains: Gains = "bandwidth") -> GeometricParams:
-        """Return the shared parameters of an airframe.
-
-        Args:
-            airframe: The airframe.
-            freq: Rate of the controller, Hz.
-            gains: ``"bandwidth"`` for the rule of ``crazysim.control.bandwidth``, times mass and inertia;
-                ``"airframe"`` for the table ``[geometric]`` of the airframe. Airframes of AIMotionLab have its gains
-                in this table.
-        """
-        if gains == "airframe":
-            table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
-        else:
-            table = bandwidth_gains(airframe, bandwidth(airframe, freq))
-        return GeometricParams(
-            **rigid_body_params(airframe),
-            **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
-        )
 
 
 def bandwidth_gains(airframe: Airframe, bandwidths: Bandwidth) -> dict[str, Any]:
@@ -200,7 +180,8 @@ class Geometric(Controller):
     freq: int = 500
     """Rate of the controller, Hz."""
     gains: Gains = "bandwidth"
-    """Rule for the gains, as for ``GeometricParams.create``."""
+    """``"bandwidth"`` for the rule of ``crazysim.control.bandwidth``, times mass and inertia; ``"airframe"`` for the
+    airframe's table ``[geometric]``. Airframes of AIMotionLab have its gains in this table."""
     feedforward: bool = True
     """True to feed the derivatives of the setpoint forward; False for the law of AIMotionLab-Virtual."""
     integral: float = 0.0
@@ -212,10 +193,14 @@ class Geometric(Controller):
     def params(self, airframe: Airframe) -> GeometricParams:
         if not (np.isfinite(self.integral) and self.integral >= 0):
             raise ConfigError(f"expected a finite integral of at least 0, 1/s, got {self.integral!r}. Use 0 for none.")
-        return GeometricParams.create(airframe, self.freq, self.gains)
+        if self.gains == "airframe":
+            gains = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
+        else:
+            gains = bandwidth_gains(airframe, bandwidth(airframe, self.freq))
+        return GeometricParams.create(airframe, **gains)
 
     def memory(self, airframe: Airframe) -> GeometricMemory | None:
-        return GeometricMemory(as_parameter(np.zeros(3))) if self.integral else None
+        return zeros(GeometricMemory) if self.integral else None
 
     def update(self, data: DroneData, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
         s = data.states

@@ -6,7 +6,6 @@ import math
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim import rotation
@@ -20,9 +19,10 @@ from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 ROTOR_LEAD = 2.0
@@ -36,69 +36,36 @@ TORQUE_MAX = 0.5
 """Rotation error whose feedback torque is as large as the largest disturbance torque that is compensated, rad."""
 
 
-class INDIParams(PyTree):
+class INDIParams(AirframeParams):
     """Gains and parameters of INDI, each shared or one per drone."""
 
     geometric: GeometricParams
     """Gains, mass, inertia and limits."""
-    mixing_matrix: Array = leaf("parameter", 2)
+    mixing_matrix: Array = leaf("parameter", 2, airframe=wrench_matrix)
     """Matrix from rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
-    lead: Array = leaf("parameter", 1)
+    lead: Array = leaf("parameter", 1, (1,))
     """Factor on the difference between commanded and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
     """Change of a rotor's angular momentum per change of its drag torque as its speed changes around hover, s. (1,)"""
     drag_torque_share: Array = leaf("parameter", 1, (1,))
     """Fraction of the missing yaw torque that is demanded from rotor drag, 1. The reaction to spin-up gives the rest.
     (1,)"""
-    filter: Array = leaf("parameter", 1)
+    filter: Array = leaf("parameter", 1, (3,))
     """Coefficients b0, a1, a2 of the low-pass filter, from ``butterworth``. (3,)"""
-
-    @staticmethod
-    def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
-        """Return the shared parameters of an airframe.
-
-        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``lead`` times as fast. ``lead``
-        is ``ROTOR_LEAD``, or less if ``MAX_FEEDBACK_STEP`` requires it.
-
-        Args:
-            airframe: The airframe.
-            freq: Rate of the controller, Hz.
-            cutoff: Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to ``0.45 freq``.
-        """
-        if not 0 < cutoff < math.inf:
-            raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
-        params = GeometricParams.create(airframe, freq)
-        rotor_lag_rate, reaction = rotor_rate(airframe), momentum_per_torque(airframe)
-        lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        # INDI compensates the reaction to accelerating rotors, which therefore does not limit the bandwidth.
-        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * rotor_lag_rate, limits_reaction=False))
-        return INDIParams(
-            geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
-            mixing_matrix=as_parameter(wrench_matrix(airframe)),
-            lead=as_parameter(lead),
-            reaction=as_parameter(reaction),
-            drag_torque_share=as_parameter(1 / (1 + lead * rotor_lag_rate * reaction)),
-            filter=as_parameter(butterworth(min(cutoff, 0.45 * freq), freq)),
-        )
 
 
 class INDIMemory(PyTree):
     """Memory of INDI: velocity and angular momentum at the last tick, and the states of the filter."""
 
-    vel: Array = leaf("drone", 1)
+    vel: Array = leaf("drone", 1, (3,))
     """Velocity at the last tick, world frame, m/s. (n_worlds, n_drones, 3)"""
-    momentum: Array = leaf("drone", 1)
+    momentum: Array = leaf("drone", 1, (3,))
     """Angular momentum of body and rotors at the last tick, body frame, N m s. (n_worlds, n_drones, 3)"""
-    filter: Array = leaf("drone", 1)
+    filter: Array = leaf("drone", 1, (24,))
     """Two states of the filter for each of its 12 signals: components of acceleration, acceleration by the rotors, rate
     of change of the momentum, and torque of the rotors. (n_worlds, n_drones, 24)"""
-    started: Array = leaf("drone", 1)
+    started: Array = leaf("drone", 1, (1,))
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
-
-    @staticmethod
-    def create() -> INDIMemory:
-        """Return the memory of one drone before the first tick."""
-        return INDIMemory(*(as_parameter(np.zeros(n)) for n in (3, 3, 24, 1)))
 
 
 def apply_filter(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
@@ -203,8 +170,12 @@ def indi_control(
     return rotor_vel_cmd, INDIMemory(vel, total_momentum, filter_state, jnp.ones_like(memory.started))
 
 
-class INDI(Controller):
-    """Incremental nonlinear dynamic inversion (``indi_control``) for setpoints; needs measured rotor speeds."""
+class INDI(Controller, memory=INDIMemory):
+    """Incremental nonlinear dynamic inversion (``indi_control``) for setpoints; needs measured rotor speeds.
+
+    The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``lead`` times as fast. ``lead`` is
+    ``ROTOR_LEAD``, or less if ``MAX_FEEDBACK_STEP`` requires it.
+    """
 
     name: ClassVar[str] = "indi"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -212,13 +183,23 @@ class INDI(Controller):
     freq: int = 500
     """Rate of the controller, Hz."""
     cutoff: float = 12.0
-    """Cutoff frequency of the filter, Hz."""
+    """Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to ``0.45 freq``."""
 
     def params(self, airframe: Airframe) -> INDIParams:
-        return INDIParams.create(airframe, self.freq, self.cutoff)
-
-    def memory(self, airframe: Airframe) -> INDIMemory:
-        return INDIMemory.create()
+        if not 0 < self.cutoff < math.inf:
+            raise ConfigError(f"expected a positive, finite cutoff, Hz, got {self.cutoff!r}. Use INDI(cutoff=12.0).")
+        rotor_lag_rate, reaction = rotor_rate(airframe), momentum_per_torque(airframe)
+        lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * self.freq / fastest_rotor_rate(airframe)), 1.0)
+        # INDI compensates the reaction to accelerating rotors, which therefore does not limit the bandwidth.
+        bandwidths = bandwidth(airframe, self.freq, lead * rotor_lag_rate, limits_reaction=False)
+        return INDIParams.create(
+            airframe,
+            geometric=GeometricParams.create(airframe, **bandwidth_gains(airframe, bandwidths)),
+            lead=lead,
+            reaction=reaction,
+            drag_torque_share=1 / (1 + lead * rotor_lag_rate * reaction),
+            filter=butterworth(min(self.cutoff, 0.45 * self.freq), self.freq),
+        )
 
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array

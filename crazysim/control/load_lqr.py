@@ -17,12 +17,12 @@ from crazysim.control.lqr import Reference, lqr_weights, solve_on_host, state_er
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_discrete
-from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
+from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 SetpointBody = Literal["load", "drone"]
@@ -40,58 +40,11 @@ class LoadLQRParams(RigidBodyParams):
     """Mass of the load that the controller assumes, kg. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of the rod that the controller assumes, m. (1,)"""
-    gain: Array = leaf("parameter", 2)
+    gain: Array = leaf("parameter", 2, (4, 16))
     """Gain K from the errors of position, velocity, rotation, body rates, rod angles and their rates to the wrench.
     (4, 16)"""
     attach: Array | None = leaf("parameter", 1, (3,))
     """Position of the rod's joint relative to the centre of mass, body frame, m; None for zero. (3,)"""
-
-    @staticmethod
-    def create(
-        airframe: Airframe,
-        freq: int,
-        load_mass: float,
-        length: float,
-        Q: ArrayLike | None = None,
-        R: ArrayLike | None = None,
-        attach: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> LoadLQRParams:
-        """Return the shared parameters of an airframe, with the gain computed in float64.
-
-        Args:
-            airframe: The airframe.
-            freq: Rate of the controller, Hz, for which the model is discretised.
-            load_mass: Mass of the load, kg.
-            length: Length of the rod, m.
-            Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
-                (16, 16); None for ``lqr_weights``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
-            attach: Position of the rod's joint relative to the centre of mass, body frame, m. (3,)
-
-        Raises:
-            ConfigError: If no gain stabilises the drone.
-        """
-        if not (0 <= load_mass < np.inf and 0 < length < np.inf):
-            raise ConfigError(
-                f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
-                f"LoadLQR(load_mass=0.05, length=0.4)."
-            )
-        joint = np.asarray(attach)
-        if joint.shape != (3,) or joint.dtype.kind not in "iuf" or not np.all(np.isfinite(joint)):
-            raise ConfigError(
-                f"expected attach as three finite numbers, m, got {attach!r}. Use LoadLQR(attach=(0.0, 0.0, -0.02))."
-            )
-        mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
-        Q, R = lqr_weights(airframe, freq, Q, R, load_mass, length)
-        joint_args = [joint] if np.any(joint) else []
-        gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *joint_args)
-        return LoadLQRParams(
-            **rigid_body_params(airframe),
-            load_mass=as_parameter(load_mass),
-            length=as_parameter(length),
-            gain=as_parameter(gain),
-            attach=as_parameter(joint) if joint_args else None,
-        )
 
 
 def load_gain(
@@ -259,13 +212,13 @@ def load_lqr_control(
 class LoadLQRMemory(PyTree):
     """Memory of the LQR with load. The third derivative of the rod's direction is computed from it by a difference."""
 
-    rod_acc: Array = leaf("drone", 1)
+    rod_acc: Array = leaf("drone", 1, (3,))
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""
-    started: Array = leaf("drone", 1)
+    started: Array = leaf("drone", 1, (1,))
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
 
 
-class LoadLQR(Controller):
+class LoadLQR(Controller, memory=LoadLQRMemory):
     """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone."""
 
     name: ClassVar[str] = "load_lqr"
@@ -284,15 +237,29 @@ class LoadLQR(Controller):
     load: str = "load"
     """Name of the plugin of the load. Its record has ``tip_pos`` and ``tip_vel`` (a hook), or ``pos`` and ``vel``."""
     Q: ArrayLike | None = None
-    """Weights of the states, as for ``LoadLQRParams.create``."""
+    """Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or (16, 16); None
+    for ``lqr_weights``."""
     R: ArrayLike | None = None
-    """Weights of the inputs, as for ``LoadLQRParams.create``."""
+    """Weights of collective thrust and torque, (4,) or (4, 4); None for ``lqr_weights``."""
 
     def params(self, airframe: Airframe) -> LoadLQRParams:
-        return LoadLQRParams.create(airframe, self.freq, self.load_mass, self.length, self.Q, self.R, self.attach)
-
-    def memory(self, airframe: Airframe) -> LoadLQRMemory:
-        return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
+        load_mass, length, joint = self.load_mass, self.length, np.asarray(self.attach)
+        if not (0 <= load_mass < np.inf and 0 < length < np.inf):
+            raise ConfigError(
+                f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
+                f"LoadLQR(load_mass=0.05, length=0.4)."
+            )
+        if joint.shape != (3,) or joint.dtype.kind not in "iuf" or not np.all(np.isfinite(joint)):
+            raise ConfigError(
+                f"expected attach as three finite numbers, m, got {self.attach!r}. Use "
+                f"LoadLQR(attach=(0.0, 0.0, -0.02))."
+            )
+        Q, R = lqr_weights(airframe, self.freq, self.Q, self.R, load_mass, length)
+        body = (airframe.value("rigid_body.mass"), airframe.inertia)
+        attach = joint if np.any(joint) else None
+        joint_args = [] if attach is None else [attach]
+        gain = solve_on_host(load_gain, *body, [load_mass], [length], 1 / self.freq, Q, R, *joint_args)
+        return LoadLQRParams.create(airframe, load_mass=load_mass, length=length, gain=gain, attach=attach)
 
     def take_over(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array

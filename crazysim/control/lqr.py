@@ -19,12 +19,12 @@ from crazysim.control.linear_models import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import check_gain, gain_continuous
-from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
+from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import cross, dot, matvec
 from crazysim.tables import read_numbers
 
@@ -32,28 +32,8 @@ from crazysim.tables import read_numbers
 class LQRParams(RigidBodyParams):
     """Gain and parameters of the LQR about hover, each shared or one per drone."""
 
-    gain: Array = leaf("parameter", 2)
+    gain: Array = leaf("parameter", 2, (4, 12))
     """Gain K from the errors of position, velocity, rotation and body rates to the wrench. (4, 12)"""
-
-    @staticmethod
-    def create(airframe: Airframe, freq: int, Q: ArrayLike | None = None, R: ArrayLike | None = None) -> LQRParams:
-        """Return the shared parameters of an airframe, with the gain computed in float64.
-
-        Args:
-            airframe: The airframe.
-            freq: Rate of the controller, Hz, on which the default weights depend.
-            Q: Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12);
-                None for ``lqr_weights``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
-
-        Raises:
-            ConfigError: If no gain stabilises the drone.
-        """
-        Q, R = lqr_weights(airframe, freq, Q, R)
-        return LQRParams(
-            **rigid_body_params(airframe),
-            gain=as_parameter(solve_on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
-        )
 
 
 def lqr_weights(
@@ -254,12 +234,15 @@ class LQR(Controller):
     freq: int = 500
     """Rate of the controller, Hz."""
     Q: ArrayLike | None = None
-    """Weights of the states, as for ``LQRParams.create``."""
+    """Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12); None for
+    ``lqr_weights``."""
     R: ArrayLike | None = None
-    """Weights of the inputs, as for ``LQRParams.create``."""
+    """Weights of collective thrust and torque, (4,) or (4, 4); None for ``lqr_weights``."""
 
     def params(self, airframe: Airframe) -> LQRParams:
-        return LQRParams.create(airframe, self.freq, self.Q, self.R)
+        Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)
+        gain = solve_on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)
+        return LQRParams.create(airframe, gain=gain)
 
     def update(self, data: DroneData, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
         s = data.states

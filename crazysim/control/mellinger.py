@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control import power_distribution
-from crazysim.control.gains import require_gains
+from crazysim.control.gains import Gains
 from crazysim.control.levels import Control
 from crazysim.control.power_distribution import (
     PowerDistributionParams,
@@ -21,78 +19,55 @@ from crazysim.control.power_distribution import (
 )
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
-from crazysim.drones import Airframe
-from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.dynamics.models import GRAVITY, part
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip, dot
 
-_GAINS = ("kp", "kd", "ki", "integral_max", "kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max")
-KEYS = (*(f"mellinger.{key}" for key in ("mass", "mass_thrust", *_GAINS)), *power_distribution.KEYS)
-"""Values of an airframe that this controller needs."""
 
-
-class MellingerParams(PyTree):
+class MellingerParams(Gains, controller="mellinger"):
     """Gains and limits of the controller, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
+    mass: Array = leaf("parameter", 1, (1,), airframe="mellinger.mass")
     """Mass that the controller assumes, kg. (1,)"""
-    mass_thrust: Array = leaf("parameter", 1, (1,))
+    mass_thrust: Array = leaf("parameter", 1, (1,), airframe="mellinger.mass_thrust")
     """Thrust of each motor over the collective thrust, PWM/N. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
+    gravity_vec: Array = leaf("parameter", 1, (3,), airframe=lambda _: GRAVITY)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    kp: Array = leaf("parameter", 1)
+    kp: Array = leaf("parameter", 1, (3,), airframe="mellinger.kp")
     """Gain on the position error, N/m. (3,)"""
-    kd: Array = leaf("parameter", 1)
+    kd: Array = leaf("parameter", 1, (3,), airframe="mellinger.kd")
     """Gain on the velocity error, N s/m. (3,)"""
-    ki: Array = leaf("parameter", 1)
+    ki: Array = leaf("parameter", 1, (3,), airframe="mellinger.ki")
     """Gain on the integral of the position error, N/(m s). (3,)"""
-    integral_max: Array = leaf("parameter", 1)
+    integral_max: Array = leaf("parameter", 1, (3,), airframe="mellinger.integral_max")
     """Limit of the integral of the position error, m s. (3,)"""
-    kR: Array = leaf("parameter", 1)
+    kR: Array = leaf("parameter", 1, (3,), airframe="mellinger.kR")
     """Gain on the rotation error, PWM. (3,)"""
-    kw: Array = leaf("parameter", 1)
+    kw: Array = leaf("parameter", 1, (3,), airframe="mellinger.kw")
     """Gain on the error of the body rates, PWM s/rad. (3,)"""
-    ki_m: Array = leaf("parameter", 1)
+    ki_m: Array = leaf("parameter", 1, (3,), airframe="mellinger.ki_m")
     """Gain on ``integral_m``, PWM/(rad s). (3,)"""
-    kd_omega: Array = leaf("parameter", 1)
+    kd_omega: Array = leaf("parameter", 1, (3,), airframe="mellinger.kd_omega")
     """Gain on the derivative of the error of the body rates, PWM s^2/rad. (3,)"""
-    integral_m_max: Array = leaf("parameter", 1)
+    integral_m_max: Array = leaf("parameter", 1, (3,), airframe="mellinger.integral_m_max")
     """Limit of ``integral_m``, rad s. (3,)"""
-    torque_max: Array = leaf("parameter", 1)
+    torque_max: Array = leaf("parameter", 1, (3,), airframe="mellinger.torque_max")
     """Limit of the torque, PWM. (3,)"""
-    motors: PowerDistributionParams
+    motors: PowerDistributionParams = part(PowerDistributionParams)
     """Power distribution."""
-
-    @staticmethod
-    def create(airframe: Airframe) -> MellingerParams:
-        """Return the shared parameters of an airframe."""
-        require_gains(airframe, KEYS, "mellinger")
-        gains = {key: as_parameter(airframe.value(f"mellinger.{key}", (3,))) for key in _GAINS}
-        return MellingerParams(
-            mass=as_parameter(airframe.value("mellinger.mass", ())),
-            mass_thrust=as_parameter(airframe.value("mellinger.mass_thrust", ())),
-            gravity_vec=as_parameter(GRAVITY),
-            motors=PowerDistributionParams.create(airframe),
-            **gains,
-        )
 
 
 class MellingerMemory(PyTree):
     """Memory of the controller."""
 
-    integral: Array = leaf("drone", 1)
+    integral: Array = leaf("drone", 1, (3,))
     """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
-    integral_m: Array = leaf("drone", 1)
+    integral_m: Array = leaf("drone", 1, (3,))
     """Integral of the negative rotation error, rad s. (n_worlds, n_drones, 3)"""
-    ang_vel: Array = leaf("drone", 1)
+    ang_vel: Array = leaf("drone", 1, (3,))
     """Angular velocity at the last tick, rad/s. (n_worlds, n_drones, 3)"""
-    ang_vel_des: Array = leaf("drone", 1)
+    ang_vel_des: Array = leaf("drone", 1, (3,))
     """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
-
-    @staticmethod
-    def create() -> MellingerMemory:
-        """Return the memory of one drone before the first tick."""
-        return MellingerMemory(*(np.zeros(3) for _ in range(4)))  # type: ignore[arg-type]
 
 
 def desired_force(
@@ -149,7 +124,7 @@ def torque_of_rotation(
     return clip(torque, -p.torque_max, p.torque_max), new_memory
 
 
-class Mellinger(Controller):
+class Mellinger(Controller, params=MellingerParams, memory=MellingerMemory):
     """Controller of the Crazyflie firmware after Mellinger and Kumar (2011).
 
     Crazyflow's cascade is derived from this controller, but differs: this controller lowers all motors if one motor
@@ -166,12 +141,6 @@ class Mellinger(Controller):
     """Rate of the controller, Hz (``ATTITUDE_RATE``)."""
     whole_numbers: bool = False
     """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
-
-    def params(self, airframe: Airframe) -> MellingerParams:
-        return MellingerParams.create(airframe)
-
-    def memory(self, airframe: Airframe) -> MellingerMemory:
-        return MellingerMemory.create()
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams

@@ -10,8 +10,10 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.control.gains import require_gains
 from crazysim.control.levels import Control
 from crazysim.control.pid_cascade import (
+    LOOPS,
     THRUST_SCALE,
     PIDMemory,
     PIDParams,
@@ -23,9 +25,9 @@ from crazysim.control.pid_cascade import (
     to_heading_frame,
     wrap_degrees,
 )
-from crazysim.control.pid_loop import PIDLoopMemory, continue_integral, pid_step
+from crazysim.control.pid_loop import PIDLoop, PIDLoopMemory, continue_integral, pid_step
 from crazysim.control.power_distribution import command_of_rotor_vel, distribute_power, pwm_of_thrust, rotor_vel_of_pwm
-from crazysim.control.protocol import Controller, DroneData
+from crazysim.control.protocol import Controller, DroneData, zeros
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 
@@ -56,10 +58,15 @@ class PID(Controller):
     """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
     def params(self, airframe: Airframe) -> PIDParams:
-        return PIDParams.create(airframe, self.outer_freq, self.freq)
+        require_gains(airframe, PIDParams)
+        freqs = dict(zip(LOOPS, (self.outer_freq, self.outer_freq, self.freq, self.freq), strict=True))
+        loops = {name: PIDLoop.create(airframe, f"pid.{name}", freq) for name, freq in freqs.items()}
+        return PIDParams.create(airframe, **loops)
 
     def memory(self, airframe: Airframe) -> PIDMemory:
-        return PIDMemory.create(self.params(airframe))
+        params = self.params(airframe)
+        loops = {name: PIDLoopMemory.create(getattr(params, name)) for name in LOOPS}
+        return zeros(PIDMemory, **loops, started=np.zeros(1, bool))
 
     def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         s, heading = data.states, heading_vector(data.states.quat)

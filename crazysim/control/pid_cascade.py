@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control import power_distribution
-from crazysim.control.gains import require_gains
+from crazysim.control.gains import Gains
 from crazysim.control.pid_loop import PIDLoop, PIDLoopMemory, pid_step
 from crazysim.control.power_distribution import PowerDistributionParams
-from crazysim.drones import Airframe
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.dynamics.models import part
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip
 
 THRUST_SCALE = 1000.0
@@ -22,16 +18,13 @@ THRUST_SCALE = 1000.0
 TORQUE_MAX = 32767.0
 """Limit of the outputs of the rate loops, PWM (``saturateSignedInt16``)."""
 
-_LOOPS = ("position", "velocity", "attitude", "rate")
-KEYS = (
-    *(f"pid.{loop}.{key}" for loop in _LOOPS for key in ("kp", "ki", "kd")),
-    *(f"pid.{key}" for key in ("tilt_max", "thrust_base", "thrust_min")),
-    *power_distribution.KEYS,
-)
-"""Values of an airframe that this controller needs."""
+LOOPS = ("position", "velocity", "attitude", "rate")
+"""Names of the loops: fields of parameters and memory, and tables ``[pid.position]`` and so on."""
 
 
-class PIDParams(PyTree):
+class PIDParams(
+    Gains, controller="pid", needs=tuple(f"pid.{loop}.{key}" for loop in LOOPS for key in ("kp", "ki", "kd"))
+):
     """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware.
 
     The heading frame has x along the yaw, y to the left and z up (``to_heading_frame``).
@@ -46,29 +39,14 @@ class PIDParams(PyTree):
     """Attitude loop: error of roll, pitch and yaw, degrees, to desired body rates, degrees/s."""
     rate: PIDLoop
     """Rate loop: error of the body rates, degrees/s, to torque, PWM."""
-    tilt_max: Array = leaf("parameter", 1)
+    tilt_max: Array = leaf("parameter", 1, (2,), airframe="pid.tilt_max")
     """Limits of the desired roll and pitch, degrees. (2,)"""
-    thrust_base: Array = leaf("parameter", 1, (1,))
+    thrust_base: Array = leaf("parameter", 1, (1,), airframe="pid.thrust_base")
     """Thrust to which the output of the velocity loop is added, roughly the hover thrust, PWM. (1,)"""
-    thrust_min: Array = leaf("parameter", 1, (1,))
+    thrust_min: Array = leaf("parameter", 1, (1,), airframe="pid.thrust_min")
     """Minimum thrust of the velocity loop, PWM. (1,)"""
-    motors: PowerDistributionParams
+    motors: PowerDistributionParams = part(PowerDistributionParams)
     """Power distribution."""
-
-    @staticmethod
-    def create(airframe: Airframe, outer_freq: int, freq: int) -> PIDParams:
-        """Return the shared parameters of an airframe for the rates of the loops, Hz."""
-        require_gains(airframe, KEYS, "pid")
-        return PIDParams(
-            position=PIDLoop.create(airframe, "pid.position", outer_freq),
-            velocity=PIDLoop.create(airframe, "pid.velocity", outer_freq),
-            attitude=PIDLoop.create(airframe, "pid.attitude", freq),
-            rate=PIDLoop.create(airframe, "pid.rate", freq),
-            tilt_max=as_parameter(airframe.value("pid.tilt_max", (2,))),
-            thrust_base=as_parameter(airframe.value("pid.thrust_base", ())),
-            thrust_min=as_parameter(airframe.value("pid.thrust_min", ())),
-            motors=PowerDistributionParams.create(airframe),
-        )
 
 
 class PIDMemory(PyTree):
@@ -82,20 +60,12 @@ class PIDMemory(PyTree):
     """Memory of the attitude loop."""
     rate: PIDLoopMemory
     """Memory of the rate loop."""
-    rpy_des: Array = leaf("drone", 1)
+    rpy_des: Array = leaf("drone", 1, (3,))
     """Desired roll, pitch, yaw, degrees. (n_worlds, n_drones, 3)"""
-    thrust: Array = leaf("drone", 1)
+    thrust: Array = leaf("drone", 1, (1,))
     """Desired thrust, PWM. (n_worlds, n_drones, 1)"""
-    started: Array = leaf("drone", 1)
+    started: Array = leaf("drone", 1, (1,))
     """True after the first tick. (n_worlds, n_drones, 1)"""
-
-    @staticmethod
-    def create(params: PIDParams) -> PIDMemory:
-        """Return the memory of one drone before the first tick."""
-        p, create_memory = params, PIDLoopMemory.create
-        zeros: Any = np.zeros(3)
-        loops = {name: create_memory(getattr(p, name)) for name in _LOOPS}
-        return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 
 def desired_velocity(

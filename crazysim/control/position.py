@@ -9,8 +9,8 @@ from jax import Array
 from crazysim.control.allocation import max_thrust_without_torque
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.dynamics.models import GRAVITY, AirframeParams
+from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip, dot, safe_norm
 
 POSITION_RATE_RATIO = 0.4
@@ -36,67 +36,62 @@ MAX_DISTURBANCE_RATIO = 0.5
 """Largest acceleration by unknown forces along an axis that is compensated, over gravity, 1."""
 
 
-class PositionParams(PyTree):
+class PositionParams(AirframeParams):
     """Gains and limits of the position loop, each shared or one per drone."""
 
-    gravity_vec: Array = leaf("parameter", 1)
+    gravity_vec: Array = leaf("parameter", 1, (3,), airframe=lambda _: GRAVITY)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
     stiffness: Array = leaf("parameter", 1, (1,))
     """Acceleration per position error, 1/s^2. (1,)"""
     damping: Array = leaf("parameter", 1, (1,))
     """Acceleration per velocity error, 1/s. (1,)"""
-    reach: Array = leaf("parameter", 1)
+    reach: Array = leaf("parameter", 1, (2,))
     """Limits of the position error, horizontal and vertical, m. (2,)"""
-    acc_max: Array = leaf("parameter", 1)
+    acc_max: Array = leaf("parameter", 1, (3,))
     """Largest acceleration by feedback, horizontal, up and down, m/s^2. (3,)"""
     observer: Array = leaf("parameter", 1, (1,))
     """Weight of a new measurement in the estimate of unknown forces, 1. (1,)"""
-
-    @staticmethod
-    def create(airframe: Airframe, delay: float, freq: int) -> PositionParams:
-        """Return the shared parameters of an airframe.
-
-        The loop is critically damped at the natural frequency ``POSITION_RATE_RATIO / delay``. Its acceleration is
-        limited to the acceleration that the rotors can give while they carry the drone. The position error is limited
-        to twice the error at which the stiffness alone demands this acceleration. The drone then approaches a distant
-        setpoint at a speed from which it can stop.
-
-        Args:
-            airframe: The airframe.
-            delay: Delay of the loop that follows the specific force, s.
-            freq: Rate of the controller, Hz.
-        """
-        g = -GRAVITY[2]
-        max_specific_force = (
-            MAX_THRUST_SHARE * max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass", ()))
-        )
-        max_up_acc, max_down_acc = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
-        max_horizontal_acc = min(
-            MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))
-        )
-        natural_freq = POSITION_RATE_RATIO / delay
-        return PositionParams(
-            gravity_vec=as_parameter(GRAVITY),
-            stiffness=as_parameter(natural_freq**2),
-            damping=as_parameter(2 * natural_freq),
-            reach=as_parameter(2 * np.array([max_horizontal_acc, min(max_up_acc, max_down_acc)]) / natural_freq**2),
-            acc_max=as_parameter([max_horizontal_acc, max_up_acc, max_down_acc]),
-            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq)),
-        )
 
 
 class PositionMemory(PyTree):
     """Memory of the position loop."""
 
-    vel: Array = leaf("drone", 1)
+    vel: Array = leaf("drone", 1, (3,))
     """Velocity expected at this tick from the known forces, world frame, m/s. (n_worlds, n_drones, 3)"""
-    disturbance: Array = leaf("drone", 1)
+    disturbance: Array = leaf("drone", 1, (3,))
     """Estimated acceleration by unknown forces, world frame, m/s^2. (n_worlds, n_drones, 3)"""
 
-    @staticmethod
-    def create() -> PositionMemory:
-        """Return the memory of one drone before the first tick."""
-        return PositionMemory(as_parameter(np.zeros(3)), as_parameter(np.zeros(3)))
+
+def position_params(airframe: Airframe, delay: float, freq: int) -> PositionParams:
+    """Return the parameters of the position loop for an airframe.
+
+    The loop is critically damped at the natural frequency ``POSITION_RATE_RATIO / delay``. Its acceleration is
+    limited to the acceleration that the rotors can give while they carry the drone. The position error is limited
+    to twice the error at which the stiffness alone demands this acceleration. The drone then approaches a distant
+    setpoint at a speed from which it can stop.
+
+    Args:
+        airframe: The airframe.
+        delay: Delay of the loop that follows the specific force, s.
+        freq: Rate of the controller, Hz.
+    """
+    g = -GRAVITY[2]
+    max_specific_force = (
+        MAX_THRUST_SHARE * max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass", ()))
+    )
+    max_up_acc, max_down_acc = max(max_specific_force - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
+    max_horizontal_acc = min(
+        MAX_HORIZONTAL_RATIO * g, np.sqrt(max(max_specific_force**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2))
+    )
+    natural_freq = POSITION_RATE_RATIO / delay
+    return PositionParams.create(
+        airframe,
+        stiffness=natural_freq**2,
+        damping=2 * natural_freq,
+        reach=2 * np.array([max_horizontal_acc, min(max_up_acc, max_down_acc)]) / natural_freq**2,
+        acc_max=[max_horizontal_acc, max_up_acc, max_down_acc],
+        observer=1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq),
+    )
 
 
 def specific_force(

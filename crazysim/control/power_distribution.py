@@ -10,41 +10,28 @@ from jax import Array, lax
 
 from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
 from crazysim.drones import Airframe
+from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import clip, matvec
 
-KEYS = ("controller.pwm_max", "rotors.thrust_max", "rotors.thrust_curve")
-"""Values of an airframe that the power distribution needs."""
 
-
-class PowerDistributionParams(PyTree):
+class PowerDistributionParams(AirframeParams):
     """Parameters of the power distribution, each shared or one per drone."""
 
-    pwm_max: Array = leaf("parameter", 1, (1,))
+    pwm_max: Array = leaf("parameter", 1, (1,), airframe="controller.pwm_max")
     """Maximum PWM of a motor, PWM. (1,)"""
-    thrust_max: Array = leaf("parameter", 1, (1,))
+    thrust_max: Array = leaf("parameter", 1, (1,), airframe="rotors.thrust_max")
     """Thrust of one rotor at maximum PWM, N. (1,)"""
-    rpm2thrust: Array = leaf("parameter", 2)
+    rpm2thrust: Array = leaf("parameter", 2, airframe="rotors.thrust_curve")
     """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
-    torque_allocation: Array = leaf("parameter", 2)
+    torque_allocation: Array = leaf("parameter", 2, airframe=lambda airframe: torque_allocation(airframe))
     """Matrix from torque commands to PWM of the rotors, with the firmware's factor 1/2 for roll and pitch, 1.
     (n_rotors, 3)"""
-    torque_of_pwm: Array = leaf("parameter", 2)
+    torque_of_pwm: Array = leaf("parameter", 2, airframe=lambda airframe: np.linalg.pinv(torque_allocation(airframe)))
     """Matrix from PWM of the rotors to torque commands: pseudoinverse of ``torque_allocation``, 1. (3, n_rotors)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
-
-    @staticmethod
-    def create(airframe: Airframe) -> PowerDistributionParams:
-        """Return the shared parameters of an airframe."""
-        return PowerDistributionParams(
-            pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
-            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            rpm2thrust=as_parameter(airframe.value("rotors.thrust_curve").reshape(-1, 3)),
-            torque_allocation=as_parameter(torque_allocation(airframe)),
-            torque_of_pwm=as_parameter(np.linalg.pinv(torque_allocation(airframe))),
-        )
 
 
 def torque_allocation(airframe: Airframe) -> np.ndarray:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol, dataclass_transform
+from typing import Any, ClassVar, Protocol, TypeVar, dataclass_transform
 
+import numpy as np
 from jax import Array
 
 from crazysim.control.levels import Control
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.pytree import PyTree
+from crazysim.dynamics.models import AirframeParams
+from crazysim.pytree import PyTree, float_dtype
+
+R = TypeVar("R", bound=PyTree)
 
 OUTPUT_LEVELS = (Control.attitude, Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
@@ -75,9 +79,9 @@ class Controller:
     """Base class of controllers, which ``Sim(controller=...)`` uses at one of their command levels.
 
     A subclass lists its settings as annotated fields with defaults, including ``freq``; it becomes a frozen
-    dataclass. Its methods are pure and written for one drone. A controller with an outer loop, which runs at a lower
-    rate, has a field ``outer_freq`` and overrides ``outer``. At the level ``state``, ``outer`` is then called before
-    ``update``.
+    dataclass. It names the classes of its records, as in ``class PI(Controller, params=PIGains, memory=PIMemory)``. Its
+    methods are pure and written for one drone. A controller with an outer loop, which runs at a lower rate, has a field
+    ``outer_freq`` and overrides ``outer``. At the level ``state``, ``outer`` is then called before ``update``.
     """
 
     name: ClassVar[str]
@@ -96,13 +100,20 @@ class Controller:
     follows_feedforward: ClassVar[bool] = True
     """True if a state command may have a ``feedforward``; ``PID`` and ``Mellinger`` accept it but do not use it. If
     False, a command with feedforward is an error."""
+    params_type: ClassVar[type[AirframeParams] | None] = None
+    """Class of the parameters, declared as ``class PI(Controller, params=PIGains)``."""
+    memory_type: ClassVar[type[PyTree] | None] = None
+    """Class of the memory, declared as ``class PI(Controller, memory=PIMemory)``."""
     follows_rates: ClassVar[bool] = False
     """True if the controller also follows the body rates of an attitude command,
     ``data.controls.attitude.staged_ang_vel_des``."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(
+        cls, params: type[AirframeParams] | None = None, memory: type[PyTree] | None = None, **kwargs: Any
+    ) -> None:
         """Make every subclass a frozen dataclass, and check its declarations."""
         super().__init_subclass__(**kwargs)
+        cls.params_type, cls.memory_type = params or cls.params_type, memory or cls.memory_type
         dataclasses.dataclass(frozen=True, eq=False)(cls)
         if "freq" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
             raise TypeError(f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500")
@@ -115,14 +126,16 @@ class Controller:
     def params(self, airframe: Airframe) -> PyTree | None:
         """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.
 
+        Override it for parameters that do not follow from the declarations of their class alone.
+
         Raises:
             ConfigError: If the airframe lacks a value that the controller needs.
         """
-        return None
+        return None if self.params_type is None else self.params_type.create(airframe)
 
     def memory(self, airframe: Airframe) -> PyTree | None:
-        """Return the memory of one drone at rest, in a record of leaves of scope ``drone``, or None."""
-        return None
+        """Return the memory of one drone at rest, by default zeros, in leaves of scope ``drone``, or None."""
+        return None if self.memory_type is None else zeros(self.memory_type)
 
     def outer(self, data: DroneData, command: Setpoint, memory: Any, params: Any) -> Any:
         """Return the memory after a tick of the outer loop.
@@ -186,6 +199,13 @@ class Controller:
     def has_outer(self) -> bool:
         """True if the controller has an outer loop."""
         return self.outer_freq is not None
+
+
+def zeros(record: type[R], **values: Any) -> R:
+    """Return a record of one drone with the given values, and zeros of their declared core shape for other leaves."""
+    fields: Any = dataclasses.fields(record)  # type: ignore[arg-type]
+    cores = {field.name: field.metadata["core"] for field in fields if field.name not in values}
+    return record(**{name: np.zeros(core, float_dtype()) for name, core in cores.items()}, **values)
 
 
 def controller_chain(

@@ -4,57 +4,41 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.control.gains import require_gains
+from crazysim.control.gains import Gains
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import PyTree, as_parameter, leaf
-
-_GAINS = ("kp", "kd", "ki", "int_err_max")
-KEYS = (
-    *(f"controller.state.{key}" for key in _GAINS),
-    *(f"controller.{key}" for key in ("mass", "mass_thrust", "pwm_max")),
-    "rotors.thrust_max",
-)
-"""Values of an airframe that this controller needs."""
+from crazysim.pytree import leaf
 
 
-class StateParams(PyTree):
+def thrust_scale(airframe: Airframe) -> ArrayLike:
+    """Return the thrust of the firmware's PWM for a desired thrust over that thrust, 1."""
+    pwm_per_newton = airframe.value("controller.mass_thrust", ())
+    max_thrust = airframe.n_rotors * airframe.value("rotors.thrust_max", ())
+    return pwm_per_newton * (max_thrust / airframe.value("controller.pwm_max", ()))
+
+
+class StateParams(
+    Gains, controller="crazyflow", needs=("controller.mass_thrust", "controller.pwm_max", "rotors.thrust_max")
+):
     """Gains and parameters of the state controller, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
+    mass: Array = leaf("parameter", 1, (1,), airframe="controller.mass")
     """Mass that the controller assumes, kg. (1,)"""
-    kp: Array = leaf("parameter", 1)
+    kp: Array = leaf("parameter", 1, (3,), airframe="controller.state.kp")
     """Gain on the position error, N/m. (3,)"""
-    kd: Array = leaf("parameter", 1)
+    kd: Array = leaf("parameter", 1, (3,), airframe="controller.state.kd")
     """Gain on the velocity error, N s/m. (3,)"""
-    ki: Array = leaf("parameter", 1)
+    ki: Array = leaf("parameter", 1, (3,), airframe="controller.state.ki")
     """Gain on the integral of the position error, N/(m s). (3,)"""
-    gravity_vec: Array = leaf("parameter", 1)
+    gravity_vec: Array = leaf("parameter", 1, (3,), airframe=lambda _: GRAVITY)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    thrust_scale: Array = leaf("parameter", 1, (1,))
+    thrust_scale: Array = leaf("parameter", 1, (1,), airframe=thrust_scale)
     """Actual over desired thrust, 1. It is not 1, because the firmware's mass_thrust does not match its mass. (1,)"""
-    int_err_max: Array = leaf("parameter", 1)
+    int_err_max: Array = leaf("parameter", 1, (3,), airframe="controller.state.int_err_max")
     """Limit of the integral of the position error, m s. (3,)"""
-
-    @staticmethod
-    def create(airframe: Airframe) -> StateParams:
-        """Return the shared parameters of an airframe."""
-        require_gains(airframe, KEYS, "crazyflow")
-        pwm_per_newton = airframe.value("controller.mass_thrust", ())
-        newton_per_pwm = (
-            airframe.n_rotors * airframe.value("rotors.thrust_max", ()) / airframe.value("controller.pwm_max", ())
-        )
-        return StateParams(
-            mass=as_parameter(airframe.value("controller.mass", ())),
-            kp=as_parameter(airframe.value("controller.state.kp", (3,))),
-            kd=as_parameter(airframe.value("controller.state.kd", (3,))),
-            ki=as_parameter(airframe.value("controller.state.ki", (3,))),
-            gravity_vec=as_parameter(GRAVITY),
-            thrust_scale=as_parameter(pwm_per_newton * newton_per_pwm),
-            int_err_max=as_parameter(airframe.value("controller.state.int_err_max", (3,))),
-        )
 
 
 def state2attitude(

@@ -24,12 +24,12 @@ from crazysim.control.lqr import (
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
-from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
+from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import cross, matvec
 
 MAX_KNOTS = 60
@@ -41,9 +41,9 @@ class TrackingLQRParams(RigidBodyParams):
 
     gains: Array = leaf("parameter", 3)
     """Gains at the knots. (n_knots, 4, 12)"""
-    dt: Array = leaf("parameter", 1)
+    dt: Array = leaf("parameter", 1, (1,))
     """Time from one knot to the next, s. (1,)"""
-    start: Array = leaf("parameter", 1)
+    start: Array = leaf("parameter", 1, (1,))
     """Time of the first knot, s since the reset. (1,)"""
 
 
@@ -192,9 +192,9 @@ class TrackingLQR(Controller):
     freq: int = 500
     """Rate of the controller, Hz."""
     Q: ArrayLike | None = None
-    """Weights of the states, as for ``LQRParams.create``."""
+    """Weights of the states, as for ``LQR``."""
     R: ArrayLike | None = None
-    """Weights of the inputs, as for ``LQRParams.create``."""
+    """Weights of the inputs, as for ``LQR``."""
 
     def params(self, airframe: Airframe) -> TrackingLQRParams:
         shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
@@ -214,12 +214,7 @@ class TrackingLQR(Controller):
         mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
         compute_gains = functools.partial(tracking_gains, n_steps=math.ceil(self.dt * self.freq))
         gains = solve_on_host(compute_gains, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
-        return TrackingLQRParams(
-            **rigid_body_params(airframe),
-            gains=as_parameter(gains),
-            dt=as_parameter(self.dt),
-            start=as_parameter(self.start),
-        )
+        return TrackingLQRParams.create(airframe, gains=gains, dt=self.dt, start=self.start)
 
     def update(self, data: DroneData, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
         s, core = data.states, data.core

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics.drag import body_drag_force
-from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
+from crazysim.dynamics.models import BodyParams, Dynamics, require_support
 from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration, stable_angular_acceleration
 from crazysim.dynamics.rotor import (
     quadratic_curve,
@@ -22,63 +22,39 @@ from crazysim.dynamics.rotor import (
     rotor_vel_of_thrust,
 )
 from crazysim.eager import jit_eager_calls
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import leaf
 from crazysim.rotation import along_z
 
 
-class Params(PyTree):
+class Params(BodyParams):
     """Parameters of the first-principles model, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass, kg. (1,)"""
-    L: Array = leaf("parameter", 1)
+    L: Array = leaf("parameter", 1, airframe=lambda airframe: airframe.arm)
     """Arm that scales the first two rows of the mixing matrix, m. (n_rotors,) if rotors differ, else (1,)"""
-    prop_inertia: Array = leaf("parameter", 1)
+    prop_inertia: Array = leaf("parameter", 1, airframe="rotors.inertia")
     """Inertia of a propeller and motor about its axis, kg m^2. (n_rotors,) if rotors differ, else (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia about the centre of mass, body frame, kg m^2. (3, 3)"""
-    J_inv: Array = leaf("parameter", 2)
+    J_inv: Array = leaf("parameter", 2, airframe=lambda airframe: np.linalg.inv(airframe.inertia))
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
-    rpm2thrust: Array = leaf("parameter", 2)
+    rpm2thrust: Array = leaf("parameter", 2, airframe="rotors.thrust_curve")
     """Thrust curve, N, N/rpm, N/rpm^2. (n_rotors, 3) if rotors differ, else (1, 3)"""
-    rpm2torque: Array = leaf("parameter", 2)
+    rpm2torque: Array = leaf("parameter", 2, airframe="rotors.torque_curve")
     """Drag torque curve, N m, N m/rpm, N m/rpm^2. (n_rotors, 3) if rotors differ, else (1, 3)"""
-    mixing_matrix: Array = leaf("parameter", 2)
+    mixing_matrix: Array = leaf("parameter", 2, airframe=lambda airframe: airframe.mixing_matrix)
     """Mixing matrix, rotor thrusts to torque: positions over L, and signs of the drag torque. (3, n_rotors)"""
-    drag_matrix: Array = leaf("parameter", 2)
+    drag_matrix: Array = leaf("parameter", 2, airframe=lambda airframe: airframe.matrix("drag.coefficients"))
     """Linear drag coefficients, body frame, N s/m. (3, 3)"""
-    rotor_dyn_coef: Array = leaf("parameter", 2)
+    rotor_dyn_coef: Array = leaf("parameter", 2, airframe="rotors.lag")
     """Coefficients of ``rotor_acceleration`` on spin-up, then on spin-down, 1/s, 1/(s rpm). (n_rotors, 4) if
     rotors differ, else (1, 4)"""
-    rotor_vel_min: Array = leaf("parameter", 1)
+    rotor_vel_min: Array = leaf("parameter", 1, airframe=lambda airframe: airframe.rotor_vel_limits[0])
     """Minimum speed of a rotor that is on, rpm. (n_rotors,) if rotors differ, else (1,)"""
-    rotor_vel_max: Array = leaf("parameter", 1)
+    rotor_vel_max: Array = leaf("parameter", 1, airframe=lambda airframe: airframe.rotor_vel_limits[1])
     """Maximum rotor speed, rpm. (n_rotors,) if rotors differ, else (1,)"""
 
-    @staticmethod
-    def create(airframe: Airframe) -> Params:
-        """Return the shared parameters of an airframe."""
+    @classmethod
+    def create(cls, airframe: Airframe, **values: Any) -> Self:
         require_support(airframe, Dynamics.first_principles)
-        thrust_curve = airframe.value("rotors.thrust_curve")
-        # In float64 at any precision of the simulation: the limits are constants, not results.
-        low, high = airframe.rotor_vel_limits
-        return Params(
-            mass=as_parameter(airframe.value("rigid_body.mass")),
-            L=as_parameter(airframe.arm),
-            prop_inertia=as_parameter(airframe.value("rotors.inertia")),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(airframe.inertia),
-            J_inv=as_parameter(np.linalg.inv(airframe.inertia)),
-            rpm2thrust=as_parameter(np.atleast_2d(thrust_curve)),
-            rpm2torque=as_parameter(np.atleast_2d(airframe.value("rotors.torque_curve"))),
-            mixing_matrix=as_parameter(airframe.mixing_matrix),
-            drag_matrix=as_parameter(airframe.matrix("drag.coefficients")),
-            rotor_dyn_coef=as_parameter(np.atleast_2d(airframe.value("rotors.lag"))),
-            rotor_vel_min=as_parameter(low),
-            rotor_vel_max=as_parameter(high),
-        )
+        return super().create(airframe, **values)
 
 
 def dynamics(
@@ -179,7 +155,7 @@ def pad_rotors(params: Params, n_rotors: int) -> Params:
         )
         return np.pad(per_rotor, [(0, n_rotors - n_own_rotors if k == axis else 0) for k in range(array.ndim)], mode)
 
-    curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
-    limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}
+    names = ("rpm2thrust", "rpm2torque", "rotor_vel_min", "rotor_vel_max")
+    curves_and_limits = {name: extend(getattr(params, name), 0) for name in names}
     inertia_and_lag = {name: extend(getattr(params, name), 0, "edge") for name in ("prop_inertia", "rotor_dyn_coef")}
-    return params.replace(mixing_matrix=extend(params.mixing_matrix, 1), **curves, **limits, **inertia_and_lag)
+    return params.replace(mixing_matrix=extend(params.mixing_matrix, 1), **curves_and_limits, **inertia_and_lag)

@@ -12,6 +12,7 @@ Outside of the fitted range the motion is bounded and continuous, but not identi
 from __future__ import annotations
 
 import math
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +20,10 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.drones import Airframe
+from crazysim.drones.keys import TABLES
 from crazysim.dynamics.drag import body_drag_force
-from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.dynamics.models import BodyParams, Dynamics, require_support
+from crazysim.pytree import leaf
 from crazysim.rotation import along_z, matvec
 
 MIN_FITTED_COSINE = math.cos(math.radians(80))
@@ -35,16 +37,10 @@ and sixteen revolutions.
 """
 
 
-class Params(PyTree):
-    """Parameters of a fitted model, each shared or one per drone."""
+class Params(BodyParams):
+    """Parameters of a fitted model, each shared or one per drone. The inertia affects external torques only."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass, kg. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia about the centre of mass, body frame, kg m^2; affects external torques only. (3, 3)"""
-    J_inv: Array = leaf("parameter", 2)
+    J_inv: Array = leaf("parameter", 2, airframe=lambda airframe: np.linalg.inv(airframe.inertia))
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
     acc_coef: Array = leaf("parameter", 1, (1,))
     """Thrust at command zero, N. (1,)"""
@@ -60,38 +56,30 @@ class Params(PyTree):
     """Rate of the lag of the thrust behind its command, 1/s; None without lag. (1,)"""
     drag_matrix: Array | None = leaf("parameter", 2)
     """Linear drag coefficients, body frame, N s/m; None without drag. (3, 3)"""
-    thrust_min: Array = leaf("parameter", 1)
+    thrust_min: Array = leaf(
+        "parameter", 1, airframe=lambda airframe: airframe.n_rotors * airframe.value("rotors.thrust_min", ())
+    )
     """Minimum collective thrust of rotors that are on, N. (1,)"""
-    thrust_max: Array = leaf("parameter", 1)
+    thrust_max: Array = leaf(
+        "parameter", 1, airframe=lambda airframe: airframe.n_rotors * airframe.value("rotors.thrust_max", ())
+    )
     """Maximum collective thrust, N. (1,)"""
 
-    @staticmethod
-    def create(airframe: Airframe, dynamics: Dynamics) -> Params:
+    @classmethod
+    def create(cls, airframe: Airframe, dynamics: Dynamics) -> Self:
         """Return the shared parameters of an airframe for one of the fitted models."""
         require_support(airframe, dynamics)
+        fit = dict.fromkeys(("thrust_dyn_coef", "drag_matrix")) | fitted_numbers(airframe, dynamics)
+        return super().create(airframe, **fit)
 
-        def fitted_value(key: str) -> Array:
-            return as_parameter(airframe.value(f"fitted.{dynamics.value}.{key}"))
 
-        has_lag = dynamics in (Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
-        drag_matrix = None
-        if dynamics == Dynamics.so_rpy_rotor_drag:
-            drag_matrix = as_parameter(airframe.matrix("fitted.so_rpy_rotor_drag.drag_coefficients"))
-        return Params(
-            mass=as_parameter(airframe.value("rigid_body.mass")),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(airframe.inertia),
-            J_inv=as_parameter(np.linalg.inv(airframe.inertia)),
-            acc_coef=fitted_value("acc_coef"),
-            cmd_f_coef=fitted_value("cmd_f_coef"),
-            rpy_coef=fitted_value("rpy_coef"),
-            rpy_rates_coef=fitted_value("rpy_rates_coef"),
-            cmd_rpy_coef=fitted_value("cmd_rpy_coef"),
-            thrust_dyn_coef=fitted_value("thrust_dyn_coef") if has_lag else None,
-            drag_matrix=drag_matrix,
-            thrust_min=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_min", ())),
-            thrust_max=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_max", ())),
-        )
+def fitted_numbers(airframe: Airframe, dynamics: Dynamics) -> dict[str, Any]:
+    """Return an airframe's numbers of a fitted model, by field of ``Params``."""
+    table = f"fitted.{dynamics.value}"
+    numbers = {key: airframe.value(f"{table}.{key}") for key in TABLES[table] if key != "drag_coefficients"}
+    if "drag_coefficients" in TABLES[table]:
+        numbers["drag_matrix"] = airframe.matrix(f"{table}.drag_coefficients")
+    return numbers
 
 
 def dynamics(

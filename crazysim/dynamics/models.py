@@ -1,15 +1,20 @@
-"""Names of the dynamics models, and which airframes support them."""
+"""Dynamics models: their names, which airframes support them, and parameters that follow from an airframe."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from enum import StrEnum
+from typing import Any, Self, dataclass_transform
 
 import numpy as np
+from jax import Array
 
 from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.pytree import PyTree, as_parameter, leaf, static
 
 MAX_LAG_STEP = 1.5
 """Largest ratio of the time step to the time constant of a lag. Euler steps diverge at a ratio of 2; at 1.5, a lag
@@ -30,6 +35,63 @@ class Dynamics(StrEnum):
     so_rpy_rotor_drag = "so_rpy_rotor_drag"
     """``so_rpy_rotor`` with linear drag in the body frame."""
     default = first_principles
+
+
+def part(source: type[AirframeParams] | Callable[[Airframe], PyTree]) -> Any:
+    """Declare a record within ``AirframeParams``, by its class or by the function that makes it for an airframe."""
+    return dataclasses.field(metadata={"airframe": source})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, part, dataclasses.field))
+class AirframeParams(PyTree):
+    """Base class of parameters that follow from an airframe, each shared or one per drone.
+
+    A leaf declares where its number comes from: ``kp: Array = leaf("parameter", 1, (3,), airframe="mellinger.kp")``,
+    or a function of the airframe. ``part`` declares a record of such leaves.
+    """
+
+    @classmethod
+    def numbers(cls, airframe: Airframe) -> dict[str, Any]:
+        """Return what the declarations give for an airframe, by field: numbers in float64, and parts."""
+        metadata = {field.name: field.metadata for field in dataclasses.fields(cls)}
+        return {name: _read(airframe, x) for name, x in metadata.items() if x.get("airframe") is not None}
+
+    @classmethod
+    def create(cls, airframe: Airframe, **values: Any) -> Self:
+        """Return the shared parameters of an airframe.
+
+        Args:
+            airframe: The airframe.
+            values: Values of fields without a declaration, or in place of it.
+        """
+        metadata = {field.name: field.metadata for field in dataclasses.fields(cls)}
+        numbers = cls.numbers(airframe) | values
+        return cls(**{name: _as_leaf(x, metadata[name]) for name, x in numbers.items()})
+
+
+class BodyParams(AirframeParams):
+    """Mass, gravity and inertia of a drone, or those that its controller assumes."""
+
+    mass: Array = leaf("parameter", 1, (1,), airframe="rigid_body.mass")
+    """Mass, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1, airframe=lambda _: GRAVITY)
+    """Gravitational acceleration, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2, airframe=lambda airframe: airframe.inertia)
+    """Inertia about the centre of mass, body frame, kg m^2. (3, 3)"""
+
+
+def _read(airframe: Airframe, metadata: Mapping[str, Any]) -> Any:
+    source, core = metadata["airframe"], metadata.get("core")
+    if isinstance(source, str):
+        return airframe.value(source, () if core == (1,) else core)
+    return (source.create if isinstance(source, type) else source)(airframe)
+
+
+def _as_leaf(x: Any, metadata: Mapping[str, Any]) -> Any:
+    if x is None or isinstance(x, PyTree):
+        return x
+    has_shape = metadata["core"] is not None
+    return as_parameter(np.broadcast_to(x, metadata["core"]) if has_shape else np.array(x, ndmin=metadata["core_ndim"]))
 
 
 def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe, rotation
 from crazysim.control.allocation import yaw_arm
-from crazysim.control.auto import DAMPING_RATIO, STIFFNESS_RATIO, Auto, AutoParams, quat_error
+from crazysim.control.auto import DAMPING_RATIO, STIFFNESS_RATIO, Auto, quat_error
 from crazysim.control.bandwidth import max_ang_acc, rotor_rate
 from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
@@ -218,15 +218,15 @@ def test_the_gains_are_damped_as_documented():
 def test_gains_by_hand():
     """cf21B_500: lag 16.094 1/s, made faster to 50 1/s; with 1.5 periods of 500 Hz that is 43.48 1/s."""
     airframe = load_airframe("cf21B_500")
-    p = AutoParams.create(airframe, 500, 100)
+    p = Auto().params(airframe)
     rate = 1 / (1 / 50 + 1.5 / 500)
     np.testing.assert_allclose(p.lead, 50 / rotor_rate(airframe))
     np.testing.assert_allclose(p.damping, 0.6 * rate * np.array([1, 1, 0.5]))
     np.testing.assert_allclose(p.stiffness, 0.12 * rate**2 * np.array([1, 1, 0.25]))
     np.testing.assert_allclose(p.position.damping, 2 * 0.4 / (5 / rate + 0.5 / 100))
-    slow = AutoParams.create(load_airframe("cf2x_L250"), 500, 100)
+    slow = Auto().params(load_airframe("cf2x_L250"))
     np.testing.assert_allclose(slow.lead, 5.0)  # the largest lead
-    assert AutoParams.create(airframe, 50, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
+    assert Auto(freq=50, outer_freq=50).params(airframe).lead < p.lead  # half of what is missing in a tick of 20 ms
 
 
 def test_authority_by_hand():
@@ -257,7 +257,7 @@ def test_authority_by_hand():
     quad["rotors"]["thrust_max"] = 3.0
     np.testing.assert_allclose(max_ang_acc(load_airframe(quad)), [40 * 1.45, 40 * 1.45, 4 * (3 - hover)], rtol=1e-6)
     # Quick rotors: the rate follows from the authority, so that the rotors can brake each turn.
-    p, (roll, _, yaw) = AutoParams.create(load_airframe(quad), 500, 100), max_ang_acc(load_airframe(quad))
+    p, (roll, _, yaw) = Auto().params(load_airframe(quad)), max_ang_acc(load_airframe(quad))
     np.testing.assert_allclose(p.lead, 1.0)
     np.testing.assert_allclose((p.stiffness / p.damping) ** 2 * [2, 2, 1], [roll, roll, yaw], rtol=1e-5)
 

@@ -16,7 +16,7 @@ from crazysim import ConfigError, Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.flatness import Attitude
-from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
+from crazysim.control.geometric import Geometric, attitude_errors, geometric_control
 from crazysim.control.priority import prioritized_wrench
 from crazysim.plugins.follow import Follow
 from crazysim.trajectories import curves
@@ -27,7 +27,7 @@ control = jax.jit(geometric_control, static_argnames="feedforward")
 
 @functools.cache
 def params(drone="bumblebee", gains="airframe", freq=500):
-    return GeometricParams.create(load_airframe(drone), freq, gains)
+    return Geometric(freq, gains).params(load_airframe(drone))
 
 
 def setpoint(**changes):
@@ -68,7 +68,7 @@ def lab_wrench(pos, matrix, vel, ang_vel, yaw, drone):
 @pytest.mark.parametrize("drone", ["crazyflie", "bumblebee_lab"])
 def test_the_wrench_agrees_with_the_lab_law(drone, rng):
     """Small errors, so that no rotor saturates; the lab's law has no limits."""
-    p = GeometricParams.create(load_airframe(drone), 500, "airframe")
+    p = Geometric(gains="airframe").params(load_airframe(drone))
     for _ in range(20):
         rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.05)
         pos, vel, ang_vel, yaw = 0.05 * rng.normal(size=3), 0.05 * rng.normal(size=3), 0.02 * rng.normal(size=3), 0.05
@@ -82,7 +82,7 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
     """On a figure eight, without drag: thrust and torque of Newton and Euler, J w' + w x J w."""
     from crazysim.control.flatness import attitude_of_thrust
 
-    p, attitude = GeometricParams.create(load_airframe("bumblebee"), 500), jax.jit(attitude_of_thrust)
+    p, attitude = Geometric().params(load_airframe("bumblebee")), jax.jit(attitude_of_thrust)
     setpoint_on_eight = jax.jit(functools.partial(path_setpoint, figure_eight))
     for t in (0.3, 1.0, 2.2):
         sp = jax.tree.map(np.asarray, setpoint_on_eight(t))

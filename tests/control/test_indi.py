@@ -11,8 +11,8 @@ import scipy.signal
 from flights import figure_eight, fly, hover, make_sim, path_setpoint, rms_error, start_on_path
 
 from crazysim import Sim, load_airframe
-from crazysim.control.geometric import GeometricParams, geometric_control
-from crazysim.control.indi import INDI, INDIMemory, INDIParams, apply_filter, indi_control, steady_filter_states
+from crazysim.control.geometric import Geometric, geometric_control
+from crazysim.control.indi import INDI, INDIMemory, apply_filter, indi_control, steady_filter_states
 from crazysim.control.low_pass import butterworth
 
 
@@ -37,7 +37,7 @@ def test_a_filter_in_its_steady_state_stays_there():
 
 @functools.cache
 def law(drone):
-    p = INDIParams.create(load_airframe(drone), 500, 12.0)
+    p = INDI().params(load_airframe(drone))
 
     def rotors(data, setpoint, memory):
         s = data.states
@@ -48,7 +48,7 @@ def law(drone):
 
 
 def memory():
-    return jax.tree.map(jnp.asarray, INDIMemory.create())
+    return jax.tree.map(jnp.asarray, INDI().memory(load_airframe("cf21B_500")))
 
 
 def test_a_return_to_the_controller_starts_its_filter_anew():
@@ -91,7 +91,7 @@ def test_a_force_and_a_torque_are_compensated():
     assert error[-1] < 1e-3
     assert error.max() < 0.1
 
-    p = GeometricParams.create(load_airframe("cf21B_500"), 500)
+    p = Geometric().params(load_airframe("cf21B_500"))
 
     def geometric(data, setpoint, nothing):
         s = data.states

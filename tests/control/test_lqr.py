@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.linear_models import linearize, load_derivative, rod_angles, rod_direction
-from crazysim.control.load_lqr import LoadLQR, LoadLQRParams, load_gain, load_lqr_control, load_reference
-from crazysim.control.lqr import LQR, LQRParams, flat_reference, hover_gain, lqr_control, state_error, weight_matrix
+from crazysim.control.load_lqr import LoadLQR, load_gain, load_lqr_control, load_reference
+from crazysim.control.lqr import LQR, flat_reference, hover_gain, lqr_control, state_error, weight_matrix
 from crazysim.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
@@ -38,12 +38,12 @@ def rounded(x):
 @pytest.mark.usefixtures("x64")
 def test_gains_about_hover_equal_those_of_the_lab():
     """The gains are those that AIMotionLab-Virtual computes for the Bumblebee and the Crazyflie."""
-    gain = np.asarray(LQRParams.create(load_airframe("bumblebee_lab"), 500, LAB_Q, LAB_R).gain)
+    gain = np.asarray(LQR(Q=LAB_Q, R=LAB_R).params(load_airframe("bumblebee_lab")).gain)
     assert rounded(gain[0, [2, 5]]) == [1.4142, 1.9264]
     assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6341, 2.3243, 0.1635]
     assert rounded(gain[1, [1, 4, 6, 9]]) == [-1.4142, -1.6345, 2.3295, 0.1643]
     assert rounded(gain[3, [8, 11]]) == [0.4472, 0.1496]
-    gain = np.asarray(LQRParams.create(load_airframe("crazyflie"), 500, LAB_Q, LAB_R).gain)
+    gain = np.asarray(LQR(Q=LAB_Q, R=LAB_R).params(load_airframe("crazyflie")).gain)
     assert rounded(gain[0, [2, 5]]) == [1.4142, 1.4419]
     assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6202, 2.1684, 0.1416]
     assert rounded(gain[3, [8, 11]]) == [0.4472, 0.1415]
@@ -52,7 +52,7 @@ def test_gains_about_hover_equal_those_of_the_lab():
 @pytest.mark.usefixtures("x64")
 def test_gains_with_a_load_equal_those_of_the_lab():
     """The gains are those that AIMotionLab-Virtual computes for 0.05 kg on a rod of 0.4 m, at 100 Hz."""
-    params = LoadLQRParams.create(load_airframe("bumblebee"), 100, 0.05, 0.4, LAB_LOAD_Q, LAB_LOAD_R)
+    params = LoadLQR(100, Q=LAB_LOAD_Q, R=LAB_LOAD_R).params(load_airframe("bumblebee"))
     gain = np.asarray(params.gain)
     assert rounded(gain[0, [2, 5]]) == [9.6398, 4.7304]
     assert rounded(gain[1, [1, 4, 6, 9, 12, 14]]) == [-0.2667, -0.2000, 0.6085, 0.0705, -0.0137, 0.0184]
@@ -143,7 +143,7 @@ def knots():
 @pytest.mark.usefixtures("x64")
 def test_error_dynamics_agree_with_flights(knots):
     """Derivatives equal differences of errors after 1e-5 s of flight of a reference drone and a disturbed one."""
-    p = jax.tree.map(np.asarray, LQRParams.create(load_airframe("bumblebee"), 500))
+    p = jax.tree.map(np.asarray, LQR().params(load_airframe("bumblebee")))
     sp = jax.tree.map(lambda x: np.asarray(x, np.float64)[7], knots)
     sp = sp.replace(yaw_rate=np.array([0.7]), yaw_acc=np.array([-0.4]))
     reference = jax.tree.map(np.asarray, jax.jit(flat_reference)(sp, p))
@@ -174,7 +174,7 @@ def test_error_dynamics_agree_with_flights(knots):
 
 @pytest.mark.usefixtures("x64")
 def test_gains_along_a_hover_equal_the_gain_for_hover():
-    p = LQRParams.create(load_airframe("bumblebee"), 500)
+    p = LQR().params(load_airframe("bumblebee"))
     still = jax.jit(jax.vmap(lambda t: path_setpoint(hover, t)))(np.arange(4) * 0.1)
     Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
     gains = jax.jit(tracking_gains, static_argnames="n_steps")(
@@ -202,7 +202,7 @@ def state_of(data):
 def test_a_figure_eight_is_tracked(drone, bound, knots):
     """The figure eight is 2 m wide, at up to 2 m/s. Gains are those for hover, then those along the trajectory."""
     sim = make_sim(drone)
-    p = LQRParams.create(load_airframe(drone), 500)
+    p = LQR().params(load_airframe(drone))
     start_on_path(sim, figure_eight)
     states, setpoints, _, _ = fly(sim, lambda d, sp, m: (lqr_control(*state_of(d), sp, params=p), m), figure_eight, 4.8)
     assert rms_error(states, setpoints) < bound
@@ -221,7 +221,7 @@ def test_a_figure_eight_is_tracked(drone, bound, knots):
 
 def test_heading_turns_the_gain():
     """A drone with its setpoint ahead of its nose pitches down, for any yaw."""
-    p = LQRParams.create(load_airframe("bumblebee"), 500)
+    p = LQR().params(load_airframe("bumblebee"))
     for yaw in (0.0, 1.0, -2.5):
         nose = np.float32([np.cos(yaw), np.sin(yaw), 0.0])
         zero, none = np.zeros(3, np.float32), np.zeros(1, np.float32)
@@ -285,7 +285,7 @@ def test_the_gain_with_a_load_without_mass_is_that_of_the_drone():
 
 def test_at_rest_at_the_setpoint_the_thrust_carries_drone_and_load():
     """There is no torque, with the drone at the setpoint, and with the load there."""
-    p = LoadLQRParams.create(load_airframe("bumblebee"), 500, 0.1, 0.4)
+    p = LoadLQR(load_mass=0.1).params(load_airframe("bumblebee"))
     zero, down, none = np.zeros(3, np.float32), np.float32([0, 0, -1.0]), np.zeros(1, np.float32)
     sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)
     state = (zero, np.float32([0, 0, 0, 1.0]), zero, zero, down, zero)

@@ -392,7 +392,7 @@ WRONG_AIRFRAMES = {
     "no controller": (
         remove_key("controller"),
         r"lacks \[controller.attitude\] kR, kw, ki_m, kd_omega, int_err_max; \[controller\] torque_pwm_max, "
-        r"thrust2torque, pwm_min, pwm_max, which",
+        r"pwm_min, pwm_max, thrust2torque, which",
     ),
     "shape misspelt": (
         set_key("shape.propellor_radius", 0.02),
