@@ -13,6 +13,7 @@ from crazysim.control.levels import Control
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
+from crazysim.errors import require
 from crazysim.pytree import PyTree, float_dtype
 
 R = TypeVar("R", bound=PyTree)
@@ -204,7 +205,13 @@ class Controller:
 def zeros(record: type[R], **values: Any) -> R:
     """Return a record of one drone with the given values, and zeros of their declared core shape for other leaves."""
     fields: Any = dataclasses.fields(record)  # type: ignore[arg-type]
-    cores = {field.name: field.metadata["core"] for field in fields if field.name not in values}
+    cores = {field.name: field.metadata.get("core") for field in fields if field.name not in values}
+    without_core = [name for name, core in cores.items() if core is None]
+    require(
+        not without_core,
+        f"expected a core shape for {', '.join(without_core)} of {record.__name__}, got none. Use leaf('drone', 1, (3,)) "
+        f"for three numbers, say, or override Controller.memory.",
+    )
     return record(**{name: np.zeros(core, float_dtype()) for name, core in cores.items()}, **values)
 
 

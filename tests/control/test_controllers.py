@@ -9,37 +9,31 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Latency, Sim, load_airframe, make
-from crazysim.control import INDI, PID, Control, Controller, LoadLQR, Mellinger, Setpoint
+from crazysim.control import INDI, PID, AirframeParams, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.core.stage import as_stages
-from crazysim.pytree import PyTree, as_parameter, leaf, replace_leaves
+from crazysim.pytree import PyTree, leaf, replace_leaves
 
 WORLDS, DRONES = 3, 2
 
 
 class SpringMemory(PyTree):
-    n_ticks: jax.Array = leaf("drone", 1)
-    feedforward: jax.Array = leaf("drone", 1)
+    n_ticks: jax.Array = leaf("drone", 1, (1,))
+    feedforward: jax.Array = leaf("drone", 1, (8,))
 
 
-class SpringParams(PyTree):
-    mass: jax.Array = leaf("parameter", 1, (1,))
+class SpringParams(AirframeParams):
+    mass: jax.Array = leaf("parameter", 1, (1,), airframe="rigid_body.mass")
 
 
-class Spring(Controller):
+class Spring(Controller, params=SpringParams, memory=SpringMemory):
     """Weight and a spring along z, with a counter of its ticks."""
 
     name = "spring"
     levels = (Control.state,)
     output = Control.force_torque
     freq: int = 100
-
-    def params(self, airframe):
-        return SpringParams(as_parameter(airframe.value("rigid_body.mass")))
-
-    def memory(self, airframe):
-        return SpringMemory(np.zeros(1), np.zeros(8))
 
     def update(self, data, command, memory, params):
         s = data.states
@@ -329,6 +323,17 @@ def test_incomplete_controllers_are_refused():
         class Undeclared(Controller):
             name = "undeclared"
             freq: int = 100
+
+
+def test_memory_that_begins_at_zero_needs_a_core_shape():
+    class Shapeless(PyTree):
+        integral: jax.Array = leaf("drone", 1)
+
+    class Forgetful(Spring, memory=Shapeless):
+        name = "forgetful"
+
+    with pytest.raises(ConfigError, match=r"core shape for integral of Shapeless.*leaf\('drone', 1, \(3,\)\)"):
+        Sim(control="state", controller=Forgetful())
 
 
 def test_controllers_run_on_two_devices():
