@@ -209,8 +209,8 @@ def zeros(record: type[R], **values: Any) -> R:
     without_core = [name for name, core in cores.items() if core is None]
     require(
         not without_core,
-        f"expected a core shape for {', '.join(without_core)} of {record.__name__}, got none. Use leaf('drone', 1, (3,)) "
-        f"for three numbers, say, or override Controller.memory.",
+        f"expected a core shape for {', '.join(without_core)} of {record.__name__}, got none. Use leaf('drone', 1, "
+        f"(3,)) for three numbers, say, or override Controller.memory.",
     )
     return record(**{name: np.zeros(core, float_dtype()) for name, core in cores.items()}, **values)
 
