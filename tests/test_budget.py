@@ -11,11 +11,11 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 1180,
-    "control": 2010,
+    "control": 1989,
     "core": 1899,
     "crazysim": 1404,
     "drones": 514,
-    "dynamics": 593,
+    "dynamics": 584,
     "engine": 5804,
     "envs": 3832,
     "geometry": 1089,

@@ -7,7 +7,7 @@ from typing import Any
 
 from crazysim.control.protocol import Controller
 from crazysim.control.switch import make_switch
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import UnknownNameError, expect
 
 DEFAULT_CONTROLLER = "auto"
 """Name of the default controller."""
@@ -34,15 +34,15 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
     """
     if isinstance(controller, (list, tuple)):
         return make_switch([find_controller(item) for item in controller], switch)
-    if switch is not None:
-        raise ConfigError(f"expected a list of controllers for a switch, got {controller!r}. Use controller=[...].")
+    expect(switch is None, "a list of controllers for a switch", controller, "Use controller=[...].")
     if isinstance(controller, Controller):
         return controller
-    if not isinstance(controller, str):
-        raise ConfigError(
-            f"expected a controller as a name or a Controller, got {controller!r}. Use controller='pid', or an "
-            f"instance of a subclass of crazysim.control.Controller."
-        )
+    expect(
+        isinstance(controller, str),
+        "a controller as a name or a Controller",
+        controller,
+        "Use controller='pid', or an instance of a subclass of crazysim.control.Controller.",
+    )
     if controller not in CONTROLLERS:
         names = ", ".join(repr(name) for name in sorted(CONTROLLERS))
         is_library = controller.endswith((".so", ".dylib"))

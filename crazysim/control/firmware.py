@@ -22,7 +22,7 @@ from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, expect, require
 from crazysim.pytree import PyTree, leaf
 from crazysim.storage import open_replacement, read_bytes
 
@@ -77,8 +77,7 @@ class CFirmware(Controller, params=AllocationParams):
         Raises:
             ConfigError: If the library cannot be loaded or lacks a function.
         """
-        if self.motors not in MOTOR_UNITS:
-            raise ConfigError(f"expected motors as one of {', '.join(MOTOR_UNITS)}, got {self.motors!r}")
+        expect(self.motors in MOTOR_UNITS, f"motors as one of {', '.join(MOTOR_UNITS)}", self.motors)
         _ = self._copy_path
 
     @functools.cached_property
@@ -170,14 +169,16 @@ def copy_library(library: str | Path) -> str:
     if missing_functions:
         required_names, missing_names = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing_functions)
         raise ConfigError(f"expected the functions {required_names} in {path}, got no {missing_names}. {remedy}")
-    if (version := library_copy.crazysim_version()) != INTERFACE_VERSION:
-        raise ConfigError(f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}")
+    require(
+        (version := library_copy.crazysim_version()) == INTERFACE_VERSION,
+        f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}",
+    )
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
     library_copy.crazysim_memory_size.restype = size
-    if (n_bytes := library_copy.crazysim_memory_size()) > MAX_MEMORY_BYTES:
-        raise ConfigError(
-            f"expected a memory of at most {MAX_MEMORY_BYTES} bytes a drone, got {n_bytes} from {path}. {remedy}"
-        )
+    require(
+        (n_bytes := library_copy.crazysim_memory_size()) <= MAX_MEMORY_BYTES,
+        f"expected a memory of at most {MAX_MEMORY_BYTES} bytes a drone, got {n_bytes} from {path}. {remedy}",
+    )
     library_copy.crazysim_init.argtypes = [pointer]
     library_copy.crazysim_init.restype = None
     library_copy.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]

@@ -18,7 +18,7 @@ from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.errors import ConfigError
+from crazysim.errors import expect
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip, cross, dot, matvec
 
@@ -191,8 +191,12 @@ class Geometric(Controller):
     ``MAX_INTEGRAL_RATIO`` times gravity for it."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
-        if not (np.isfinite(self.integral) and self.integral >= 0):
-            raise ConfigError(f"expected a finite integral of at least 0, 1/s, got {self.integral!r}. Use 0 for none.")
+        expect(
+            np.isfinite(self.integral) and self.integral >= 0,
+            "a finite integral of at least 0, 1/s",
+            self.integral,
+            "Use 0 for none.",
+        )
         if self.gains == "airframe":
             gains = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:

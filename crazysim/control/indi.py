@@ -21,7 +21,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
-from crazysim.errors import ConfigError
+from crazysim.errors import expect
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -186,8 +186,7 @@ class INDI(Controller, memory=INDIMemory):
     """Cutoff frequency of the filter, Hz; values above ``0.45 freq`` are reduced to ``0.45 freq``."""
 
     def params(self, airframe: Airframe) -> INDIParams:
-        if not 0 < self.cutoff < math.inf:
-            raise ConfigError(f"expected a positive, finite cutoff, Hz, got {self.cutoff!r}. Use INDI(cutoff=12.0).")
+        expect(0 < self.cutoff < math.inf, "a positive, finite cutoff, Hz", self.cutoff, "Use INDI(cutoff=12.0).")
         rotor_lag_rate, reaction = rotor_rate(airframe), momentum_per_torque(airframe)
         lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * self.freq / fastest_rotor_rate(airframe)), 1.0)
         # INDI compensates the reaction to accelerating rotors, which therefore does not limit the bandwidth.

@@ -21,7 +21,7 @@ from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.errors import ConfigError
+from crazysim.errors import expect, require
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -244,16 +244,17 @@ class LoadLQR(Controller, memory=LoadLQRMemory):
 
     def params(self, airframe: Airframe) -> LoadLQRParams:
         load_mass, length, joint = self.load_mass, self.length, np.asarray(self.attach)
-        if not (0 <= load_mass < np.inf and 0 < length < np.inf):
-            raise ConfigError(
-                f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
-                f"LoadLQR(load_mass=0.05, length=0.4)."
-            )
-        if joint.shape != (3,) or joint.dtype.kind not in "iuf" or not np.all(np.isfinite(joint)):
-            raise ConfigError(
-                f"expected attach as three finite numbers, m, got {self.attach!r}. Use "
-                f"LoadLQR(attach=(0.0, 0.0, -0.02))."
-            )
+        require(
+            0 <= load_mass < np.inf and 0 < length < np.inf,
+            f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
+            f"LoadLQR(load_mass=0.05, length=0.4).",
+        )
+        expect(
+            joint.shape == (3,) and joint.dtype.kind in "iuf" and np.all(np.isfinite(joint)),
+            "attach as three finite numbers, m",
+            self.attach,
+            "Use LoadLQR(attach=(0.0, 0.0, -0.02)).",
+        )
         Q, R = lqr_weights(airframe, self.freq, self.Q, self.R, load_mass, length)
         body = (airframe.value("rigid_body.mass"), airframe.inertia)
         attach = joint if np.any(joint) else None
@@ -270,11 +271,11 @@ class LoadLQR(Controller, memory=LoadLQRMemory):
     def update(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
-        if self.load not in data.plugins:
-            raise ConfigError(
-                f"expected a load {self.load!r} for controller {self.name!r}, got plugins {list(data.plugins)}. Use "
-                f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name."
-            )
+        require(
+            self.load in data.plugins,
+            f"expected a load {self.load!r} for controller {self.name!r}, got plugins {list(data.plugins)}. Use "
+            f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name.",
+        )
         s, load = data.states, data.plugins[self.load]
         # The rod of a hook swings even when the hook holds no load.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)

@@ -10,7 +10,7 @@ from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.keys import TABLES
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import convert_arrays
-from crazysim.errors import UnknownNameError
+from crazysim.errors import UnknownNameError, require
 
 CASCADE_NAME = "mellinger"
 """Crazyflow's name for its cascade of controllers, which is ``"crazyflow"`` here; not the controller ``Mellinger``."""
@@ -43,8 +43,7 @@ def load_params(
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.
     """
-    if controller != CASCADE_NAME:
-        raise UnknownNameError(f"expected controller {CASCADE_NAME!r}, got {controller!r}")
+    require(controller == CASCADE_NAME, f"expected controller {CASCADE_NAME!r}, got {controller!r}", UnknownNameError)
     airframe = load_airframe(drone)
     tables: dict[str, dict[str, Any]] = {
         name: {key: x for key, x in airframe.table(table).items() if key in TABLES[table]}

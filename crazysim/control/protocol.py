@@ -116,13 +116,22 @@ class Controller:
         super().__init_subclass__(**kwargs)
         cls.params_type, cls.memory_type = params or cls.params_type, memory or cls.memory_type
         dataclasses.dataclass(frozen=True, eq=False)(cls)
-        if "freq" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
-            raise TypeError(f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500")
+        require(
+            "freq" in {f.name for f in dataclasses.fields(cls)},  # type: ignore[arg-type]
+            f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500",
+            TypeError,
+        )
         missing_names = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
-        if missing_names:
-            raise TypeError(f"controller {cls.__name__} has no class variables {missing_names}; add them")
-        if cls.output not in OUTPUT_LEVELS:
-            raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUT_LEVELS}, got {cls.output!r}")
+        require(
+            not missing_names,
+            f"controller {cls.__name__} has no class variables {missing_names}; add them",
+            TypeError,
+        )
+        require(
+            cls.output in OUTPUT_LEVELS,
+            f"controller {cls.__name__}: expected output as one of {OUTPUT_LEVELS}, got {cls.output!r}",
+            TypeError,
+        )
 
     def params(self, airframe: Airframe) -> PyTree | None:
         """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 N_DOUBLINGS = 30
 """Number of doublings. k doublings cover 2^k time steps, so a closed loop with an eigenvalue of 1 - 1e-8 converges."""
@@ -129,10 +129,10 @@ def check_gain(K: Any) -> Any:
     Raises:
         ConfigError: If the gain is not finite, because the Riccati equation has no stabilising solution.
     """
-    if not np.all(np.isfinite(K)):
-        raise ConfigError(
-            "expected a Riccati equation with a stabilising solution, got none: an unstable or marginal mode is not "
-            "reached by the inputs, or has no weight. Give each position, angle and rate a positive weight in Q, each "
-            "input a positive weight in R, and check that mass and inertia are positive."
-        )
+    require(
+        np.all(np.isfinite(K)),
+        "expected a Riccati equation with a stabilising solution, got none: an unstable or marginal mode is not "
+        "reached by the inputs, or has no weight. Give each position, angle and rate a positive weight in Q, each "
+        "input a positive weight in R, and check that mass and inertia are positive.",
+    )
     return K

@@ -15,7 +15,7 @@ from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import expect, require
 from crazysim.pytree import PyTree, leaf
 
 
@@ -105,33 +105,33 @@ class Switch(Controller):
             index = params.index[0]
         else:
             index = jnp.asarray(self.switch(data.states, command, data.core.steps / data.core.freq))
-        if index.shape != () or not jnp.issubdtype(index.dtype, jnp.integer):
-            raise ConfigError(
-                f"expected one integer from the switch function, got shape {index.shape} and type {index.dtype}. "
-                f"Use jnp.where(..., 1, 0), for one drone."
-            )
+        require(
+            index.shape == () and jnp.issubdtype(index.dtype, jnp.integer),
+            f"expected one integer from the switch function, got shape {index.shape} and type {index.dtype}. "
+            f"Use jnp.where(..., 1, 0), for one drone.",
+        )
         return jnp.clip(index, 0, len(self.controllers) - 1).astype(jnp.int32)
 
 
 def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
     """Return a ``Switch`` between several controllers."""
-    if not controllers:
-        raise ConfigError("expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
-    if switch is None:
-        raise ConfigError(
-            "expected a switch for several controllers, got None. Use switch=fn with fn(state, setpoint, time) -> "
-            "index, or indices of the drones' controllers."
-        )
+    require(controllers, "expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
+    require(
+        switch is not None,
+        "expected a switch for several controllers, got None. Use switch=fn with fn(state, setpoint, time) -> "
+        "index, or indices of the drones' controllers.",
+    )
     return Switch(tuple(controllers), switch)
 
 
 def _check_indices(switch: Any, n: int) -> np.ndarray:
     indices = np.asarray(switch)
-    if indices.dtype.kind not in "iu" or indices.ndim not in (0, 2) or np.any((indices < 0) | (indices >= n)):
-        raise ConfigError(
-            f"expected switch as a function or as integers from 0 to {n - 1} of shape () or (n_worlds, n_drones), got "
-            f"{switch!r}. Use np.zeros((n_worlds, n_drones), int) for the first controller."
-        )
+    expect(
+        indices.dtype.kind in "iu" and indices.ndim in (0, 2) and not np.any((indices < 0) | (indices >= n)),
+        f"switch as a function or as integers from 0 to {n - 1} of shape () or (n_worlds, n_drones)",
+        switch,
+        "Use np.zeros((n_worlds, n_drones), int) for the first controller.",
+    )
     return indices[..., None].astype(np.int32)
 
 

@@ -28,7 +28,7 @@ from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import leaf
 from crazysim.rotation import cross, matvec
 
@@ -199,17 +199,17 @@ class TrackingLQR(Controller):
     def params(self, airframe: Airframe) -> TrackingLQRParams:
         shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
         n = shape[0] if len(shape) == 2 else 0
-        if not 2 <= n <= MAX_KNOTS or not 0 < self.dt < math.inf:
-            raise ConfigError(
-                f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
-                f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
-            )
+        require(
+            2 <= n <= MAX_KNOTS and 0 < self.dt < math.inf,
+            f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
+            f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt.",
+        )
         invalid = [name for name, x in vars(self.setpoints).items() if not np.all(np.isfinite(x))]
-        if invalid:
-            raise ConfigError(
-                f"expected finite setpoints, got NaN or infinity in {', '.join(invalid)}. Evaluate the trajectory at "
-                f"times that it covers, and check its limits."
-            )
+        require(
+            not invalid,
+            f"expected finite setpoints, got NaN or infinity in {', '.join(invalid)}. Evaluate the trajectory at "
+            f"times that it covers, and check its limits.",
+        )
         Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)
         mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
         compute_gains = functools.partial(tracking_gains, n_steps=math.ceil(self.dt * self.freq))

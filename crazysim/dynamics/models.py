@@ -13,7 +13,7 @@ from jax import Array
 
 from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.pytree import PyTree, as_parameter, leaf, static
 
 MAX_LAG_STEP = 1.5
@@ -104,19 +104,22 @@ def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:
 
 def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:
     """Return the built-in airframes that have parameters for a model."""
-    if dynamics not in tuple(Dynamics):
-        raise UnknownNameError(f"expected dynamics as one of {', '.join(Dynamics)}, got {dynamics!r}")
+    require(
+        dynamics in tuple(Dynamics),
+        f"expected dynamics as one of {', '.join(Dynamics)}, got {dynamics!r}",
+        UnknownNameError,
+    )
     return tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
 
 
 def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
     """Check that an airframe has the parameters of a model."""
     supported = supported_dynamics(airframe)
-    if dynamics not in supported:
-        raise ConfigError(
-            f"expected dynamics that drone {airframe.name!r} has parameters for ({', '.join(supported) or 'none'}), "
-            f"got {dynamics.value!r}. Pass one of these as dynamics=, or add the missing numbers to the airframe."
-        )
+    require(
+        dynamics in supported,
+        f"expected dynamics that drone {airframe.name!r} has parameters for ({', '.join(supported) or 'none'}), "
+        f"got {str(dynamics)!r}. Pass one of these as dynamics=, or add the missing numbers to the airframe.",
+    )
 
 
 def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.models import Dynamics, require_support
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 
 
 def load_params(
@@ -30,8 +30,11 @@ def load_params(
     Raises:
         ConfigError: If the drone has no parameters for the model.
     """
-    if dynamics not in tuple(Dynamics):
-        raise UnknownNameError(f"expected one of {', '.join(Dynamics)} as dynamics, got {dynamics!r}")
+    require(
+        dynamics in tuple(Dynamics),
+        f"expected one of {', '.join(Dynamics)} as dynamics, got {dynamics!r}",
+        UnknownNameError,
+    )
     model, airframe = Dynamics(dynamics), load_airframe(drone)
     require_support(airframe, model)
     limits = {key: airframe.value(f"rotors.{key}", ()) for key in ("thrust_min", "thrust_max")}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim import rotation
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 LEVEL_DURATION = 0.1
 """Duration at the start of a log over which the mean attitude is defined as level, s."""
@@ -35,20 +35,24 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         ConfigError: If a column is missing, the time does not increase, or nearly all positions are outliers.
     """
     keys = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
-    if missing := [key for key in keys if key not in data]:
-        raise ConfigError(f"expected {', '.join(keys)}, got no {', '.join(missing)}. Add them to the log.")
+    require(
+        not (missing := [key for key in keys if key not in data]),
+        f"expected {', '.join(keys)}, got no {', '.join(missing)}. Add them to the log.",
+    )
     log = {key: np.array(x, np.float64) for key, x in data.items()}
     time, pos, quat = log["time"] - log["time"][0], log["pos"], log["quat"]
-    if not np.all(np.diff(time) > 0):
-        raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
+    require(
+        np.all(np.diff(time) > 0), "expected a time that increases, got repeated or earlier samples. Drop them first."
+    )
     dt = np.diff(time)
     half_window = max(1, round(MEDIAN_DURATION / 2 / float(np.mean(dt))))
     median_pos = np.stack(
         [np.median(pos[max(0, k - half_window) : k + half_window + 1], axis=0) for k in range(len(time))]
     )
     is_valid = ~np.any(np.abs(pos - median_pos) > OUTLIER_DISTANCE, axis=-1)
-    if np.sum(is_valid) < 2:
-        raise ConfigError("expected positions along a path, got jumps at nearly every sample. Check their unit.")
+    require(
+        np.sum(is_valid) >= 2, "expected positions along a path, got jumps at nearly every sample. Check their unit."
+    )
     sign = np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])
     quat = sign[:, None] * quat
     pos, quat = (np.stack([np.interp(time, time[is_valid], c[is_valid]) for c in x.T], axis=-1) for x in (pos, quat))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim import rotation
 from crazysim.dynamics.models import GRAVITY, Dynamics
-from crazysim.errors import ConfigError
+from crazysim.errors import expect, require
 
 logger = logging.getLogger(__name__)
 
@@ -104,12 +104,13 @@ def fit_translation(
     dynamics: str, mass: float, logs: Sequence[Mapping[str, ArrayLike]], gravity: ArrayLike = GRAVITY
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the parameters of ``sys_id_translation`` for several logs, and their standard deviations."""
-    if dynamics not in list(FITTED_MODELS):
-        raise ConfigError(
-            f"expected dynamics as one of {', '.join(FITTED_MODELS)}, got {dynamics!r}. Choose one of them."
-        )
-    if not 0 < mass < np.inf:
-        raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}. Weigh the drone.")
+    expect(
+        dynamics in list(FITTED_MODELS),
+        f"dynamics as one of {', '.join(FITTED_MODELS)}",
+        dynamics,
+        "Choose one of them.",
+    )
+    expect(0 < mass < np.inf, "mass to be positive and finite, in kg", mass, "Weigh the drone.")
     from scipy.optimize import minimize_scalar  # a fifth of a second to import
 
     model = Dynamics(dynamics)
@@ -276,8 +277,7 @@ def _standard_deviations(jacobian: NDArray, residuals: NDArray, blocks: NDArray)
 
 
 def _refuse_plot(plot: bool) -> None:
-    if plot:
-        raise ConfigError("expected plot=False, got True. Plot errors with crazysim identify --plot.")
+    require(not plot, "expected plot=False, got True. Plot errors with crazysim identify --plot.")
 
 
 def _rms(x: NDArray) -> float:
