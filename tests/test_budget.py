@@ -11,7 +11,7 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 1180,
-    "control": 1989,
+    "control": 1987,
     "core": 1899,
     "crazysim": 1404,
     "drones": 514,

@@ -22,10 +22,6 @@ from crazysim.errors import expect
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import clip, cross, dot, matvec
 
-Gains = Literal["bandwidth", "airframe"]
-"""Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
-
-
 MAX_INTEGRAL_RATIO = 0.5
 """Largest acceleration along an axis by the integral of the position error, over gravity, 1."""
 
@@ -40,13 +36,13 @@ class GeometricMemory(PyTree):
 class GeometricParams(RigidBodyParams):
     """Gains and parameters of geometric control, each shared or one per drone."""
 
-    kr: Array = leaf("parameter", 1, (3,))
+    kr: Array = leaf("parameter", 1, (3,), airframe=lambda airframe: airframe.value("geometric.kr", ()))
     """Gain on the position error, N/m. (3,)"""
-    kv: Array = leaf("parameter", 1, (3,))
+    kv: Array = leaf("parameter", 1, (3,), airframe=lambda airframe: airframe.value("geometric.kv", ()))
     """Gain on the velocity error, N s/m. (3,)"""
-    kR: Array = leaf("parameter", 1, (3,))
+    kR: Array = leaf("parameter", 1, (3,), airframe=lambda airframe: airframe.value("geometric.kR", ()))
     """Gain on the rotation error, N m. (3,)"""
-    kw: Array = leaf("parameter", 1, (3,))
+    kw: Array = leaf("parameter", 1, (3,), airframe=lambda airframe: airframe.value("geometric.kw", ()))
     """Gain on the error of the body rates, N m s. (3,)"""
 
 
@@ -179,7 +175,7 @@ class Geometric(Controller):
     output: ClassVar[Control] = Control.force_torque
     freq: int = 500
     """Rate of the controller, Hz."""
-    gains: Gains = "bandwidth"
+    gains: Literal["bandwidth", "airframe"] = "bandwidth"
     """``"bandwidth"`` for the rule of ``crazysim.control.bandwidth``, times mass and inertia; ``"airframe"`` for the
     airframe's table ``[geometric]``. Airframes of AIMotionLab have its gains in this table."""
     feedforward: bool = True
@@ -197,10 +193,8 @@ class Geometric(Controller):
             self.integral,
             "Use 0 for none.",
         )
-        if self.gains == "airframe":
-            gains = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
-        else:
-            gains = bandwidth_gains(airframe, bandwidth(airframe, self.freq))
+        is_tuned = self.gains == "airframe"
+        gains = {} if is_tuned else bandwidth_gains(airframe, bandwidth(airframe, self.freq))
         return GeometricParams.create(airframe, **gains)
 
     def memory(self, airframe: Airframe) -> GeometricMemory | None:

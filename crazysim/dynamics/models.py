@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from enum import StrEnum
 from typing import Any, Self, dataclass_transform
 
@@ -51,9 +51,9 @@ class AirframeParams(PyTree):
     """
 
     @classmethod
-    def numbers(cls, airframe: Airframe) -> dict[str, Any]:
-        """Return what the declarations give for an airframe, by field: numbers in float64, and parts."""
-        metadata = {field.name: field.metadata for field in dataclasses.fields(cls)}
+    def numbers(cls, airframe: Airframe, but: Collection[str] = ()) -> dict[str, Any]:
+        """Return what the declarations give for an airframe, ``but`` those of some fields: float64 numbers, and parts."""
+        metadata = {field.name: field.metadata for field in dataclasses.fields(cls) if field.name not in but}
         return {name: _read(airframe, x) for name, x in metadata.items() if x.get("airframe") is not None}
 
     @classmethod
@@ -65,7 +65,7 @@ class AirframeParams(PyTree):
             values: Values of fields without a declaration, or in place of it.
         """
         metadata = {field.name: field.metadata for field in dataclasses.fields(cls)}
-        numbers = cls.numbers(airframe) | values
+        numbers = cls.numbers(airframe, but=values) | values
         return cls(**{name: _as_leaf(x, metadata[name]) for name, x in numbers.items()})
 
 
