@@ -52,7 +52,7 @@ class AirframeParams(PyTree):
 
     @classmethod
     def numbers(cls, airframe: Airframe, but: Collection[str] = ()) -> dict[str, Any]:
-        """Return what the declarations give for an airframe, ``but`` those of some fields: float64 numbers, and parts."""
+        """Return numbers, in float64, and parts that an airframe gives to all declared fields ``but`` some."""
         metadata = {field.name: field.metadata for field in dataclasses.fields(cls) if field.name not in but}
         return {name: _read(airframe, x) for name, x in metadata.items() if x.get("airframe") is not None}
 
