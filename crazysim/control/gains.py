@@ -15,15 +15,15 @@ from crazysim.errors import ConfigError
 class Gains(AirframeParams):
     """Base class of parameters from an airframe's table of gains. All gains that it lacks are listed in one message."""
 
-    controller: ClassVar[str]
+    controller: ClassVar[str] = ""
     """Name of the controller, for the message, declared as ``class MellingerParams(Gains, controller="mellinger")``."""
-    needs: ClassVar[tuple[str, ...]]
+    needs: ClassVar[tuple[str, ...]] = ()
     """Paths of the values that are needed beside those that leaves declare, declared like ``controller``."""
 
-    def __init_subclass__(cls, controller: str, needs: tuple[str, ...] = (), **kwargs: Any) -> None:
+    def __init_subclass__(cls, controller: str = "", needs: tuple[str, ...] = (), **kwargs: Any) -> None:
         """Keep the declarations."""
         super().__init_subclass__(**kwargs)
-        cls.controller, cls.needs = controller, needs
+        cls.controller, cls.needs = controller or cls.controller, (*cls.needs, *needs)
 
     @classmethod
     def create(cls, airframe: Airframe, **values: Any) -> Self:

@@ -10,6 +10,7 @@ from cases import with_states
 
 from crazysim import ConfigError, Latency, Sim, load_airframe, make
 from crazysim.control import INDI, PID, AirframeParams, Control, Controller, LoadLQR, Mellinger, Setpoint
+from crazysim.control.mellinger import MellingerParams
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.core.stage import as_stages
@@ -323,6 +324,17 @@ def test_incomplete_controllers_are_refused():
         class Undeclared(Controller):
             name = "undeclared"
             freq: int = 100
+
+
+def test_a_subclass_of_gains_needs_the_same_gains():
+    class Heavier(MellingerParams):
+        extra_mass: jax.Array = leaf("parameter", 1, (1,))
+
+    own = Heavier.create(load_airframe("cf2x_L250"), extra_mass=0.01)
+    np.testing.assert_array_equal(own.kp, MellingerParams.create(load_airframe("cf2x_L250")).kp)
+    assert own.extra_mass.shape == (1,)
+    with pytest.raises(ConfigError, match=r"lacks \[mellinger\] mass, .*which controller 'mellinger' needs"):
+        Heavier.create(load_airframe("bumblebee"), extra_mass=0.01)
 
 
 def test_memory_that_begins_at_zero_needs_a_core_shape():
