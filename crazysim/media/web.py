@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, RenderError, address_message, not_installed
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, is_own_name, start_guarded_server, wrong_name_message
 from crazysim.media.flight import Flight
@@ -30,7 +31,8 @@ FOV = 50.0
 """Initial vertical field of view, degrees."""
 
 
-def page(flight: Flight, world: int | None = None, lights: NDArray | None = None) -> str:
+@check_arguments
+def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = None) -> str:
     """Return one world of a flight as an HTML page with drones, obstacles, setpoints and trails.
 
     The page contains the viewer and the flight, so that it can be opened as a file, without server or network.
@@ -45,9 +47,9 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
         ImportError: If viser is not installed.
     """
     k = 0 if world is None else flight.index(world)
-    shape = (len(flight.time), flight.n_drones, 3)
-    if lights is not None and np.shape(lights) != shape:
-        raise ConfigError(f"expected lights of shape {shape} = (n, n_drones, 3), got {np.shape(lights)}")
+    lights, shape = None if lights is None else np.asarray(lights), (len(flight.time), flight.n_drones, 3)
+    if lights is not None and lights.shape != shape:
+        raise ConfigError(f"expected lights of shape {shape} = (n, n_drones, 3), got {lights.shape}")
     viser = import_viser()
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints the address of this temporary server
         server = start_guarded_server(viser, Access("127.0.0.1", free_port()))
@@ -57,6 +59,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
             server.stop()
 
 
+@check_arguments
 def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
     """Write ``page`` to a file.
 
@@ -64,7 +67,6 @@ def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
         ConfigError: If the world was not recorded, the folder does not exist, or the name has another suffix.
         ImportError: If viser is not installed.
     """
-    path = Path(path)
     check_writable(path, (".html",))
     write_file(path, page(flight, world))
 

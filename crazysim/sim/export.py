@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from crazysim.arguments import check_arguments
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command, staged_leaves
@@ -18,7 +19,7 @@ from crazysim.engine.ir.program import Program, Slot, UnfusedStage
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 from crazysim.engine.tools import symbolic
-from crazysim.errors import ConfigError, UnknownNameError, not_installed, require
+from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
 from crazysim.jaxcompat import is_key
 from crazysim.sim.sim import Sim
 
@@ -79,6 +80,7 @@ class CasadiStep:
         return self.function(*args)
 
 
+@check_arguments
 def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
     """Return the step of one drone as a CasADi function.
 
@@ -113,7 +115,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     # Below, a leaf is an index into ``program.leaves``, and a slot is a leaf with the index of one of its elements.
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [x.name for x in program.leaves]
-    command = _command_field(data)
+    mode = data.controls.mode
+    command = "controls.rotor_vel" if mode == Control.rotor_vel else f"controls.{mode.value}.staged_cmd"
     state = [names.index(name) for name in STATES]
     inputs = [names.index(command), *_parameter_leaves(program, parameters, command)]
     sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *inputs, *program.written_leaves}}
@@ -190,18 +193,11 @@ def _stage_default_feedforward(data: SimData) -> SimData:
     return stage_command(data, staged_leaves(data)[0])
 
 
-def _command_field(data: SimData) -> str:
-    mode = data.controls.mode
-    return "controls.rotor_vel" if mode == Control.rotor_vel else f"controls.{mode.value}.staged_cmd"
-
-
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
     """Return the indices of the leaves requested as parameters."""
     names = [x.name for x in program.leaves]
-    require(
-        not isinstance(parameters, str) and len(set(parameters)) == len(parameters),
-        f"expected parameters as a list of distinct names, got {parameters!r}",
-    )
+    is_list = isinstance(parameters, (list, tuple)) and all(isinstance(x, str) for x in parameters)
+    expect(is_list and len(set(parameters)) == len(parameters), "parameters as a list of distinct names", parameters)
     choices = [
         name
         for leaf, name in enumerate(names)

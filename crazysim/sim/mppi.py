@@ -173,7 +173,11 @@ class MPPI:
         if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
             raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
-            "mppi_command": Stage(self._command_stage, "drone", self._starts_control_step),
+            "mppi_command": Stage(
+                lambda data: stage_command(data, self._command_at(data, data.core.steps)),
+                "drone",
+                self._starts_control_step,
+            ),
             **self._sim.step_pipeline,
             "mppi_cost": Stage(self._cost_stage, "drone", self._starts_control_step),
         }
@@ -291,10 +295,6 @@ class MPPI:
 
     def _starts_control_step(self, data: SimData) -> Array:
         return data.core.steps % self.substeps == 0
-
-    def _command_stage(self, data: SimData) -> SimData:
-        """Stage the command of the plan at this time."""
-        return stage_command(data, self._command_at(data, data.core.steps))
 
     def _cost_stage(self, data: SimData) -> SimData:
         """Add the cost of the control step that has just ended; the step counter has been incremented already."""

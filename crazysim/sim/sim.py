@@ -188,7 +188,10 @@ class Sim:
         self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        self._built_step = BuiltPipeline("step_pipeline", stages, self._build_step)
+        # The step refuses data of another scene if one of its plugins has read the scene.
+        self._built_step = BuiltPipeline(
+            "step_pipeline", stages, lambda p: self._stepper.build(p, self.plugins.scene_check(self._default_data))
+        )
         self._built_reset = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
         for plugin in first_plugins:
             self.add(plugin)
@@ -324,10 +327,6 @@ class Sim:
         if object_names(data) != object_names(self._default_data):
             data = self._update_objects(data)
         return self.plugins.adapt_records(data, self._default_data)
-
-    def _build_step(self, pipeline: Pipeline) -> Step:
-        """Build a step that refuses data of another scene if one of its plugins has read the scene."""
-        return self._stepper.build(pipeline, self.plugins.scene_check(self._default_data))
 
     def _update_objects(self, data: SimData) -> SimData:
         ids = device_array(self._scene.drone_mocap_ids, np.int32)

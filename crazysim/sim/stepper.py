@@ -18,10 +18,11 @@ from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.record import MAX_STEPS
 from crazysim.core.sharding import put_on_device, shard
+from crazysim.eager import is_traced
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.sim.rollout import stage_flat
 
 ANNOUNCEMENT_DELAY = 5.0
@@ -79,10 +80,10 @@ class Stepper:
         if not isinstance(flat, FlatData):
             return self.data
         if self._shapes is None or self._shapes[0] is not flat.plan:
-            data = flat.data()
-            if isinstance(data.states.pos, jax.core.Tracer):
-                return data
-            self._shapes = flat.plan, jax.tree.map(_without_values, data)
+            self._shapes = (
+                flat.plan,
+                jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), flat.data()),
+            )
         return self._shapes[1]
 
     def stage_command(self, command: Any, feedforward: Any = None) -> None:
@@ -93,13 +94,15 @@ class Stepper:
                 (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for the default of ``crazysim.core.functional.stage_command``.
         """
-        traced = isinstance(command, jax.core.Tracer) or isinstance(feedforward, jax.core.Tracer)
-        if isinstance(self._data, FlatData) and not traced:
+        if isinstance(self._data, FlatData):
+            _require_values(command, feedforward)
             self._data = stage_flat(self._data, self.data_or_shapes, command, feedforward)
             return
         data = self.data
         feedforward = None if feedforward is None else put_command(data, feedforward)
-        self._data = stage_command(data, put_command(data, command), feedforward)
+        data = stage_command(data, put_command(data, command), feedforward)
+        _require_values(data)
+        self._data = data
 
     def set_synced(self, flag: bool) -> None:
         """Set ``core.mjx_synced``, in which users read whether the scene matches the data."""
@@ -109,11 +112,12 @@ class Stepper:
         data = self._data
         if isinstance(data, FlatData):
             i = int(data.plan.leaf_indices.core.mjx_synced)
-            on_host = isinstance(data.leaves, HostLeaves)
-            self._data = data.replace([i], [np.bool_(flag) if on_host else _flag_like(data.leaves[i], flag)])
+            sharding = None if isinstance(data.leaves, HostLeaves) else data.leaves[i].sharding
+            self._data = data.replace([i], [np.bool_(flag) if sharding is None else jax.device_put(flag, sharding)])
         else:
             core = self.data.core
-            self._data = self.data.replace(core=core.replace(mjx_synced=_flag_like(core.mjx_synced, flag)))
+            new_flag = jax.device_put(np.bool_(flag), core.mjx_synced.sharding)
+            self._data = self.data.replace(core=core.replace(mjx_synced=new_flag))
         self._is_flagged = flag
 
     def assign(self, data: SimData) -> None:
@@ -127,6 +131,7 @@ class Stepper:
 
     def accept(self, data: SimData) -> None:
         """Replace the data by data on the device, as compiled calls return it."""
+        _require_values(data)
         self.data = data
         self.set_synced(False)
 
@@ -136,6 +141,7 @@ class Stepper:
         JAX puts an edited leaf on its default device. A leaf on another device, or one that is not committed to its
         device, would make the next step compile again.
         """
+        _require_values(data)
         return put_on_device(data, self.device) if self.mesh is None else shard(data, self.mesh)
 
     def build(self, pipeline: Pipeline, check_data: Callable[[SimData], None] | None = None) -> Step:
@@ -155,6 +161,7 @@ class Stepper:
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))
+                _require_values(flat_after.leaves)
             else:
                 flat_after = self.step.advance_on_host(flat, n_steps)
         self._data = flat_after
@@ -192,9 +199,10 @@ class Stepper:
         return self._step_counts[n_steps]
 
 
-def _without_values(x: Any) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding)
-
-
-def _flag_like(x: Any, flag: bool) -> Array:
-    return jnp.asarray(flag) if isinstance(x, jax.core.Tracer) else jax.device_put(np.bool_(flag), x.sharding)
+def _require_values(*values: Any) -> None:
+    """Check that arrays are not traced: they would stay in the simulation after the trace."""
+    require(
+        not is_traced(values),
+        "expected arrays with values, got traced ones, of a function inside jit, grad or vmap, which a simulation "
+        "cannot keep. Use functions of data there: those of crazysim.core.functional, and sim.build_step_fn().",
+    )

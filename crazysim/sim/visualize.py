@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.arguments import check_flag
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.core.settings import as_rgba
 from crazysim.drones.body import MAX_LED_DRONES
 from crazysim.errors import UnknownNameError, require
@@ -15,6 +15,7 @@ from crazysim.sim.sim import Sim
 from crazysim.tables import read_floats
 
 
+@check_arguments
 def draw_line(
     sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, start_size: float = 3.0, end_size: float = 3.0
 ) -> None:
@@ -30,6 +31,7 @@ def draw_line(
     sim.overlays.line(_check_points(points), DEFAULT_COLOR if rgba is None else rgba, start_size, end_size)
 
 
+@check_arguments
 def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size: float = 0.01) -> None:
     """Draw points in the next image, as spheres.
 
@@ -42,6 +44,7 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
     sim.overlays.points(_check_points(points), DEFAULT_COLOR if rgba is None else rgba, size)
 
 
+@check_arguments
 def draw_capsule(
     sim: Sim,
     p1: ArrayLike,
@@ -69,6 +72,7 @@ def draw_capsule(
     sim.overlays.capsule(start, end, radius, DEFAULT_COLOR if rgba is None else rgba, check_flag("cylinder", cylinder))
 
 
+@check_arguments
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
     """Write one line of text at a point in the next image, in front of everything.
 
@@ -82,6 +86,7 @@ def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
     sim.overlays.label(text, pos)
 
 
+@check_arguments
 def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
     """Write text into a corner of the next image, below earlier text.
 
@@ -93,6 +98,7 @@ def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
     sim.overlays.text(text, corner)
 
 
+@check_arguments
 def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size: float = 0.02) -> None:
     """Draw the positions of the last state command of a world in the next image, as spheres.
 
@@ -114,6 +120,7 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
     )
 
 
+@check_arguments
 def change_material(
     sim: Sim,
     mat_name: str,

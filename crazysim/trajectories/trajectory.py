@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
-from crazysim.arguments import check_flag
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError, expect, require
@@ -93,6 +93,7 @@ class Trajectory(PyTree):
         """Time from the start to the end, s. (...)"""
         return self.ends[..., -1]
 
+    @check_arguments
     @jit_eager_calls()
     def evaluate(self, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
@@ -104,6 +105,7 @@ class Trajectory(PyTree):
         """
         return _build_setpoint(self.derivatives(t, N_DERIVATIVES))
 
+    @check_arguments
     def evaluate_one(self, index: Array | int, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
 
@@ -149,6 +151,7 @@ class Trajectory(PyTree):
         values = [jnp.stack([derivatives_by_axis[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
         return _build_setpoint(_scale_derivatives(values, jnp.where(is_active, inverse * rate, 0.0)))
 
+    @check_arguments
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
         """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
 
@@ -161,8 +164,8 @@ class Trajectory(PyTree):
         """
         self._require_single("evaluate_one(index, t)")
         require(
-            np.shape(t) == (),
-            f"expected one time, got shape {np.shape(t)}. Use jax.vmap(trajectory.evaluate)(times) for several.",
+            (shape := jnp.asarray(t).shape) == (),
+            f"expected one time, got shape {shape}. Use jax.vmap(trajectory.evaluate)(times) for several.",
         )
         expect(
             not isinstance(order, bool) and isinstance(order, (int, np.integer)) and 0 <= order <= N_DERIVATIVES,

@@ -38,6 +38,8 @@ from crazysim.envs.tasks.hover import Hover
 from crazysim.geometry import Shape, hfield, hull
 from crazysim.lab.identify import read_log
 from crazysim.media import Flight, Recorder, Trail, View, flight_of
+from crazysim.sim.export import to_casadi
+from crazysim.sim.visualize import draw_label, draw_points, draw_setpoints
 from crazysim.train import TrainConfig
 
 PACKAGE = Path(crazysim.__file__).parent
@@ -237,6 +239,8 @@ CALLS = {
     "spline": (trajectories.spline, {
         "times": np.arange(8.0), "points": np.ones((8, 3)), "degree": 5, "yaw": 0.0, "at_rest": True
     }),
+    "evaluate": (CIRCLE.evaluate, {"t": 0.5}),
+    "derivatives": (CIRCLE.derivatives, {"t": 0.5, "order": 2}),
     "check": (trajectories.check, {
         "trajectories": CIRCLE, "limits": trajectories.Limits(speed=1.0), "airframe": None, "starts": 0.0,
         "duration": 1.0, "names": None, "tolerance": 0.001,
@@ -262,6 +266,10 @@ CALLS = {
     "flight_of": (lambda **k: flight_of(sim(), **k), {"states": Lazy(lambda: on_sim("rollout")(policy=FALL)),
         "dt": 0.1, "worlds": None}),
     "Flight.load": (Flight.load, {"path": "nowhere.npz"}),
+    "to_casadi": (to_casadi, {"sim": Lazy(Sim), "parameters": (), "world": 0, "drone": 0}),
+    "draw_points": (draw_points, {"sim": Lazy(sim), "points": np.zeros(3), "rgba": None, "size": 0.01}),
+    "draw_label": (draw_label, {"sim": Lazy(sim), "point": np.zeros(3), "text": "here"}),
+    "draw_setpoints": (draw_setpoints, {"sim": Lazy(sim), "world": 0, "rgba": None, "size": 0.02}),
     "MPPI": (lambda **k: MPPI(env().sim, **k), {
         "horizon": 5, "samples": 4, "substeps": 2, "knots": 2, "freq": None, "noise": None, "temperature": 0.05,
         "seed": 0,
@@ -365,6 +373,8 @@ EMPTY_TEXTS = np.zeros(0, "U3")
         ("sim.depth", "camera", np.array(0, np.int8)), ("sim.depth", "camera", jnp.array(0)),
         ("sim.depth", "along", EMPTY_TEXTS), ("sim.rollout", "every", np.array(0, np.int8)),
         ("sim.rollout", "every", jnp.array(1)), ("envs.rollout", "policy", 95.0),
+        ("evaluate", "t", RAGGED), ("evaluate", "t", [1.0, 2.0]), ("derivatives", "t", RAGGED),
+        ("to_casadi", "sim", Lazy(env)), ("to_casadi", "parameters", 3), ("draw_points", "sim", Lazy(env)),
         ("DroneVectorEnv", "render_mode", np.zeros(0, bool)), ("estimate_airframe", "layout", EMPTY_TEXTS),
     ],
 )  # fmt: skip

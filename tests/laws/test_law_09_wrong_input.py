@@ -244,6 +244,33 @@ def test_wrong_calls_leave_the_simulation_as_it_was(sim, case):
     assert sim.step_pipeline == stages
 
 
+KEEPS_TRACED_VALUES = {
+    "command": lambda sim, x: sim.attitude_control(jnp.zeros((3, 1, 4)) + x),
+    "data": lambda sim, x: setattr(sim, "data", sim.data.replace(params=sim.data.params.replace(mass=x + jnp.ones(1)))),
+    "default_data": lambda sim, x: setattr(
+        sim, "default_data", sim.data.replace(params=sim.data.params.replace(mass=x + jnp.ones(1)))
+    ),
+    "member": lambda sim, x: sim[sim.names[0]].set(pos=x + jnp.zeros(3)),
+    "mask": lambda sim, x: sim.reset(jnp.ones(3) > x),
+    "rollout": lambda sim, x: sim.rollout(lambda params, data: jnp.zeros((3, 1, 4)) + params, x),
+}
+"""Methods that would keep the values of a function that is being traced."""
+
+
+@pytest.mark.parametrize("name", KEEPS_TRACED_VALUES)
+@pytest.mark.parametrize("steps_before", [0, 1], ids=["record", "flat"])
+def test_a_simulation_refuses_traced_values(sim, name, steps_before):
+    sim.reset()
+    for _ in range(steps_before):
+        sim.step()
+    before, keep = sim.data, KEEPS_TRACED_VALUES[name]
+    with pytest.raises(ConfigError, match=r"got traced ones.*crazysim.core.functional"):
+        jax.jit(lambda x: (keep(sim, x), x)[1])(0.5)
+    assert sim.data is before
+    sim.step()
+    sim.reset()
+
+
 @pytest.mark.parametrize("body", ["drone:1", "gate", 3])
 def test_contacts_of_a_body_that_does_not_exist_name_those_that_do(sim, body):
     before = sim.data

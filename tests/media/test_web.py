@@ -17,7 +17,7 @@ from browsing import MAX_PIXEL_DISTANCE
 from waiting import wait_for
 
 from crazysim.__main__ import main
-from crazysim.errors import RenderError
+from crazysim.errors import ConfigError, RenderError
 from crazysim.media import Recorder, web
 from crazysim.media.web import FOV, initial_camera_pose, page
 from crazysim.sim import Sim
@@ -157,6 +157,12 @@ def test_without_viser_the_extra_is_named(flight, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ImportError, match=r"pip install 'crazysim\[web\]'"):
         page(flight)
+
+
+@pytest.mark.parametrize("wrong", [{"flight": 3}, {"lights": [[1.0], [1.0, 2.0]]}, {"lights": np.zeros((1, 3))}])
+def test_wrong_flights_and_lights_are_named(flight, wrong):
+    with pytest.raises(ConfigError, match=f"expected {next(iter(wrong))}"):
+        page(**{"flight": flight} | wrong)
 
 
 class StubServer:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.show_files.archive import Archive, write_archive
 from crazysim.lab.show_files.led import MAX_REPEATED_COMMANDS, decode_lights, encode_lights
@@ -236,6 +237,7 @@ def _parse_integer(text: str, location: str) -> int:
     return int(text)
 
 
+@check_arguments
 def save_show(show: Show, path: str | Path) -> None:
     """Write a show as a ``.skyc`` file, which Skybrush reads too.
 
@@ -250,8 +252,7 @@ def save_show(show: Show, path: str | Path) -> None:
     Raises:
         ConfigError: If the name has another ending, the folder does not exist, or a trajectory has a degree above 7.
     """
-    path = Path(path)
-    if path.suffix != ".skyc":
+    if Path(path).suffix != ".skyc":
         raise ConfigError(f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.")
     files: dict[str, Any] = {}
     drones = []

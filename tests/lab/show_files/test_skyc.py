@@ -91,6 +91,11 @@ def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
     np.testing.assert_allclose(np.rad2deg(values[:, 3]), [0, 45, 87.45, 89.325, 90, 70.8, -90, -90], atol=1e-3)
 
 
+def test_only_a_show_is_saved(tmp_path):
+    with pytest.raises(ConfigError, match="expected show as Show, got 3"):
+        save_show(3, tmp_path / "a.skyc")
+
+
 @pytest.mark.parametrize("create_files", skyc_files.SHOW_CREATORS.values(), ids=skyc_files.SHOW_CREATORS)
 def test_saved_show_is_the_same(create_files, tmp_path):
     show = parse_show(skyc_files.pack_archive(create_files()))
