@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 
 from crazysim import cache
@@ -32,7 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command != "info":
         cache.enable_for_command()
     try:
-        status = options.run(options)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda text, *_, **__: print(f"crazysim: {text}", file=sys.stderr)
+            status = options.run(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return 130

@@ -76,8 +76,7 @@ def check_value(
     if kinds == {bool}:
         check_flag(name, value)
     elif kinds == {NumbersByName}:
-        if not isinstance(value, Mapping):
-            raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
+        expect(isinstance(value, Mapping), f"{name} as a dict of numbers by name", value, remedy)
         for key, item in value.items():
             read_numbers(f"{key!r} in {name}", item, allowed, ((),), remedy=remedy)
     elif numeric_types and not isinstance(value, classes):
@@ -127,8 +126,12 @@ def check_array(name: str, value: object, remedy: str = "Use an array of numbers
     except (TypeError, ValueError, RecursionError):
         dtype = np.dtype(object)
     is_too_large = isinstance(value, int) and not -(2**31) <= value < 2**31  # for JAX's int32
-    if is_too_large or not any(jnp.issubdtype(dtype, kind) for kind in (np.bool_, np.integer, np.floating)):
-        raise ConfigError(f"expected {name} as numbers, got {short_repr(value)}. {remedy}")
+    expect(
+        not is_too_large and any(jnp.issubdtype(dtype, k) for k in (np.bool_, np.integer, np.floating)),
+        f"{name} as numbers",
+        value,
+        remedy,
+    )
 
 
 def annotated_types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:

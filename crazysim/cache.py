@@ -23,7 +23,7 @@ from typing import Any
 import jax
 
 from crazysim import jaxcompat
-from crazysim.errors import ConfigError, warn
+from crazysim.errors import ConfigError, require, warn
 from crazysim.storage import (
     FOLDER_REMEDY,
     UNFINISHED_SUFFIX,
@@ -156,8 +156,10 @@ def _prepare_folder(root: Path, path: Path) -> None:
         raise ConfigError(
             f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {FOLDER_REMEDY}"
         )
-    if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
-        raise ConfigError(f"expected a folder that can be written, got {str(path)!r}. Use another.")
+    require(
+        os.access(path, os.R_OK | os.W_OK | os.X_OK),
+        f"expected a folder that can be written, got {str(path)!r}. Use another.",
+    )
     if free_bytes < MIN_FREE_BYTES:
         raise ConfigError(
             f"expected {MIN_FREE_BYTES / 1e6:g} MB of free space for compiled programs, got {free_bytes / 1e6:.1f} MB "

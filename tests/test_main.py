@@ -1,19 +1,33 @@
 """The command line and the demo, as a user runs them, but smaller."""
 
+import argparse
 import errno
 import os
+import re
 import subprocess
 import sys
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pictures import read_frames
 
-from crazysim import Sim
+from crazysim import Sim, errors
 from crazysim.__main__ import EXTRAS, main
-from crazysim.commands import demo_flight
+from crazysim.commands import (
+    airframe,
+    demo,
+    demo_flight,
+    identify,
+    info,
+    live,
+    replay,
+    show,
+    training,
+    validate,
+)
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
 
@@ -102,11 +116,8 @@ def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, mon
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["--seconds", "0"], "--seconds"),
-        (["--seconds", "inf"], "expected --seconds of at least 0.04, and finite, got inf"),
-        (["--seconds", "nan"], "expected --seconds of at least 0.04, and finite, got nan"),
+        (["--seconds", "0.01"], "expected --seconds of at least 0.04, and finite, got 0.01"),
         (["--out", "flight.txt"], "expected a folder, got 'flight.txt': which is a file"),
-        (["--worlds", "0"], "n_worlds"),
         (["--device", "toaster"], "toaster"),
     ],
 )
@@ -117,6 +128,45 @@ def test_wrong_arguments_are_one_line(arguments, word, tmp_path, monkeypatch, ca
     error = capsys.readouterr().err.strip()
     assert word in error
     assert "\n" not in error
+
+
+def options_with_numbers():
+    """Yield the parser and the action of every option that is a number."""
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    for module in (demo, replay, show, live, training, airframe, identify, validate, info):
+        module.add_parsers(commands)
+    parsers = dict(commands.choices)
+    parsers |= {f"airframe {name}": x for name, x in parsers.pop("airframe")._actions[1].choices.items()}
+    for command, command_parser in parsers.items():
+        for action in command_parser._actions:
+            if action.type is not None and action.type not in (Path, training.parse_seeds):
+                yield pytest.param(command_parser, action, id=f"{command} {action.dest}")
+
+
+@pytest.mark.parametrize(("parser", "action"), list(options_with_numbers()))
+def test_every_number_of_a_command_is_checked_before_its_work(parser, action, capsys):
+    option, takes_any_sign = action.option_strings[0], action.dest == "seed"
+    for text in ("1e3x", "nan", "1e400", *([] if takes_any_sign else ["-3"])):
+        with pytest.raises(SystemExit):
+            parser.parse_args([f"{option}={text}"] if action.nargs is None else [option, *[text] * action.nargs])
+        error = capsys.readouterr().err
+        assert re.search(rf"{option}: expected a .*from .*, got '{text}'. Use for example", error), error
+
+
+def test_worlds_in_other_notation_are_refused_with_the_remedy(capsys):
+    with pytest.raises(SystemExit):
+        main(["demo", "--worlds", "1e3"])
+    error = capsys.readouterr().err
+    assert "--worlds: expected a whole number from 1 to 67,108,864, got '1e3'. Use for example 10." in error
+
+
+def test_a_warning_of_a_command_is_its_message_alone(monkeypatch, capsys):
+    monkeypatch.setattr(info, "run", lambda _: errors.warn("the cache is full"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        main(["info"])
+    assert capsys.readouterr().err == "crazysim: the cache is full\n"
 
 
 def test_the_poles_are_where_drones_can_hit_them():

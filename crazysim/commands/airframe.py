@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crazysim.commands.options import DefaultsFormatter
+from crazysim.commands.options import DefaultsFormatter, number, size
 from crazysim.errors import require
 from crazysim.storage import check_writable, write_file
 
@@ -31,27 +31,29 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=estimate)
     add = parser.add_argument
     add("file", type=Path, help=".toml file to write")
-    add("--mass", type=float, required=True, metavar="KG", help="mass with the battery")
-    add("--propeller", type=float, required=True, metavar="M", help="diameter of the propellers")
-    add("--arm", type=float, metavar="M", help="distance of the rotors from the centre")
-    add("--rotors", type=int, default=4, dest="n_rotors", metavar="N", help="number of rotors on a circle")
+    add("--mass", type=size(1.2), required=True, metavar="KG", help="mass with the battery")
+    add("--propeller", type=size(0.127), required=True, metavar="M", help="diameter of the propellers")
+    add("--arm", type=size(0.12), metavar="M", help="distance of the rotors from the centre")
+    add(
+        "--rotors", type=number(example=4), default=4, dest="n_rotors", metavar="N", help="number of rotors on a circle"
+    )
     add("--layout", default="x", choices=("x", "+"), help="nose between two rotors, or on the first rotor")
     positions_help = "rotors from the centre of mass, m, instead of --arm: X,Y or X,Y,Z each"
     add("--positions", metavar="'X,Y ...'", help=positions_help)
     spins_help = "sense of rotation of each rotor seen from above; by default they alternate from ccw"
     add("--spins", nargs="+", metavar="CCW|CW", help=spins_help)
-    add("--thrust-to-weight", type=float, metavar="RATIO", help="largest thrust of all rotors over weight")
+    add("--thrust-to-weight", type=size(4), metavar="RATIO", help="largest thrust of all rotors over weight")
     motor_table_help = (
         "data sheet of one motor with its propeller instead of --thrust-to-weight, .csv with columns thrust_g or "
         "thrust_n, and if known rpm, torque_nm, power_w"
     )
     add("--motor-table", type=Path, metavar="FILE", help=motor_table_help)
-    add("--pitch", type=float, metavar="M", help="pitch of the propellers; by default half the diameter")
-    add("--inertia", type=float, nargs=3, metavar="KGM2", help="moments of inertia; by default estimated")
-    add("--time-constant", type=float, metavar="S", help="time constant of the rotors; by default estimated")
-    add("--cells", type=int, metavar="N", help="battery cells in series; by default estimated")
-    add("--capacity", type=float, metavar="AH", help="charge of the battery, A h; by default estimated")
-    add("--resistance", type=float, metavar="OHM", help="resistance of the whole battery; by default estimated")
+    add("--pitch", type=size(0.06), metavar="M", help="pitch of the propellers; by default half the diameter")
+    add("--inertia", type=size(0.001), nargs=3, metavar="KGM2", help="moments of inertia; by default estimated")
+    add("--time-constant", type=size(0.03), metavar="S", help="time constant of the rotors; by default estimated")
+    add("--cells", type=number(example=4), metavar="N", help="battery cells in series; by default estimated")
+    add("--capacity", type=size(1.5), metavar="AH", help="charge of the battery, A h; by default estimated")
+    add("--resistance", type=size(0.02), metavar="OHM", help="resistance of the whole battery; by default estimated")
     add("--name", help="name of the airframe; by default the file's")
 
     text = "print what an airframe can do and what it lacks, and draw it"

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from crazysim.commands.options import duration
+from crazysim.commands.options import MAX_WAIT, number
 from crazysim.errors import ConfigError, DivergedError, require
 
 MAX_PORT = 65535
@@ -52,12 +52,12 @@ def add_options(add: Callable[..., Any]) -> None:
     """Add the options of a command that can run on several hosts."""
     coordinator_help = "address of host 0, with which the other hosts connect; auto to read it from SLURM or Open MPI"
     add("--coordinator", metavar="HOST:PORT|auto", help=coordinator_help)
-    add("--host-id", type=int, metavar="I", help="number of this host, from 0")
-    add("--hosts", type=int, metavar="N", help="number of hosts")
+    add("--host-id", type=number(0, example=0), metavar="I", help="number of this host, from 0")
+    add("--hosts", type=number(example=2), metavar="N", help="number of hosts")
     heartbeat_help = "time without a sign of life after which a host counts as lost, s"
-    add("--heartbeat-timeout", type=duration, default=100, metavar="SECONDS", help=heartbeat_help)
+    add("--heartbeat-timeout", type=number(1, MAX_WAIT, 60), default=100, metavar="SECONDS", help=heartbeat_help)
     connect_help = "time within which all hosts must have connected, s"
-    add("--connect-timeout", type=duration, default=300, metavar="SECONDS", help=connect_help)
+    add("--connect-timeout", type=number(1, MAX_WAIT, 60), default=300, metavar="SECONDS", help=connect_help)
 
 
 def has_several_hosts(options: argparse.Namespace) -> bool:

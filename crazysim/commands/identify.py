@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter, count
+from crazysim.commands.options import DefaultsFormatter, number, size
 from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import FITTED_MODELS
 from crazysim.errors import ConfigError, require
@@ -54,7 +54,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
     add("--test", nargs="+", default=[], metavar="LOG", help="held-out logs to report prediction errors on")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
-    add("--mass", type=float, metavar="KG", help="mass; by default the airframe's")
+    add("--mass", type=size(0.03), metavar="KG", help="mass; by default the airframe's")
     add(
         "--dynamics",
         choices=["first_principles", *(x.value for x in FITTED_MODELS)],
@@ -62,8 +62,14 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         help="model to fit",
     )
     network_help = "train a residual wrench with N hidden units, 0 for linear terms"
-    add("--network", type=count(MAX_HIDDEN), metavar="N", help=network_help)
-    add("--iterations", type=count(), default=1000, metavar="N", help="iterations of the training of --network")
+    add("--network", type=number(0, MAX_HIDDEN, 16), metavar="N", help=network_help)
+    add(
+        "--iterations",
+        type=number(example=1000),
+        default=1000,
+        metavar="N",
+        help="iterations of the training of --network",
+    )
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
     add(
         "--columns",

@@ -13,10 +13,11 @@ from crazysim.commands.options import (
     DefaultsFormatter,
     add_page_options,
     add_simulation_options,
-    count,
     has_screen,
     load_policy_and_env,
+    number,
     require_screen,
+    size,
     specified_options,
 )
 from crazysim.errors import ConfigError, require
@@ -35,17 +36,17 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--policy", type=Path, metavar="FOLDER", help=policy_help)
     goals_help = "goals of the policy, one after another: x,y,z in each line, m"
     add("--goals", type=Path, metavar="FILE", help=goals_help)
-    add("--drones", type=count(MAX_DRONES), metavar="N", help="drones in each world; by default 4")
-    add("--worlds", type=count(), default=1, metavar="N", help="number of worlds")
-    add("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")
-    add("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
+    add("--drones", type=number(high=MAX_DRONES), metavar="N", help="drones in each world; by default 4")
+    add("--worlds", type=number(), default=1, metavar="N", help="number of worlds")
+    add("--seconds", type=size(20), help="simulated time, s; by default until all viewers are closed")
+    add("--speed", type=_read_speed, default="1", help="simulated seconds per second, or max for as fast as possible")
     add("--window", action="store_true", help="show a window; by default where there is a screen")
     add("--browser", action="store_true", help="show a page in a browser; by default where there is no screen")
     add("--headless", action="store_true", help="show nothing; requires --seconds")
     add_page_options(parser)
-    add("--fps", type=float, default=50.0, help="pictures per second, sent to viewers")
-    add("--control-freq", type=int, metavar="HZ", help="rate of control steps, Hz; by default 100")
-    add("--freq", type=int, metavar="HZ", help="rate of physics steps, Hz; by default 500")
+    add("--fps", type=size(50), default=50.0, help="pictures per second, sent to viewers")
+    add("--control-freq", type=number(example=100), metavar="HZ", help="rate of control steps, Hz; by default 100")
+    add("--freq", type=number(example=500), metavar="HZ", help="rate of physics steps, Hz; by default 500")
     add("--record", type=Path, metavar="FILE", help="file to record to, for crazysim replay")
     add("--pilot", action="store_true", help="pilot the first drone with arrow keys, W, S, A, D and clicks")
     add("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
@@ -72,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
         viewers = ["window" if has_screen() else "browser"]
     if options.window:
         require_screen("--browser or --headless")
-    speed, is_piloted = _parse_speed(options.speed), options.pilot or options.gamepad
+    speed, is_piloted = options.speed, options.pilot or options.gamepad
     require(
         not options.commands or not is_piloted,
         "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad.",
@@ -129,9 +130,5 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     return PolicyPilot(env, policy, points)
 
 
-def _parse_speed(text: str) -> float | Literal["max"]:
-    """Return a speed: a number, or ``max``."""
-    try:
-        return "max" if text == "max" else float(text)
-    except ValueError:
-        raise ConfigError(f"expected a positive speed or max, got {text!r}") from None
+def _read_speed(text: str) -> float | Literal["max"]:
+    return "max" if text == "max" else size("1, or max")(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -33,39 +34,46 @@ MAX_COUNT = 2**26
 """Largest number of worlds, iterations and so on of an option."""
 MAX_DRONES = 2**16
 """Largest number of drones in a world of an option."""
-
-
-def count(at_most: int = MAX_COUNT) -> Callable[[str], int]:
-    """Return the type of an option that is a whole number; what it counts checks its lower bound."""
-
-    def whole_number(text: str) -> int:
-        n = int(text)
-        require(
-            n <= at_most, f"expected at most {at_most:,}, got {text}. Use a smaller number.", argparse.ArgumentTypeError
-        )
-        return n
-
-    return whole_number
-
-
-def duration(text: str) -> int:
-    """Return an option that is a time to wait, s."""
-    seconds = int(text)
-    require(
-        1 <= seconds <= MAX_WAIT,
-        f"expected 1 to {MAX_WAIT} s, got {text}. Use for example 60.",
-        argparse.ArgumentTypeError,
-    )
-    return seconds
-
-
 MAX_WAIT = 86400
 """Longest time of an option to wait for something, s."""
+MAX_SIZE = 1e9
+"""Largest real number of an option, in its unit; the smallest positive one is its reciprocal."""
+
+
+def number(
+    low: float = 1, high: float = MAX_COUNT, example: float | str = 10, kind: type[int] | type[float] = int
+) -> Callable[[str], Any]:
+    """Return the type of an option that is a number from ``low`` to ``high``; by default a count."""
+
+    def read_number(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            what, style = ("a whole number", ",") if kind is int else ("a number", "g")
+            raise argparse.ArgumentTypeError(
+                f"expected {what} from {low:{style}} to {high:{style}}, got {text!r}. Use for example {example}."
+            )
+        return value
+
+    return read_number
+
+
+def size(example: float | str) -> Callable[[str], Any]:
+    """Return the type of an option that is a positive real number, such as a mass or a duration."""
+    return number(1 / MAX_SIZE, MAX_SIZE, example, float)
+
+
+seed = number(-(2**63), 2**63 - 1, 1)
+"""Type of an option that is a random seed."""
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a command that serves a page."""
-    parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
+    parser.add_argument(
+        "--port", type=number(0, 2**16 - 1, 8080), default=8080, help="port of the page; 0 for any free port"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
 
 

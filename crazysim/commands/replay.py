@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crazysim.commands.options import DefaultsFormatter, add_page_options
+from crazysim.commands.options import DefaultsFormatter, add_page_options, number
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
@@ -15,7 +15,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run)
     add = parser.add_argument
     add("flight", type=Path, help="flight saved by crazysim.media.Flight or recorded live")
-    add("--world", type=int, help="world to show; by default the first that was recorded")
+    add("--world", type=number(0, example=0), help="world to show; by default the first that was recorded")
     add_page_options(parser)
     add("--export", type=Path, metavar="FILE", help="write the page to an .html file instead of serving it")
 

@@ -13,6 +13,7 @@ from crazysim.commands.options import (
     add_page_options,
     add_simulation_options,
     require_screen,
+    size,
     specified_options,
 )
 from crazysim.errors import require
@@ -35,8 +36,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     live_help = "fly in real time while --window or --browser shows it; no report of distances"
     add("--live", action="store_true", help=live_help)
     add("--report", type=Path, metavar="FILE", help="figures to write, .json")
-    add("--seconds", type=float, help="duration of the flight, s; by default the show's")
-    add("--fps", type=float, default=25.0, help="frames per second of the film")
+    add("--seconds", type=size(10), help="duration of the flight, s; by default the show's")
+    add("--fps", type=size(25), default=25.0, help="frames per second of the film")
     add_simulation_options(parser)
 
 

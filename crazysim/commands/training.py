@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands import hosts
-from crazysim.commands.options import DefaultsFormatter, count, load_policy_and_env, specified_options
+from crazysim.commands.options import DefaultsFormatter, load_policy_and_env, number, seed, size, specified_options
 from crazysim.errors import ConfigError, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
@@ -33,22 +33,22 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "default the recipe's teacher, if it has one, which is trained first"
     )
     add("--teacher", metavar="FOLDER", help=teacher_help)
-    add("--seed", type=int, help="random seed; by default 0")
+    add("--seed", type=seed, help="random seed; by default 0")
     seeds_help = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
     add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds_help)
     sweep_help = "values of hyperparameters, each trained with each seed in one program"
     add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep_help)
     worlds_help = "number of parallel worlds of a training, but not of a recipe's teacher; by default the recipe's"
-    add("--worlds", type=count(), help=worlds_help)
+    add("--worlds", type=number(example=1024), help=worlds_help)
     iterations_help = (
         "number of rollouts, each with its updates, but not of a recipe's teacher; by default the recipe's"
     )
-    add("--iterations", type=count(), help=iterations_help)
+    add("--iterations", type=number(), help=iterations_help)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume_help = "continue from the checkpoint in that folder; settings that you leave out are the checkpoint's"
     add("--resume", action="store_true", help=resume_help)
     checkpoint_every_help = "write a checkpoint every so many seconds, in addition to the one at each evaluation"
-    add("--checkpoint-every", type=float, metavar="SECONDS", help=checkpoint_every_help)
+    add("--checkpoint-every", type=size(60), metavar="SECONDS", help=checkpoint_every_help)
     add("--device", help="device: cpu, gpu; by default cpu, or JAX's default platform with --devices")
     devices_help = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
     add("--devices", metavar="all|N|I,J", help=devices_help)
@@ -59,8 +59,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--no-film", action="store_true", help="write no film")
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
-    add("--worlds", type=count(), default=1000, help="number of initial states")
-    add("--seed", type=int, help="seed of other initial states than the held-out ones")
+    add("--worlds", type=number(), default=1000, help="number of initial states")
+    add("--seed", type=seed, help="seed of other initial states than the held-out ones")
     add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
     _add_task_and_device(add)
 
@@ -73,8 +73,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
-    add("--worlds", type=count(), default=4, help="number of worlds side by side")
-    add("--seed", type=int, default=1, help="seed of the initial states")
+    add("--worlds", type=number(), default=4, help="number of worlds side by side")
+    add("--seed", type=seed, default=1, help="seed of the initial states")
     _add_task_and_device(add)
 
 

@@ -35,8 +35,8 @@ def check_minibatches(minibatches: int, n_worlds: int) -> None:
     """Check that minibatches have the same number of worlds."""
     if n_worlds % minibatches:
         raise ConfigError(
-            f"expected minibatches that divide the {n_worlds} worlds, got {minibatches}. Use for "
-            f"example {math.gcd(n_worlds, 8)}."
+            f"expected a number of worlds that {minibatches} minibatches divide, got {n_worlds}. Use for example "
+            f"{-(-n_worlds // minibatches) * minibatches} worlds, or minibatches={math.gcd(n_worlds, 8)}."
         )
 
 

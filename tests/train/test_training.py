@@ -409,7 +409,10 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"expected a folder, got .*file'.* Use another --out"):
         train_quietly(tmp_path / "file", small_config())
-    with pytest.raises(ConfigError, match=r"expected minibatches that divide the 8 worlds, got 7. Use for example 8"):
+    with pytest.raises(
+        ConfigError,
+        match=r"a number of worlds that 7 minibatches divide, got 8. Use for example 14 worlds, or minibatches=8",
+    ):
         train_quietly(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
     with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
         train_quietly(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
