@@ -98,7 +98,7 @@ def run(
         return result
     log(f"wrote {folder / CHECKPOINT_FILE}, {folder / POLICY_FILE}")
     try:
-        plot_curve({config.title: read_curve(folder)}, folder / "curve.png")
+        plot_curve({config.title: read_curve(folder)}, folder / "curve.png", result.env.task.unit)
         plot_episode(result.env, result.policy, folder / "episode.png")
         log(f"wrote {folder / 'curve.png'}, {folder / 'episode.png'}")
     except ImportError as error:
@@ -181,7 +181,7 @@ def run_many(
     for name in configs:
         curves.setdefault(name.rpartition("seed-")[0].strip("-") or config.title, []).append(read_curve(folder / name))
     try:
-        plot_spread(curves, folder / "curve.png")
+        plot_spread(curves, folder / "curve.png", next(iter(results.values())).env.task.unit)
         log(f"wrote {folder / 'curve.png'}")
     except ImportError as error:
         log(f"no plot: {error}")

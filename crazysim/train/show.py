@@ -35,13 +35,14 @@ SUCCESS_LIMITS = (-2, 102)
 """Limits of axes with a success, %."""
 
 
-def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
+def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path, unit: str) -> None:
     """Plot success, error and reward terms in the evaluations of trainings.
 
     Args:
         curves: Contents of ``curve.json`` of each run, by the name of the run. Reward terms are plotted for the
             first run only.
         path: Image to write, such as a ``.png``.
+        unit: Unit of the error, ``task.unit``.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -62,7 +63,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     axes[3].plot(steps, [point["reward"] for point in first_curve], "k--", label="sum")
     axes[3].legend(fontsize="small")
     steps_label = "environment steps, millions"
-    labels = ("success, %", "success, %", "mean error", "reward in an episode, by term")
+    labels = ("success, %", "success, %", f"mean error, {unit}", "reward in an episode, by term")
     for axis, x, y in zip(
         axes, (steps_label, "time with compilation, s", steps_label, steps_label), labels, strict=True
     ):
@@ -74,13 +75,14 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     _save_figure(figure, path)
 
 
-def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> None:
+def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path, unit: str) -> None:
     """Plot median, quartiles and extremes of success, error and reward of several trainings over environment steps.
 
     Args:
         groups: Contents of ``curve.json`` of the trainings of each group, such as all seeds of one learning rate. The
             curve of a training that diverged ends earlier; it is included up to its end.
         path: Image to write, such as a ``.png``.
+        unit: Unit of the error, ``task.unit``.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -104,7 +106,7 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> 
             axis.fill_between(plotted_steps, quartile_1, quartile_3, color=line.get_color(), alpha=0.3, linewidth=0)
             axis.fill_between(plotted_steps, minimum, maximum, color=line.get_color(), alpha=0.12, linewidth=0)
     _use_log_scale(axes[1])
-    for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
+    for axis, label in zip(axes, ("success, %", f"mean error, {unit}", "reward in an episode"), strict=True):
         axis.set(xlabel="environment steps, millions", ylabel=label)
     axes[0].set_ylim(SUCCESS_LIMITS)
     axes[0].legend(fontsize="small")

@@ -715,11 +715,14 @@ def test_a_run_finds_its_airframe_from_any_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("n_crashed", [1, 2])
-def test_curves_of_a_race_without_an_error_are_plotted_without_a_warning(n_crashed, tmp_path):
+def test_curves_of_a_race_without_an_error_are_plotted_without_a_warning(n_crashed, tmp_path, monkeypatch):
     """The error is undefined while all drones crash, perhaps to the end, and zero once all have finished."""
     point = {"env_steps": 1.0, "seconds": 1.0, "success": 0.0, "reward": 1.0, "error": np.nan}
     finished = point | {"env_steps": 2.0, "seconds": 2.0, "success": 1.0, "error": 0.0}
     curve = [point] * n_crashed + [finished] * (2 - n_crashed)
-    plot_curve({"race": curve}, tmp_path / "curve.png")
-    plot_spread({"race": [curve, curve]}, tmp_path / "spread.png")
+    labels = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_ylabel", lambda _, text: labels.append(text))
+    plot_curve({"race": curve}, tmp_path / "curve.png", "m")
+    plot_spread({"race": [curve, curve]}, tmp_path / "spread.png", "gates")
+    assert {"mean error, m", "mean error, gates"} < set(labels)
     assert (tmp_path / "curve.png").stat().st_size > 1000 < (tmp_path / "spread.png").stat().st_size

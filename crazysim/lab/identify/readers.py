@@ -13,7 +13,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns, unsigned_name, without_huge_numbers
 from crazysim.lab.identify.repairs import PERIOD_RANGE, align_signs, unwrap_angles
 
@@ -88,10 +88,11 @@ def resample(
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
-    if end - start < dt:
-        raise ConfigError(f"{name}: expected messages at the same times, got none. Log all of them in one flight.")
-    if end - start > 100 * dt * max(len(s.t) for s in sorted_streams.values()):
-        raise ConfigError(f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.")
+    require(end - start >= dt, f"{name}: expected messages at the same times, got none. Log all of them in one flight.")
+    require(
+        end - start <= 100 * dt * max(len(s.t) for s in sorted_streams.values()),
+        f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.",
+    )
     t = start + dt * np.arange(int((end - start) / dt) + 1)
     is_covered = np.ones(len(t), bool)
     for key, s in sorted_streams.items():
@@ -133,11 +134,11 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
         ConfigError: If the file is not a log of this format.
     """
     content = path.read_bytes()
-    if len(content) < 9 or content[0] != 0xBC:
-        raise ConfigError(
-            f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
-            "Tables need the ending .csv or .npz, PX4's logs .ulg, ROS bags .bag, .mcap or .db3."
-        )
+    require(
+        len(content) >= 9 and content[0] == 0xBC,
+        f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
+        "Tables need the ending .csv or .npz, PX4's logs .ulg, ROS bags .bag, .mcap or .db3.",
+    )
     version, n_events = struct.unpack_from("<HH", content, 1)
     if version not in (1, 2):
         raise ConfigError(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim import rotation
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.bags import is_bag, read_bag
 from crazysim.lab.identify.blackbox import find_header, read_blackbox
 from crazysim.lab.identify.columns import KNOWN_COLUMNS, Columns, stack_columns, unsigned_name
@@ -22,6 +22,15 @@ from crazysim.storage import check_file, read_arrays, wrap_read_errors
 
 MAX_LOG_BYTES = 2**31
 """Largest log file, bytes. ROS bags have no limit, since they are not read into memory as a whole."""
+OTHER_FORMATS = {
+    b"\x1f\x8b": ("a gzipped file", "Unpack it with gunzip."),
+    b"BZh": ("a file packed by bzip2", "Unpack it with bunzip2."),
+    b"\xfd7zXZ": ("a file packed by xz", "Unpack it with unxz."),
+    b"\x28\xb5\x2f\xfd": ("a file packed by zstd", "Unpack it with unzstd."),
+    b"\xff\xfe": ("text in UTF-16", "Save it as UTF-8."),
+    b"\xfe\xff": ("text in UTF-16", "Save it as UTF-8."),
+}
+"""First bytes of files that are no logs, but may contain one, what they are, and the remedy."""
 
 
 def read_table(
@@ -66,13 +75,16 @@ def _read_source(
     if is_bag(path) and path.exists():
         with wrap_read_errors(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
             return path.stem, read_bag(path, repairs, columns)
-    if not path.is_file():
-        raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
-    if path.suffix.lower() in (".bbl", ".bfl"):
-        raise ConfigError(
-            f"{path.name}: expected a blackbox log as .csv, got a raw log. Convert it with blackbox_decode, or "
-            f"export it from the Blackbox Explorer."
-        )
+    require(path.is_file(), f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
+    require(
+        path.suffix.lower() not in (".bbl", ".bfl"),
+        f"{path.name}: expected a blackbox log as .csv, got a raw log. Convert it with blackbox_decode, or export it "
+        f"from the Blackbox Explorer.",
+    )
+    with path.open("rb") as file:
+        start = file.read(8)
+    for first_bytes, (got, remedy) in OTHER_FORMATS.items():
+        require(not start.startswith(first_bytes), f"{path.name}: expected a log, got {got}. {remedy}")
     with wrap_read_errors(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix.lower() == ".ulg":
             return path.stem, read_ulog(path, repairs)

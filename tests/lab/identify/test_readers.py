@@ -1,5 +1,9 @@
 """Readers of logs: the files that ``log_files`` writes are read, and damaged files are repaired or refused."""
 
+import bz2
+import gzip
+import lzma
+
 import numpy as np
 import pytest
 from log_files import (
@@ -46,6 +50,26 @@ def test_law_09_a_raw_blackbox_log_gets_the_way_to_a_table(tmp_path, name):
     path.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n" + bytes(100))
     with pytest.raises(ConfigError, match="Convert it with blackbox_decode"):
         read_log(path)
+
+
+TABLE = b"t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv.gz", gzip.compress(TABLE), "gzipped file. Unpack it with gunzip"),
+        ("a.csv", gzip.compress(TABLE), "gzipped file. Unpack it with gunzip"),
+        ("a.csv", bz2.compress(TABLE), "Unpack it with bunzip2"),
+        ("a.csv", lzma.compress(TABLE), "Unpack it with unxz"),
+        ("a.csv", TABLE.decode().encode("utf-16"), "text in UTF-16. Save it as UTF-8"),
+        ("a.csv", b"\xfe\xff" + TABLE.decode().encode("utf-16-be"), "text in UTF-16. Save it as UTF-8"),
+    ],
+)
+def test_law_09_packed_logs_and_other_encodings_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=f"{name}: expected a log, got .*{message}"):
+        read_log(tmp_path / name)
 
 
 def test_pauses_of_a_stream_are_gaps(tmp_path):
