@@ -17,8 +17,8 @@ from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
-from crazysim.envs.state import EnvState, flatten
-from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
+from crazysim.envs.state import NO_EPISODE, EnvState, flatten
+from crazysim.errors import ConfigError, UnknownNameError, not_installed, require
 from crazysim.tables import read_floats
 
 try:
@@ -108,7 +108,7 @@ class DroneParallelEnv(ParallelEnv):
         Returns:
             Observations, rewards, terminations, truncations and infos, by agent.
         """
-        require(self.env_state is not None and self.agents, "expected a running episode, got none. Call reset() first.")
+        require(self.agents, NO_EPISODE)
         self.env_state, results = self._step(self.env_state, self._stack_actions(actions))
         obs, reward, terminated, truncated, info = jax.device_get(results)
         if self.render_mode == "human":
@@ -141,7 +141,8 @@ class DroneParallelEnv(ParallelEnv):
         return self.env.explain()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, and end the episode."""
+        self.env_state, self.agents = None, []
         self.sim.close()
 
     def _advance(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:

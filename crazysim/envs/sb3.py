@@ -17,7 +17,7 @@ from crazysim.arguments import check_arguments
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.rendering import Renderer
-from crazysim.envs.state import EnvState, Obs, check_actions, flatten
+from crazysim.envs.state import NO_EPISODE, EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError, require
 
@@ -101,7 +101,7 @@ class DroneVecEnv(VecEnv):
 
     def step_async(self, actions: ArrayLike) -> None:
         """Store the actions for the next step. (num_envs, n_drones * k)"""
-        require(self.state is not None, "expected a reset before the first step, got none. Call reset().")
+        require(self.state is not None, NO_EPISODE)
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -162,7 +162,8 @@ class DroneVecEnv(VecEnv):
         return self.env.explain()
 
     def close(self) -> None:
-        """Close the window and free the renderers."""
+        """Close the window, free the renderers, and end the episodes."""
+        self.state = self._actions = None
         self.sim.close()
 
     def _reset_state(self, key: Array) -> tuple[EnvState, Obs]:

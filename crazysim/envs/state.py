@@ -27,6 +27,9 @@ PRIVILEGED = "privileged"
 Obs = dict[str, Array]
 """Named observations. (n_worlds, n_drones, k) each, or (n_drones, k) in one world"""
 
+NO_EPISODE = "expected a running episode, got none: it has not begun, has ended, or was closed. Call reset()."
+"""Message about a step without an episode."""
+
 
 class EnvRecord(PyTree):
     """Record that an environment adds to the data of its simulation; ``EnvState`` is its public interface."""

@@ -19,7 +19,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
-from crazysim.envs.state import EnvState, check_actions, read_action
+from crazysim.envs.state import NO_EPISODE, EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError, require, short_repr
@@ -111,7 +111,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             key_seed = seed if seed is not None else int(self.np_random.integers(2**31))
             with announce_if_slow("compiling the environment", "2 to 4 s"):
                 state = self._reset_fn(jax.random.key(key_seed))
-        self._stepper.state, self._outputs = state, self._output(state)
+        self._stepper.state, self._outputs, self.closed = state, self._output(state), False
         obs, _, info = self._outputs
         return self._convert((obs, self._add_final_info(info)))
 
@@ -119,7 +119,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
     def state(self) -> EnvState | None:
         """State of the functional environment; all drones of a world have its reward. None before the first reset."""
         state = self._stepper.state
-        if state is None:
+        if state is None or self._outputs is None:
             return None
         obs, reward, info = self._outputs
         batch_shape = (self.num_envs, self.sim.n_drones)
@@ -143,7 +143,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             actions: Actions in [-1, 1]. (num_envs, k), or (num_envs, n_drones, k) with several drones
         """
-        require(self._outputs is not None, "expected a reset before the first step, got none. Call reset().")
+        require(self._outputs is not None, NO_EPISODE)
         shape = self.action_space.shape or ()
         actions = read_action(actions, shape) if isinstance(actions, jax.Array) else check_actions(actions, shape)
         self._outputs, terminated, truncated = self._stepper(actions)
@@ -200,9 +200,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """Return how a step is executed, as ``Env.explain`` does."""
         return self.env.explain()
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the window."""
-        del kwargs
+    def close_extras(self, **_: Any) -> None:
+        """Close the window, and end the episodes."""
+        self._outputs = None
         self.sim.close()
 
 

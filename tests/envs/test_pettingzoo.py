@@ -86,7 +86,7 @@ def test_an_episode_ends_for_all(env):
         *_, truncated, _ = env.step(zeros(env))
     assert truncated == {"drone_0": True, "drone_1": True}
     assert env.agents == []
-    with pytest.raises(ConfigError, match="expected a running episode, got none"):
+    with pytest.raises(ConfigError, match="expected a running episode, got none: "):
         env.step({})
 
 

@@ -408,6 +408,24 @@ def test_a_process_that_was_forked_after_a_call_of_jax_refuses_with_the_remedy()
     assert [("spawn" in text, "make_vec" in text) for text in texts] == [(True, True)] * len(calls)
 
 
+@pytest.mark.parametrize(
+    ("kind", "action"),
+    [
+        (DroneVectorEnv, np.zeros((1, 4))),
+        (DroneSingleEnv, np.zeros(4)),
+        (DroneParallelEnv, {"drone_0": np.zeros(4)}),
+    ],
+)
+def test_a_closed_environment_steps_after_a_reset_alone(kind, action):
+    closed = kind(env(1))
+    for _ in range(2):
+        closed.reset(seed=0)
+        closed.step(action)
+        closed.close()
+        with pytest.raises(ConfigError, match=r"expected a running episode, got none.*Call reset\(\)"):
+            closed.step(action)
+
+
 @pytest.mark.parametrize("copying", [pickle.dumps, copy.deepcopy])
 @pytest.mark.parametrize("make_one", [sim, env, functools.partial(adapter, DroneVectorEnv),
     functools.partial(adapter, DroneSingleEnv), functools.partial(adapter, DroneParallelEnv)])  # fmt: skip
