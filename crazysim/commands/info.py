@@ -50,7 +50,9 @@ def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of each line and a function that returns the text after the name."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
-    yield "system", lambda: f"{platform.platform()}, {_n_cores()} CPU cores"
+    # Cores that this process may use.
+    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield "system", lambda: f"{platform.platform()}, {n_cores} CPU cores"
     for name in REQUIRED_PACKAGES:
         yield name, lambda name=name: importlib.metadata.version(name)
     yield "extras", _extras
@@ -74,11 +76,6 @@ def _value_or_reason(value: Callable[[], str]) -> str:
 
 def _first_line(text: str) -> str:
     return text.strip().partition("\n")[0][:300]
-
-
-def _n_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _extras() -> str:
@@ -126,14 +123,9 @@ def _cache() -> str:
     if folder is None:
         return "off"
     reason = untrusted_reason(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
-    size = _size_text(folder) if folder.is_dir() else "not there yet"
-    return f"{folder}: {size}" + (f", kernels refused: {reason}" if reason else "")
-
-
-def _size_text(folder: Path) -> str:
-    """Return the total size and the number of the files in a folder, as text."""
     sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
-    return f"{sum(sizes) / 1e6:.1f} MB in {len(sizes)} files"
+    size = f"{sum(sizes) / 1e6:.1f} MB in {len(sizes)} files" if folder.is_dir() else "not there yet"
+    return f"{folder}: {size}" + (f", kernels refused: {reason}" if reason else "")
 
 
 def _rendering() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from crazysim.commands.options import (
     MAX_DRONES,
@@ -39,7 +39,13 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--drones", type=number(high=MAX_DRONES), metavar="N", help="drones in each world; by default 4")
     add("--worlds", type=number(), default=1, metavar="N", help="number of worlds")
     add("--seconds", type=size(20), help="simulated time, s; by default until all viewers are closed")
-    add("--speed", type=_read_speed, default="1", help="simulated seconds per second, or max for as fast as possible")
+    read_speed = size("1, or max")
+    add(
+        "--speed",
+        type=lambda text: text if text == "max" else read_speed(text),
+        default="1",
+        help="simulated seconds per second, or max for as fast as possible",
+    )
     add("--window", action="store_true", help="show a window; by default where there is a screen")
     add("--browser", action="store_true", help="show a page in a browser; by default where there is no screen")
     add("--headless", action="store_true", help="show nothing; requires --seconds")
@@ -128,7 +134,3 @@ def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
     points = None if options.goals is None else read_points(options.goals)
     policy, _, env = load_policy_and_env(options.policy, options.device, options.worlds)
     return PolicyPilot(env, policy, points)
-
-
-def _read_speed(text: str) -> float | Literal["max"]:
-    return "max" if text == "max" else size("1, or max")(text)

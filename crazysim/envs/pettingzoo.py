@@ -18,7 +18,7 @@ from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import NO_EPISODE, EnvState, flatten
-from crazysim.errors import ConfigError, UnknownNameError, not_installed, require
+from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
 from crazysim.tables import read_floats
 
 try:

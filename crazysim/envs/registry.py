@@ -198,7 +198,12 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
         f"Use for example 'two_hoops'.",
     )
     control = enum_member(Control, "control", control).value
-    entry = Entry(_check_class(task), _gymnasium_id(name), control, positive_integer("n_drones", n_drones))
+    entry = Entry(
+        _check_class(task),
+        f"crazysim/{''.join(part.capitalize() for part in name.split('_'))}-v0",
+        control,
+        positive_integer("n_drones", n_drones),
+    )
     TASKS[name] = entry
     _register_with_gymnasium(name, entry)
     return entry.id
@@ -249,10 +254,6 @@ def _check_class(task: object) -> type[Task]:
             f"decorator. Write @dataclass(frozen=True, kw_only=True) above it."
         )
     return task
-
-
-def _gymnasium_id(name: str) -> str:
-    return f"crazysim/{''.join(part.capitalize() for part in name.split('_'))}-v0"
 
 
 def _register_with_gymnasium(name: str, entry: Entry) -> None:

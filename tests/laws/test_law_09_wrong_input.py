@@ -224,7 +224,7 @@ WRONG_CALLS = [
         "expected rgba",
         "got [2.0, 0.0, 0.0, 1.0]",
     ),
-    (lambda sim: draw_points(sim, [0, 0, 0], rgba="red"), "expected rgba as a number or array", "got 'red'"),
+    (lambda sim: draw_points(sim, [0, 0, 0], rgba="red"), "expected rgba as numbers", "got 'red'"),
     (lambda sim: change_material(sim, "led_top", [0], rgba=(np.nan,) * 4), "expected rgba to be from 0 to 1", "nan"),
     (lambda sim: View(rgba="red"), "expected rgba of View as a number or array", "'red'"),
     (lambda sim: View(width=10**9), "width is 1000000000", "at most 16384"),

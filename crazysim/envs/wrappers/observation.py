@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from crazysim.arguments import check_array
 from crazysim.core.data import SimData
@@ -116,12 +115,10 @@ class ObservationNoise(Wrapper):
         keys = jax.vmap(lambda drone: jax.random.fold_in(key, drone))(data.core.drone_id)
         noisy = dict(obs)
         for i, (name, std) in enumerate(sorted(self.std.items())):
-            noisy[name] = obs[name] + std * jax.vmap(lambda key, i=i, x=obs[name]: _draw_normal(key, i, x))(keys)
+            noisy[name] = obs[name] + std * jax.vmap(
+                lambda key, i=i, x=obs[name]: normal(jax.random.fold_in(key, i), x.shape[1:], x.dtype)
+            )(keys)
         return noisy
-
-
-def _draw_normal(key: Array, index: int, template: Array) -> Array:
-    return normal(jax.random.fold_in(key, index), template.shape[1:], template.dtype)
 
 
 class Normalize(Wrapper):
