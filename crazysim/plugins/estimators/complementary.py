@@ -8,12 +8,11 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, drone_array, parameter
+from crazysim.core.plugin import Param, Simulation, drone_array, param, state
 from crazysim.core.settings import default_rates
 from crazysim.core.stage import Stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
@@ -23,7 +22,6 @@ from crazysim.plugins.sensors.barometer import Barometer
 from crazysim.plugins.sensors.flow_deck import TimeOfFlight
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor, rate_in
-from crazysim.pytree import PyTree, leaf
 
 HEIGHT_FREQ = 100
 """Updates of the height per second, Hz (estimator_complementary.c)."""
@@ -34,28 +32,6 @@ CLIMB_DEADBAND = 0.04
 """Largest vertical acceleration that is treated as zero, in units of gravity (position_estimator_altitude.c)."""
 MAX_RANGE_AGE = 0.05
 """Greatest age of a distance to the ground that is used, s (position_estimator_altitude.c)."""
-
-
-class ComplementaryData(PyTree):
-    """The filter of every drone."""
-
-    quat: Array = leaf("drone", 1)
-    """Attitude, body to world, xyzw. (n_worlds, n_drones, 4)"""
-    integral: Array = leaf("drone", 1, (3,))
-    """Integral of the attitude error, times ``ki``, rad/s. (n_worlds, n_drones, 3)"""
-    height: Array = leaf("drone", 1, (1,))
-    """Height, m. (n_worlds, n_drones, 1)"""
-    climb: Array = leaf("drone", 1, (1,))
-    """Rate of change of the height in the last update, m/s. (n_worlds, n_drones, 1)"""
-    inertial_climb: Array = leaf("drone", 1, (1,))
-    """Leaky integral of the vertical acceleration, m/s. (n_worlds, n_drones, 1)"""
-    over_surface: Array = leaf("drone", 1, (1,))
-    """1 once a distance to the ground has been measured, after which pressure is not used; else 0.
-    (n_worlds, n_drones, 1)"""
-    kp: Array = leaf("parameter", 1, (1,))
-    """Gain of the attitude error, 1/s. (1,)"""
-    ki: Array = leaf("parameter", 1, (1,))
-    """Gain of the integral of the attitude error, 1/s^2. (1,)"""
 
 
 class Complementary(Estimator):
@@ -72,10 +48,23 @@ class Complementary(Estimator):
     _: dataclasses.KW_ONLY
     freq: int = 250
     """Updates of the attitude per second, Hz, a divisor of ``sim.freq``."""
-    kp: ArrayLike = parameter(default=0.4, low=0.0)
-    """Gain of the attitude error, 1/s. () or (n_worlds, n_drones)"""
-    ki: ArrayLike = parameter(default=0.001, low=0.0)
-    """Gain of the integral of the attitude error, 1/s^2. () or (n_worlds, n_drones)"""
+    kp: Param = param(default=0.4, low=0.0)
+    """Gain of the attitude error, 1/s. (1,)"""
+    ki: Param = param(default=0.001, low=0.0)
+    """Gain of the integral of the attitude error, 1/s^2. (1,)"""
+    quat: Array = state((4,))
+    """Attitude, body to world, xyzw. (n_worlds, n_drones, 4)"""
+    integral: Array = state((3,))
+    """Integral of the attitude error, times ``ki``, rad/s. (n_worlds, n_drones, 3)"""
+    height: Array = state()
+    """Height, m. (n_worlds, n_drones, 1)"""
+    climb: Array = state()
+    """Rate of change of the height in the last update, m/s. (n_worlds, n_drones, 1)"""
+    inertial_climb: Array = state()
+    """Leaky integral of the vertical acceleration, m/s. (n_worlds, n_drones, 1)"""
+    over_surface: Array = state()
+    """1 once a distance to the ground has been measured, after which pressure is not used; else 0.
+    (n_worlds, n_drones, 1)"""
     name: str = "complementary"
 
     @classmethod
@@ -86,7 +75,7 @@ class Complementary(Estimator):
     def kinds(self) -> tuple[type[Sensor], ...]:
         return Barometer, TimeOfFlight
 
-    def record(self, sim: Simulation) -> ComplementaryData:
+    def bind(self, sim: Simulation) -> Complementary:
         self.check_sensors(sim)
         if not self.aiding_sensors or len({type(sensor) for sensor in self.aiding_sensors}) < len(self.aiding_sensors):
             classes = [type(sensor).__name__ for sensor in self.aiding_sensors]
@@ -98,7 +87,7 @@ class Complementary(Estimator):
                 f"expected control at the level 'attitude' or below with {self.name!r}, which estimates no position, "
                 f"got 'state'. Use estimator=\"kalman\"."
             )
-        return self.fill_record(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
+        return self.with_arrays(sim, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period = freq // rate_in(self, freq)
@@ -136,11 +125,10 @@ class Complementary(Estimator):
         return {"pos": pos, "vel": vel, "quat": rotation.safe_normalize(record.quat, s.quat)}
 
     def reset_episode(self, data: SimData) -> SimData:
-        s, record = data.states, self.read(data)
-        climb = s.vel[2:]
-        return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=climb, inertial_climb=climb))
+        s, climb = data.states, data.states.vel[2:]
+        return self.write(data, self.replace(quat=s.quat, height=s.pos[2:], climb=climb, inertial_climb=climb))
 
-    def _height(self, data: SimData, record: ComplementaryData, dt: float) -> tuple[Array, Array]:
+    def _height(self, data: SimData, record: Complementary, dt: float) -> tuple[Array, Array]:
         """Return the new height of one drone, m, and the new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         new_height = height

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation
+from crazysim.core.plugin import Simulation, nested, state
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
@@ -19,22 +19,30 @@ from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor, rate_in
-from crazysim.pytree import PyTree, device_array
-
-R = TypeVar("R", bound=PyTree)
+from crazysim.pytree import device_array
 
 
 class ErrorStateFilter(Estimator):
     """Base class of filters with error states.
 
-    A subclass also defines ``update_estimate`` and ``restarted_estimate``. Its record has the fields ``estimate``,
-    ``accel`` and ``gyro``, sums of the inertial measurements since the last prediction, and the fields ``used_steps``
-    and ``failures``, which ``initial_record`` describes.
+    A subclass also defines ``update_estimate`` and ``restarted_estimate``.
     """
 
     _: dataclasses.KW_ONLY
     freq: int = 100
     """Predictions per second, Hz, a divisor of ``sim.freq``."""
+    estimate: Any = nested(default=None)
+    """The estimate, an ``Estimate``."""
+    accel: Array = state((3,))
+    """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
+    gyro: Array = state((3,))
+    """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    used_steps: Array = state(("sensors",), dtype=np.int32)
+    """Step in which the latest used measurement of each sensor was taken; -1 before the first.
+    (n_worlds, n_drones, n_sensors)"""
+    failures: Array = state(dtype=np.int32)
+    """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
+    name: str = "filter"
 
     @classmethod
     def default(cls) -> Self:
@@ -58,22 +66,9 @@ class ErrorStateFilter(Estimator):
         """
         raise NotImplementedError
 
-    def initial_record(self, sim: Simulation, record_type: type[R], estimate: Estimate, **fields: Any) -> R:
-        """Return the record before the first step.
-
-        ``used_steps`` has the step in which the latest used measurement of each sensor was taken; here -1. ``failures``
-        counts the restarts of the filter after the estimate left its bounds; here 0.
-
-        Args:
-            sim: The simulation.
-            record_type: Class of the record.
-            estimate: Estimate of all drones.
-            fields: Other fields, see ``fill_record``.
-        """
-        shape = sim.data.states.pos.shape[:2]
-        used_steps = device_array(np.full((*shape, len(self.aiding_sensors)), -1), np.int32)
-        failures = device_array(np.zeros((*shape, 1)), np.int32)
-        return self.fill_record(sim, record_type, estimate=estimate, used_steps=used_steps, failures=failures, **fields)
+    def with_arrays(self, sim: Simulation, **values: Any) -> Self:
+        used_steps = np.full((*sim.data.states.pos.shape[:2], len(self.aiding_sensors)), -1)
+        return super().with_arrays(sim, used_steps=device_array(used_steps, np.int32), **values)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
         """Return the number of steps between predictions, and a function that returns True in steps with a prediction.
@@ -93,13 +88,12 @@ class ErrorStateFilter(Estimator):
 
     def restart_stage(self) -> Stage:
         """Return the stage that restarts the filter where its estimate has left its bounds."""
-        return Stage(self._restart, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
+        return self.stage(self._restart, when=lambda data: ~self.is_valid(self.read(data).estimate))
 
     def add_sample(self, data: SimData) -> SimData:
         """Add the latest inertial measurement of one drone to the sums."""
-        record = self.read(data)
         gyro, accel = self.inertial(data)
-        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
+        return self.write(data, self.replace(accel=self.accel + accel, gyro=self.gyro + gyro))
 
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
         """Return a function that returns True if the latest measurement of aiding sensor k was not used yet."""
@@ -118,8 +112,6 @@ class ErrorStateFilter(Estimator):
 
     def _restart(self, data: SimData) -> SimData:
         """Restart the filter of one drone with a level attitude at the origin."""
-        record = self.read(data)
-        pos, quat = jnp.zeros_like(record.estimate.pos), jnp.zeros_like(record.estimate.quat).at[3].set(1.0)
-        return self.write(
-            data, record.replace(estimate=self.restarted_estimate(data, pos, quat), failures=record.failures + 1)
-        )
+        pos, quat = jnp.zeros_like(self.estimate.pos), jnp.zeros_like(self.estimate.quat).at[3].set(1.0)
+        estimate = self.restarted_estimate(data, pos, quat)
+        return self.write(data, self.replace(estimate=estimate, failures=self.failures + 1))

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, drone_array
+from crazysim.core.plugin import Simulation, drone_array, state
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state, inertial_path, updates
@@ -35,7 +35,6 @@ from crazysim.plugins.sensors.magnetometer import Magnetometer
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.plugins.sensors.triad import Triad
-from crazysim.pytree import PyTree, leaf
 
 INITIAL_STD = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad. These are assumptions: the estimate
@@ -47,26 +46,6 @@ MIN_STD = 1e-3
 """Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and for a magnetometer as a fraction
 of the field. For pressures the limit is 100 times as large, 0.1 Pa, and for sweeps of a ``Lighthouse`` a tenth, 1e-4
 rad. This is an assumption, for sensors without noise and for float32."""
-
-
-class ESKFData(PyTree):
-    """The filter of every drone."""
-
-    estimate: Estimate
-    """The estimate, with biases."""
-    accel: Array = leaf("drone", 1, (3,))
-    """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
-    gyro: Array = leaf("drone", 1, (3,))
-    """Sum of half the angular velocity at the last prediction and the angular velocities since then, for the
-    trapezoidal rule, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    used_steps: Array = leaf("drone", 1)
-    """Step in which the latest used measurement of each sensor was taken; -1 before the first.
-    (n_worlds, n_drones, n_sensors)"""
-    failures: Array = leaf("drone", 1)
-    """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
-    paths: Array | None = leaf("drone", 2)
-    """Inertial paths to the last prediction, from the times at which the measurements in transit were taken. They are
-    grouped by sensor, newest first; None if no sensor is late. (n_worlds, n_drones, n_rows, 10)"""
 
 
 class ESKF(ErrorStateFilter):
@@ -87,6 +66,12 @@ class ESKF(ErrorStateFilter):
     """Magnitude of a position coordinate beyond which the estimate has diverged, m."""
     max_vel: float = setting(default=100.0, positive=True)
     """Magnitude of the velocity along an axis beyond which the estimate has diverged, m/s."""
+    gyro: Array = state((3,))
+    """Sum of half the angular velocity at the last prediction and the angular velocities since then, for the
+    trapezoidal rule, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    paths: Array | None = state(("rows", len(inertial_path.EMPTY_PATH_ROW)), optional=True)
+    """Inertial paths to the last prediction, from the times at which the measurements in transit were taken. They are
+    grouped by sensor, newest first; None if no sensor is late. (n_worlds, n_drones, n_rows, 10)"""
     reset_before: ClassVar[str | None] = "integration"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
     state before that step."""
@@ -96,20 +81,19 @@ class ESKF(ErrorStateFilter):
     def kinds(self) -> tuple[type[Sensor], ...]:
         return tuple(UPDATE_FNS)
 
-    def record(self, sim: Simulation) -> ESKFData:
-        self.check_sensors(sim)
-        n = error_state.N_BIASED
+    def bind(self, sim: Simulation) -> ESKF:
         quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
-        cov = drone_array(sim, 0.0, n * (n + 1) // 2)
+        cov = drone_array(sim, 0.0, error_state.N_BIASED * (error_state.N_BIASED + 1) // 2)
+        self.check_sensors(sim)
         n_rows = sum(_n_rows_in_transit(sensor, sim.data) for sensor in self.aiding_sensors)
         row = inertial_path.EMPTY_PATH_ROW
         paths = drone_array(sim, row, n_rows, len(row)) if n_rows else None
-        return self.initial_record(sim, ESKFData, Estimate(zero, zero, quat, zero, cov, zero, zero), paths=paths)
+        return self.with_arrays(sim, estimate=Estimate(zero, zero, quat, zero, cov, zero, zero), paths=paths)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period, is_due = self.prediction_schedule(freq)
         return [
-            ("sample", Stage(self.add_sample, "drone")),
+            ("sample", self.stage(self.add_sample)),
             ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
             *(
                 (
@@ -143,13 +127,13 @@ class ESKF(ErrorStateFilter):
         s = data.states
         estimate = self._initial_estimate(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
         half_rate = 0.5 * (s.ang_vel + estimate.gyro_bias)  # type: ignore[operator]
-        return self.write(data, self.read(data).replace(estimate=estimate, gyro=half_rate))
+        return self.write(data, self.replace(estimate=estimate, gyro=half_rate))
 
     def _initial_estimate(
         self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]
     ) -> Estimate:
         """Return the estimate of one drone before any measurement, with the mean biases of its ``IMU``."""
-        imu = self.imu.read(data)
+        imu = self.imu(data)
         bias_stds = [
             x
             for triad in (imu.accel, imu.gyro)
@@ -161,7 +145,7 @@ class ESKF(ErrorStateFilter):
     def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
-            record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
+            record, imu, dt = self.read(data), self.imu(data), period / data.core.freq
             half_rate = 0.5 * self.inertial(data)[0]
             accel, gyro = record.accel / period, (record.gyro - half_rate) / period
             noise_variances = [0.5 / dt * triad.noise**2 for triad in (imu.accel, imu.gyro)]
@@ -204,7 +188,7 @@ class ESKF(ErrorStateFilter):
         first = sum(counts[: self.aiding_sensors.index(sensor)])
         return first, first + counts[self.aiding_sensors.index(sensor)]
 
-    def update_estimate(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
+    def update_estimate(self, sensor: Sensor, data: SimData, record: ESKF) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor.
 
         The estimate is moved to the time at which the measurement was taken, updated, and moved back.
@@ -215,7 +199,7 @@ class ESKF(ErrorStateFilter):
         since_prediction = (taken_step - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq
         if not sensor.is_late:
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
-            past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
+            past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, past_estimate))
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
         interval, (first, end) = data.core.freq // sensor.rate(data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
@@ -225,7 +209,7 @@ class ESKF(ErrorStateFilter):
         path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
         path_back = path.without_biases(estimate).reverse()
         past_estimate = inertial_path.propagate_along(estimate, path_back, gravity)
-        past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
+        past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, past_estimate))
         return inertial_path.propagate_along(past_estimate, path.without_biases(past_estimate), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:

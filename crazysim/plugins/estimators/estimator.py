@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 from jax import Array
@@ -24,14 +24,14 @@ CONTROLLER_STAGES = ("state_controller", "attitude_controller", "body_rate_contr
 class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
-    A subclass defines ``kinds``, ``record``, ``reset_episode``, ``filter_stages`` and ``estimated_states``. With
+    A subclass defines ``kinds``, ``reset_episode``, ``filter_stages`` and ``estimated_states``. With
     ``control``, controllers use the estimate in place of the state. Environments that observe measured states observe
     the estimate, also without ``control``.
     """
 
     sensors: Sequence[Sensor]
     """An ``IMU`` and other sensors. Add them to the simulation before the estimator, except with
-    ``Sim(estimator=...)``, which adds them itself."""
+    ``Sim(estimator=...)``, which adds them itself. In ``data.plugins``, their names."""
     control: bool = True
     """True if the controllers of the simulation use the estimate."""
     reset_before: ClassVar[str | None] = "increment_steps"
@@ -43,6 +43,8 @@ class Estimator(Plugin):
     def __post_init__(self) -> None:
         """Check that ``sensors`` is a list of sensors."""
         super().__post_init__()
+        if self.is_bound:
+            return
         if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
             example = f"{type(self).__name__}([IMU(), MotionCapture()])"
             raise ConfigError(f"expected sensors as a list, got {short_repr(self.sensors)}. Use {example}, say.")
@@ -75,10 +77,10 @@ class Estimator(Plugin):
         """Return the estimated fields of ``data.states`` of one drone; the ``IMU`` measures the others."""
         raise NotImplementedError
 
-    @property
-    def imu(self) -> IMU:
-        """The inertial measurement unit."""
-        return next(sensor for sensor in self.sensors if isinstance(sensor, IMU))
+    def imu(self, data: SimData) -> IMU:
+        """Return the inertial measurement unit in ``data.plugins``."""
+        names: list[Any] = [getattr(sensor, "name", sensor) for sensor in self.sensors]
+        return next(data.plugins[name] for name in names if isinstance(data.plugins[name], IMU))
 
     @property
     def aiding_sensors(self) -> list[Sensor]:
@@ -102,16 +104,20 @@ class Estimator(Plugin):
         s, estimate = data.states, self.estimated_states(data)
         is_first_step = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
         states = {name: jnp.where(is_first_step, getattr(s, name), value) for name, value in estimate.items()}
-        return self.imu.measured_states(data) | states
+        return self.imu(data).measured_states(data) | states
 
     def observations(self, data: SimData) -> dict[str, Array]:
         return self.measured_states(data)
 
     def inertial(self, data: SimData) -> tuple[Array, Array]:
         """Return measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each"""
-        gyro, accel = jnp.split(self.imu.latest(data), 2)
-        mounting = self.imu.read(data).quat
-        return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
+        imu = self.imu(data)
+        gyro, accel = jnp.split(imu.latest(data), 2)
+        return rotation.rotate(imu.quat, gyro), rotation.rotate(imu.quat, accel)
+
+    def with_arrays(self, sim: Simulation, **values: Any) -> Self:
+        self.check_sensors(sim)
+        return super().with_arrays(sim, sensors=tuple([sensor.name for sensor in self.sensors]), **values)
 
     def check_plugins(self, sim: Simulation) -> None:
         self.check_sensors(sim)

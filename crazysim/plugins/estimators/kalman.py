@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, drone_array, parameter
-from crazysim.core.settings import setting
+from crazysim.core.plugin import Param, Simulation, drone_array, param, state
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state, updates
@@ -24,7 +23,7 @@ from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFli
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 FIRMWARE_RATE = 1000
 """Rate of the loop of the firmware's filter, Hz; every loop adds process noise (estimator_kalman.c)."""
@@ -44,30 +43,6 @@ Std = Mapping[str, Array]
 """Standard deviations by the names of ``MEASUREMENT_STD``."""
 
 
-class KalmanData(PyTree):
-    """The filter of every drone."""
-
-    estimate: Estimate
-    """The estimate."""
-    previous_quat: Array = leaf("drone", 1)
-    """Attitude at the end of the previous step, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
-    accel: Array = leaf("drone", 1, (3,))
-    """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
-    gyro: Array = leaf("drone", 1, (3,))
-    """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
-    used_steps: Array = leaf("drone", 1)
-    """Step in which the latest used measurement of each sensor was taken; -1 before the first.
-    (n_worlds, n_drones, n_sensors)"""
-    failures: Array = leaf("drone", 1)
-    """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
-    accel_noise: Array = leaf("parameter", 1, (3,))
-    """Standard deviation of accelerations in a loop of the firmware, body frame, m/s^2. (3,)"""
-    gyro_noise: Array = leaf("parameter", 1, (3,))
-    """Standard deviation of angular velocities in a loop of the firmware, body frame, rad/s. (3,)"""
-    deviations: Array = leaf("parameter", 1)
-    """Standard deviations that the filter assumes for the measurements, in the order of ``MEASUREMENT_STD``. (n,)"""
-
-
 class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
@@ -81,49 +56,44 @@ class Kalman(ErrorStateFilter):
     all_axes: bool = False
     """True to use the accelerometer along all axes, for any airframe and in wind; False for the firmware's method,
     which assumes that the force of the rotors is the only one."""
-    accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
-    """Standard deviation of accelerations in a loop of the firmware, body frame, m/s^2.
-    (3,) or (n_worlds, n_drones, 3)"""
-    gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
-    """Standard deviation of angular velocities in a loop of the firmware, body frame, rad/s.
-    (3,) or (n_worlds, n_drones, 3)"""
-    deviations: Mapping[str, float] = setting(default_factory=dict, positive=True)
-    """Standard deviations that differ from ``MEASUREMENT_STD``, by the names in it."""
+    accel_noise: Param = param(default=(0.5, 0.5, 1.0), core=(3,), low=0.0)
+    """Standard deviation of accelerations in a loop of the firmware, body frame, m/s^2. (3,)"""
+    gyro_noise: Param = param(default=(0.1, 0.1, 0.1), core=(3,), low=0.0)
+    """Standard deviation of angular velocities in a loop of the firmware, body frame, rad/s. (3,)"""
+    deviations: Mapping[str, float] | None = param(default=None, core=("measurements",), positive=True, shapes=((),))
+    """Standard deviations that differ from ``MEASUREMENT_STD``, by the names in it; in ``data.plugins``, all of them
+    in its order. (n,)"""
+    previous_quat: Array = state((4,))
+    """Attitude at the end of the previous step, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
     name: str = "kalman"
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
         return tuple(UPDATE_FNS)
 
-    def record(self, sim: Simulation) -> KalmanData:
-        self.check_sensors(sim)
-        if unknown_names := self.deviations.keys() - MEASUREMENT_STD.keys():
+    def bind(self, sim: Simulation) -> Kalman:
+        if unknown_names := (self.deviations or {}).keys() - MEASUREMENT_STD.keys():
             raise ConfigError(
                 f"expected deviations of {', '.join(MEASUREMENT_STD)}, got {', '.join(map(repr, unknown_names))}"
             )
-        deviations = MEASUREMENT_STD | dict(self.deviations)
-        quat = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
-        zeros = drone_array(sim, 0.0, 3)
+        deviations = list((MEASUREMENT_STD | dict(self.deviations or {})).values())
+        quat, zeros = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = np.diag(np.square(INITIAL_STD))[np.triu_indices(error_state.N)]
-        return self.initial_record(
-            sim,
-            KalmanData,
-            Estimate(zeros, zeros, quat, zeros, drone_array(sim, cov, *cov.shape), None, None),
-            previous_quat=quat,
-            deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), quat.dtype),
-        )
+        estimate = Estimate(zeros, zeros, quat, zeros, drone_array(sim, cov, *cov.shape), None, None)
+        deviation_array = device_array(np.array(deviations), quat.dtype)
+        return self.with_arrays(sim, estimate=estimate, previous_quat=quat, deviations=deviation_array)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         period, is_due = self.prediction_schedule(freq)
         return [
-            ("sample", Stage(self.add_sample, "drone")),
+            ("sample", self.stage(self.add_sample)),
             ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
-            ("noise", Stage(self._add_noise, "drone")),
+            ("noise", self.stage(self._add_noise)),
             *self.fusion_stages(),
-            ("finalize", Stage(self._finalize, "drone", self._is_updated)),
+            ("finalize", self.stage(self._finalize, when=self._is_updated)),
             ("restart", self.restart_stage()),
             # The last stage has the name of the estimator.
-            ("", Stage(self._store_attitude, "drone")),
+            ("", self.stage(self._store_attitude)),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
@@ -132,9 +102,9 @@ class Kalman(ErrorStateFilter):
         return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
 
     def reset_episode(self, data: SimData) -> SimData:
-        s, record = data.states, self.read(data)
+        s = data.states
         estimate = error_state.initial_estimate(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
-        return self.write(data, record.replace(estimate=estimate, previous_quat=s.quat))
+        return self.write(data, self.replace(estimate=estimate, previous_quat=s.quat))
 
     def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
@@ -150,16 +120,13 @@ class Kalman(ErrorStateFilter):
 
     def _add_noise(self, data: SimData) -> SimData:
         """Add the process noise of as many loops of the firmware as a step lasts."""
-        record, dt = self.read(data), 1 / FIRMWARE_RATE
-        accel, n_loops = record.accel_noise, FIRMWARE_RATE / data.core.freq
-        deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * record.gyro_noise])
-        return self.write(
-            data, record.replace(estimate=error_state.add_noise(record.estimate, n_loops * deviations**2))
-        )
+        dt, n_loops, accel = 1 / FIRMWARE_RATE, FIRMWARE_RATE / data.core.freq, self.accel_noise
+        deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * self.gyro_noise])
+        return self.write(data, self.replace(estimate=error_state.add_noise(self.estimate, n_loops * deviations**2)))
 
-    def update_estimate(self, sensor: Sensor, data: SimData, record: KalmanData) -> Estimate:
+    def update_estimate(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
         rot, std = rotation.matrix(record.previous_quat), dict(zip(MEASUREMENT_STD, record.deviations, strict=True))
-        return UPDATE_FNS[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
+        return UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, record.estimate, rot, std)
 
     def _is_updated(self, data: SimData) -> Array:
         """Return True where measurements of this step have changed the attitude of one drone. ()"""
@@ -167,13 +134,11 @@ class Kalman(ErrorStateFilter):
 
     def _finalize(self, data: SimData) -> SimData:
         """Move the attitude error of one drone into its attitude."""
-        record = self.read(data)
-        return self.write(data, record.replace(estimate=error_state.finalize(record.estimate)))
+        return self.write(data, self.replace(estimate=error_state.finalize(self.estimate)))
 
     def _store_attitude(self, data: SimData) -> SimData:
         """Store the attitude of one drone at the end of the step."""
-        record = self.read(data)
-        return self.write(data, record.replace(previous_quat=record.estimate.quat))
+        return self.write(data, self.replace(previous_quat=self.estimate.quat))
 
     def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
         return error_state.initial_estimate(pos, jnp.zeros_like(pos), quat, INITIAL_STD)

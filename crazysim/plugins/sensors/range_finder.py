@@ -55,8 +55,8 @@ class RangeFinder(Plugin):
     direction: Array = derived(("rays", 3), scope="shared")
     """Unit directions of the rays, body frame. (n_rays, 3)"""
     distance: Array = state(("rays",))
-    """Distance along each ray, m; ``max_range`` where nothing is nearer, and before the first measurement. (n_worlds,
-    n_drones, n_rays)"""
+    """Distance along each ray, m; ``max_range`` where nothing is nearer, and before the first measurement.
+    (n_worlds, n_drones, n_rays)"""
     taken_step: Array = state(dtype=np.int32)
     """Step in which the distances were measured, negative before the first one. (n_worlds, n_drones, 1)"""
     name: str = "range_finder"
