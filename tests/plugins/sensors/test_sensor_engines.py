@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import build_stagewise_step, hover_rotor_state, with_states
+from cases import build_stagewise_step, count_documented_arrays, hover_rotor_state, with_states
 from sweep import REQUIRED_BY, SENSORS
 
 from crazysim import Sim
@@ -87,6 +87,15 @@ def test_the_age_of_every_sensor_is_infinite_until_it_has_measured():
     sim.reset(np.array([False, True]))
     assert ages(0) == last
     assert set(ages(1).values()) == {np.inf}
+
+
+def test_docstrings_of_sensors_give_the_shapes(sim):
+    sizes = {"n_worlds": 3, "n_drones": 2, "n_rotors": 4, "n_rays": 6, "n_anchors": 2, "n_stations": 2, "n_diodes": 2}
+    for name in SENSORS:
+        sensor = sim.data.plugins[name]
+        sizes["k"] = sum(sensor.channels.values())
+        sizes["n_rows"] = 0 if sensor.samples.queue is None else sensor.samples.queue.shape[2]
+        assert count_documented_arrays(sensor, **sizes) == len(jax.tree.leaves(sensor))
 
 
 def test_every_sensor_is_fused(sim):
