@@ -171,9 +171,12 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         _check_rotor_order(logs, base)
     flight_mass = float(base.value("rigid_body.mass")) if mass is None else float(mass)
     params = Model.create(base, flight_mass).params
-    thrust_factor = float(_fit_forces(logs, params)[0][0])
-    rotation_fit = fast_rotation(logs, params, thrust_factor)
-    logs = [aligned(log, delay) for log, delay in zip(logs, rotation_fit.delays, strict=True)]
+    aligned_logs = logs
+    for _ in range(2):  # the delay changes the thrust factor, which is a factor of the moments of inertia
+        thrust_factor = float(_fit_forces(aligned_logs, params)[0][0])
+        rotation_fit = fast_rotation(logs, params, thrust_factor)
+        aligned_logs = [aligned(log, delay) for log, delay in zip(logs, rotation_fit.delays, strict=True)]
+    logs = aligned_logs
     force_values, force_spread = _fit_forces(logs, params)
     thrust_factor = float(force_values[0])
     force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force_values[0])
