@@ -34,10 +34,11 @@ from crazysim.rotation import rotate, rotate_inverse
 
 WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
-SLOW_TORQUE_DELAY_STD = 0.2
-"""Standard deviation of delays for slow torques, the third regression of ``identify``, samples. In simulated flights
-at 100 Hz whose commands change at samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would
-cause, for an unknown reason."""
+SLOW_TORQUE_DELAY_STD = 0.3
+"""Standard deviation of delays for slow torques, the third regression of ``identify``, samples. Rotor speeds have corners
+where commands change at samples, which integrals by curves through neighbouring samples round off. In simulated flights
+at 100 Hz torques per velocity then had the errors of a delay of 0.4 to 0.5 samples, and of 0.05 to 0.1 with integrals
+that keep corners; where commands changed between samples, the errors of the two were 0 and 0.2."""
 MAX_FACTOR = 10.0
 """Largest factor of the airframe's curves and moments of inertia; a fit with a larger factor is an error. Rotor
 speeds are checked to be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""

@@ -41,10 +41,9 @@ MAX_DELAY = 0.04
 SAMPLING_ERROR = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks. In simulated flights without noise, at
 100 and 500 Hz, it changed moments of inertia by 0.04 to 0.12%."""
-YAW_DELAY_STD = 0.02
-"""Standard deviation of the delay of yaw torques, samples. A first-order motor whose command changes at a sample has a
-corner there, which quadrature turns into a delay of dt^2 / (12 time constant): 0.04 samples for 0.01 s and a constant
-of 0.02 s."""
+YAW_DELAY_STD = 0.03
+"""Standard deviation of the delay of yaw torques, samples. Where the command of a motor changes at a sample, its speed
+has a corner that quadrature rounds off: in simulated flights at 100 Hz, delays came out 0.01 to 0.04 samples short."""
 MEDIAN_OVER_MEAN = 1.2533
 """Ratio of the standard deviations of median and mean of normal numbers, the root of pi / 2."""
 MAX_ITERATIONS = 50
@@ -110,7 +109,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     chance = deviation_of_sum(slow_influences - influences)
     # What exceeds chance is bias. It grows with the square of the frequency, so a quarter of it is in both bands.
     bias = 4 / 3 * np.sqrt(np.maximum(change**2 - np.nan_to_num(chance) ** 2, 0.0))
-    yaw_change = _solve_logs(log_terms, FAST_WIDTH, YAW_DELAY_STD)[0] - medians
+    yaw_change = _solve_logs(log_terms, FAST_WIDTH, has_corners=True)[0] - medians
     deviations = np.sqrt(deviation_of_sum(influences) ** 2 + bias**2 + yaw_change**2)
     inertia = moments * values[:3]
     relative_deviations = deviations[:2] / [roll, pitch]
@@ -301,14 +300,14 @@ class _Block(NamedTuple):
 
 
 def _solve_logs(
-    logs: Sequence[_LogTerms], fast_width: float, yaw_delay: float = 0.0
+    logs: Sequence[_LogTerms], fast_width: float, *, has_corners: bool = False
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return medians over all blocks, (5,), delays of the logs, (n_logs,), and influences of pieces. (n_pieces, 5)
 
-    The influences are those on the medians, and on the mean of the delays. ``yaw_delay`` is an additional delay of yaw
-    torques, samples.
+    The influences are those on the medians, and on the mean of the delays. With ``has_corners``, rotor speeds are
+    straight lines between samples for yaw, with ``YAW_DELAY_STD``: as if all their curvature were corners at samples.
     """
-    blocks = [_solve_blocks(log, fast_width, yaw_delay) for log in logs]
+    blocks = [_solve_blocks(log, fast_width, has_corners) for log in logs]
     all_blocks = list(itertools.chain.from_iterable(blocks))
     if not all_blocks:
         raise ConfigError(f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
@@ -332,7 +331,7 @@ def _solve_logs(
     )
 
 
-def _solve_blocks(log_terms: _LogTerms, fast_width: float, yaw_delay: float) -> list[_Block]:
+def _solve_blocks(log_terms: _LogTerms, fast_width: float, has_corners: bool) -> list[_Block]:
     """Return the solution of each block of a log that has a second or more outside of gaps."""
     dt, n, margin = log_terms.dt, len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
     is_kept = np.ones(n, bool)
@@ -350,7 +349,9 @@ def _solve_blocks(log_terms: _LogTerms, fast_width: float, yaw_delay: float) -> 
             delay -= float(np.mean([fit[0][1] / fit[0][0] for fit in tilt_fits]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
         (roll, roll_variance, roll_influences), (pitch, pitch_variance, pitch_influences) = tilt_fits
-        yaw, yaw_variance, yaw_influences = _solve_samples(log_terms, 2, delay + yaw_delay * dt, indices, fast_width)
+        yaw, yaw_variance, yaw_influences = _solve_samples(
+            log_terms, 2, delay + has_corners * YAW_DELAY_STD * dt, indices, fast_width, 2 if has_corners else 6
+        )
         late = -(roll_influences[:, 1] / roll[0] + pitch_influences[:, 1] / pitch[0]) / 2
         samples = np.c_[roll_influences[:, 0], pitch_influences[:, 0], yaw_influences[:, :2], late]
         pieces = np.array_split(samples, max(1, round(len(indices) * dt / PIECE_DURATION)))
@@ -365,7 +366,7 @@ def _solve_blocks(log_terms: _LogTerms, fast_width: float, yaw_delay: float) -> 
 
 
 def _solve_samples(
-    log_terms: _LogTerms, axis: int, delay: float, samples: NDArray, fast_width: float
+    log_terms: _LogTerms, axis: int, delay: float, samples: NDArray, fast_width: float, n_taps: int = 6
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return the coefficients of the regressors, their variances, and the influences of ``samples``, (n, k).
 
@@ -379,7 +380,7 @@ def _solve_samples(
             columns = rotors.impulse[:, 2], rotors.reaction
         else:
             columns = rotors.impulse[:, axis], rotors.torque_change[:, axis], rotors.thrust_impulse
-        return np.c_[shift_series(np.stack(columns, axis=-1), delay / log_terms.dt), log_terms.angle[:, axis]]
+        return np.c_[shift_series(np.stack(columns, axis=-1), delay / log_terms.dt, n_taps), log_terms.angle[:, axis]]
 
     slow_width = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, ang_vel_change = (
@@ -393,13 +394,13 @@ def _solve_samples(
     return x, variances, residual[:, None] * (instruments @ inverse.T)
 
 
-def shift_series(x: NDArray, samples: float) -> NDArray:
-    """Return series delayed by a number of samples, by Lagrange's polynomials through six samples. (n, k)
+def shift_series(x: NDArray, samples: float, n_taps: int = 6) -> NDArray:
+    """Return series delayed by a number of samples, by Lagrange's polynomials through ``n_taps`` samples. (n, k)
 
-    A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.
+    A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; six lower it by 1.5%.
     """
     whole_samples = math.floor(samples)
-    fraction, taps = samples - whole_samples, np.arange(-2, 4)
+    fraction, taps = samples - whole_samples, np.arange(n_taps) + 1 - n_taps // 2
     shifted, n = np.zeros_like(x), len(x)
     for k in taps:
         other_taps = taps[taps != k]
