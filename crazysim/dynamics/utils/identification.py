@@ -20,9 +20,6 @@ logger = logging.getLogger(__name__)
 
 RATE_RANGE = (0.5, 500.0)
 """Range in which the rate of the thrust's lag is searched, 1/s."""
-BLOCK_DURATION = 5.0
-"""Duration of a block of samples, s. The standard deviations of the rotation's parameters follow from the scatter
-between blocks. For the translation, a log has ten blocks on average."""
 EDGE_DURATION = 0.5
 """Duration at both ends of a log, s, that is omitted: the 6 Hz filters start there at rest, with a wrong velocity."""
 FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
@@ -102,8 +99,8 @@ def sys_id_rotation(
 
 def fit_translation(
     dynamics: str, mass: float, logs: Sequence[Mapping[str, ArrayLike]], gravity: ArrayLike = GRAVITY
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the parameters of ``sys_id_translation`` for several logs, and their standard deviations."""
+) -> tuple[dict[str, float], NDArray]:
+    """Return the parameters of ``sys_id_translation`` for several logs, and influences of samples, (n, k)."""
     expect(
         dynamics in list(FITTED_MODELS),
         f"dynamics as one of {', '.join(FITTED_MODELS)}",
@@ -140,15 +137,17 @@ def fit_translation(
         jacobian = np.insert(jacobian, 1, rate_slopes, axis=-1)
     if model == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
-    deviations = _standard_deviations(jacobian, residuals, np.arange(len(residuals)) * len(logs) * 10 // len(residuals))
-    return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, deviations), strict=True))
+    return dict(zip(names, map(float, values), strict=True)), _influences(jacobian, residuals)
 
 
-def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
-    """Return the parameters of ``sys_id_rotation`` for several logs, and their standard deviations."""
+def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDArray], NDArray]:
+    """Return the parameters of ``sys_id_rotation`` for several logs, and influences of samples.
+
+    The influences are those on the parameters of roll and pitch, then on those of yaw. (n, 2, 3)
+    """
     from scipy.optimize import least_squares  # a fifth of a second to import
 
-    results = []  # values and standard deviations, of roll and pitch, then of yaw
+    results = []  # values and influences, of roll and pitch, then of yaw
     for axes in ([0, 1], [2]):
         data = [_angle_samples(log, axes) for log in logs]
 
@@ -168,14 +167,11 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         error = lambda x, residuals=residuals: residuals(x).ravel()  # noqa: E731
         jacobian: Any = lambda x, slopes=slopes: -slopes(x).reshape(-1, 3)  # noqa: E731
         x = least_squares(error, initial_values, jacobian, method="lm").x
-        results.append((x, _standard_deviations(slopes(x), residuals(x), _block_numbers(logs))))
-    (tilt_values, tilt_deviations), (yaw_values, yaw_deviations) = results
+        results.append((x, _influences(slopes(x), residuals(x))))
+    (tilt_values, tilt_influences), (yaw_values, yaw_influences) = results
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
     values = {name: np.array([tilt_values[k], tilt_values[k], yaw_values[k]]) for k, name in enumerate(names)}
-    deviations = {
-        name: np.array([tilt_deviations[k], tilt_deviations[k], yaw_deviations[k]]) for k, name in enumerate(names)
-    }
-    return values, deviations
+    return values, np.stack([tilt_influences, yaw_influences], axis=1)
 
 
 def _acceleration_terms(
@@ -262,18 +258,10 @@ def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
     return np.asarray(_residual(jnp.asarray(x), *log), np.float64)
 
 
-def _block_numbers(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
-    """Return the number of the block of each sample of all logs. (n,)"""
-    parts = [1000 * k + np.asarray(log["time"], np.float64) // BLOCK_DURATION for k, log in enumerate(logs)]
-    return np.concatenate(parts)
-
-
-def _standard_deviations(jacobian: NDArray, residuals: NDArray, blocks: NDArray) -> NDArray:
-    """Return standard deviations from the scatter between blocks of time. (k,)"""
+def _influences(jacobian: NDArray, residuals: NDArray) -> NDArray:
+    """Return the influences of samples on parameters that minimise the squared residuals. (n, k)"""
     inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
-    scores = np.einsum("nri,nr->ni", jacobian, residuals)
-    block_scores = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)])
-    return np.sqrt(np.diag(inverse @ (block_scores.T @ block_scores) @ inverse))
+    return np.einsum("nri,nr->ni", jacobian, residuals) @ inverse
 
 
 def _refuse_plot(plot: bool) -> None:

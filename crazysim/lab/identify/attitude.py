@@ -21,6 +21,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import PADDING, State, Windows
+from crazysim.lab.identify.rotation import SAMPLING_ERROR, deviation_of_sum, sum_pieces
 from crazysim.pytree import PyTree
 
 PARAMETER_UNITS = {
@@ -119,8 +120,13 @@ def identify_attitude(
     flight_mass = base_mass if mass is None else float(mass)
     check_turning(logs)
     data = [derivatives_svf(preprocessing(_to_crazyflow_columns(log))) for log in logs]
-    force, force_spread = fit_translation(dynamics, flight_mass, data)
-    rotation_params, rotation_spread = fit_rotation(data)
+    force, force_influences = fit_translation(dynamics, flight_mass, data)
+    rotation_params, influences = fit_rotation(data)
+    duration = sum(float(log.t[-1] - log.t[0]) for log in logs)
+    force_spread = _deviations(np.array([*force.values()]), force_influences, duration)
+    tilt, yaw = (
+        _deviations(np.array([x[2 * k] for x in rotation_params.values()]), influences[:, k], duration) for k in (0, 1)
+    )
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
     if "thrust_dyn_coef" in force:
         table["thrust_dyn_coef"] = force["thrust_dyn_coef"]
@@ -140,6 +146,10 @@ def identify_attitude(
     lines += ["", f"[fitted.{dynamics}]"]
     lines += [f'{k} = {{ value = {x}, unit = "{PARAMETER_UNITS[k]}", source = "flights" }}' for k, x in table.items()]
     lines += ["", "# Standard deviations:"]
-    lines += [f"# {name}: {x:.2g}" for name, x in force_spread.items()]
-    lines += [f"# {name}: {', '.join(f'{v:.2g}' for v in x)}" for name, x in rotation_spread.items()]
+    lines += [f"# {name}: {x:.2g}" for name, x in zip(force, force_spread, strict=True)]
+    lines += [f"# {name}: {x:.2g}, {x:.2g}, {y:.2g}" for name, x, y in zip(rotation_params, tilt, yaw, strict=True)]
     return load_airframe(tables), "\n".join(lines) + "\n"
+
+
+def _deviations(values: NDArray, influences: NDArray, duration: float) -> NDArray:
+    return np.hypot(deviation_of_sum(sum_pieces(influences, duration)), SAMPLING_ERROR * values)

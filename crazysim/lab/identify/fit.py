@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.motion import integrate
@@ -35,10 +35,10 @@ from crazysim.rotation import rotate, rotate_inverse
 WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
 SLOW_TORQUE_DELAY_STD = 0.3
-"""Standard deviation of delays for slow torques, the third regression of ``identify``, samples. Rotor speeds have corners
-where commands change at samples, which integrals by curves through neighbouring samples round off. In simulated flights
-at 100 Hz torques per velocity then had the errors of a delay of 0.4 to 0.5 samples, and of 0.05 to 0.1 with integrals
-that keep corners; where commands changed between samples, the errors of the two were 0 and 0.2."""
+"""Standard deviation of delays for slow torques, the third regression of ``identify``, samples. Where commands change
+at samples, rotor speeds have corners. In simulated flights at 100 Hz torques per velocity then had the errors of a
+delay of 0.4 to 0.5 samples, and of 0.1 with integrals that keep corners. Where commands changed between samples, the
+errors were those of 0 and 0.2 samples."""
 MAX_FACTOR = 10.0
 """Largest factor of the airframe's curves and moments of inertia; a fit with a larger factor is an error. Rotor
 speeds are checked to be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
@@ -162,8 +162,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         mass: Mass in the flights, kg; None for the mass of the airframe.
     """
     base = load_airframe(airframe)
-    if mass is not None and not 0 < mass < np.inf:
-        raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
+    require(mass is None or 0 < mass < np.inf, f"expected mass to be positive and finite, in kg, got {mass}")
     logs = [with_speeds(log, base) for log in logs]
     _check_logs(logs, base)
     cut_windows(logs, WINDOW_DURATION, WINDOW_DURATION)  # an error if no log is long enough
@@ -344,21 +343,20 @@ def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArr
 
 def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
     """Check that the logs have equal sample times, and rotor speeds that fit the airframe in number and unit."""
-    if not logs:
-        raise ConfigError("expected at least one log, got none")
+    require(logs, "expected at least one log, got none")
     params = first_principles.Params.create(airframe)
     hover = np.broadcast_to(np.asarray(first_principles.hover_rotor_vel(params)).ravel(), airframe.n_rotors)
     for log in logs:
-        if abs(log.dt - logs[0].dt) > 1e-4:
-            raise ConfigError(
-                f"{log.name}: expected samples every {logs[0].dt:.4g} s as in the first log, got {log.dt:.4g}"
-            )
-        if log.rotor_vel.shape[1] != airframe.n_rotors:
-            raise ConfigError(
-                f"{log.name}: expected measured speeds of {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}. "
-                "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
-                "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy)."
-            )
+        require(
+            abs(log.dt - logs[0].dt) <= 1e-4,
+            f"{log.name}: expected samples every {logs[0].dt:.4g} s as in the first log, got {log.dt:.4g}",
+        )
+        require(
+            log.rotor_vel.shape[1] == airframe.n_rotors,
+            f"{log.name}: expected measured speeds of {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}. "
+            "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
+            "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy).",
+        )
         medians = np.median(log.rotor_vel, axis=0)
         if np.any((medians < 0.4 * hover) | (medians > 2.5 * hover)):
             raise ConfigError(

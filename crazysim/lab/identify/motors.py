@@ -19,7 +19,7 @@ from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
-from crazysim.lab.identify.rotation import MEDIAN_OVER_MEAN, PIECE_DURATION, deviation_of_sum
+from crazysim.lab.identify.rotation import MEDIAN_OVER_MEAN, deviation_of_sum, sum_pieces
 
 VOLTAGE_WINDOW = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
@@ -194,5 +194,4 @@ def _fit_rate(command: NDArray, speed: NDArray, dt: float, n_taps: int) -> _Rate
     residual = target - middle @ coefficients
     slope -= middle @ np.linalg.lstsq(middle.T @ middle, middle.T @ slope, rcond=1e-14)[0]
     influences = residual * slope / (slope @ slope)
-    n_pieces = max(1, round(len(influences) * dt / PIECE_DURATION))
-    return _RateFit(rate, np.array([piece.sum() for piece in np.array_split(influences, n_pieces)]))
+    return _RateFit(rate, sum_pieces(influences, len(influences) * dt))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.identify.logs import Log
 
 FAST_WIDTH, SLOW_WIDTH, YAW_SLOW_WIDTH = 0.05, 0.33, 1.0
@@ -92,11 +92,11 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         ]
         medians, delays, influences = _solve_logs(log_terms, FAST_WIDTH)
         roll, pitch, drag, reaction = medians[:4]
-        if not (roll > 0 and pitch > 0):
-            raise ConfigError(
-                "expected rotors that turn the drone in the direction of their torque, got the opposite. "
-                "Check the order of the rotors and the frames of attitude and angular velocity."
-            )
+        require(
+            roll > 0 and pitch > 0,
+            "expected rotors that turn the drone in the direction of their torque, got the opposite. "
+            "Check the order of the rotors and the frames of attitude and angular velocity.",
+        )
         x_factor, y_factor = 1 / roll / moments[0], 1 / pitch / moments[1]
         z_factor = (x_factor * moments[0] + y_factor * moments[1]) / (moments[0] + moments[1])
         rotor_factors = (max(c, 0.0) * moments[2] * z_factor for c in (drag, reaction))
@@ -141,6 +141,12 @@ def weighted_medians(x: NDArray, variances: NDArray) -> tuple[NDArray, NDArray]:
         cumulative_weight = np.cumsum(weight[order]) - 0.5 * weight[order]
         medians.append(np.interp(0.5, cumulative_weight, column[order]))
     return np.array(medians), weights
+
+
+def sum_pieces(influences: NDArray, duration: float) -> NDArray:
+    """Return sums of the influences of samples over pieces of ``PIECE_DURATION``. (n_pieces, ...)"""
+    n_pieces = max(1, round(duration / PIECE_DURATION))
+    return np.array([piece.sum(axis=0) for piece in np.array_split(influences, n_pieces)])
 
 
 def deviation_of_sum(influences: NDArray) -> NDArray:
@@ -309,8 +315,7 @@ def _solve_logs(
     """
     blocks = [_solve_blocks(log, fast_width, has_corners) for log in logs]
     all_blocks = list(itertools.chain.from_iterable(blocks))
-    if not all_blocks:
-        raise ConfigError(f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
+    require(all_blocks, f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
     variances = np.array([[*b.variances, b.variances[0]] for b in all_blocks])
     variances[:, 4] = 1.0
     medians, shares = weighted_medians(np.array([b.solution for b in all_blocks]), variances)
@@ -354,12 +359,11 @@ def _solve_blocks(log_terms: _LogTerms, fast_width: float, has_corners: bool) ->
         )
         late = -(roll_influences[:, 1] / roll[0] + pitch_influences[:, 1] / pitch[0]) / 2
         samples = np.c_[roll_influences[:, 0], pitch_influences[:, 0], yaw_influences[:, :2], late]
-        pieces = np.array_split(samples, max(1, round(len(indices) * dt / PIECE_DURATION)))
         blocks.append(
             _Block(
                 np.array([roll[0], pitch[0], *yaw[:2], delay]),
                 np.array([roll_variance[0], pitch_variance[0], *yaw_variance[:2]]),
-                np.array([piece.sum(axis=0) for piece in pieces]),
+                sum_pieces(samples, len(indices) * dt),
             )
         )
     return blocks

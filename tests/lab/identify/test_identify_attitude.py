@@ -1,5 +1,7 @@
 """Fitted dynamics are found in logs with attitude commands."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -13,30 +15,43 @@ from crazysim.sim import Sim
 
 MODEL = "so_rpy_rotor_drag"
 RATE, SECONDS = 100, 30
+COLUMN_NAMES = "t x y z qx qy qz qw roll_command pitch_command yaw_command thrust_command".split()
+PARAMETER_NAMES = (
+    "cmd_f_coef", "thrust_dyn_coef", "drag_coefficients", "rpy_coef", "rpy_rates_coef", "cmd_rpy_coef",
+)  # fmt: skip
+NOISE_STD = 1e-3
+"""Standard deviation of the noise of positions, m, and of the parts of quaternions."""
+
+
+def fly(airframes):
+    """Return columns of simulated flights with the fitted model, which start in hover."""
+    n, rng = len(airframes), np.random.default_rng(0)
+    sim = Sim(drone=airframes, dynamics=MODEL, control="attitude", freq=1000, attitude_freq=RATE, integrator="rk4")
+    loaded = [load_airframe(a) for a in airframes]
+    weight = 9.81 * np.array([a.value("rigid_body.mass") for a in loaded])
+    hover = weight / [a.value(f"fitted.{MODEL}.cmd_f_coef") for a in loaded]
+    states = sim.data.states
+    pos = np.stack([3.0 * np.arange(n), np.zeros(n), np.full(n, 50.0)], axis=-1)[None].astype(np.float32)
+    rotor_vel = np.zeros_like(states.rotor_vel) + hover[:, None].astype(np.float32)
+    sim.data = sim.data.replace(states=states.replace(pos=pos, rotor_vel=rotor_vel))
+    cmd, rows = np.c_[np.zeros((n, 3)), hover], []
+    for k in range(SECONDS * RATE):
+        states = sim.data.states
+        pos, quat, vel = (np.asarray(x)[0] for x in (states.pos, states.quat, states.vel))
+        if k >= RATE and k % 25 == 0:
+            for i, (v, height) in enumerate(zip(vel, pos[:, 2], strict=True)):
+                back = np.clip([0.1 * v[1], -0.1 * v[0]], -0.2, 0.2)
+                lift = rng.uniform(0.8, 1.25) - np.clip(0.15 * v[2] + 0.02 * (height - 50), -0.25, 0.25)
+                cmd[i] = [*rng.uniform(-0.35, 0.35, 2) + back, rng.uniform(-0.5, 0.5), hover[i] * lift]
+        rows.append(np.c_[np.full(n, k / RATE), pos, quat, cmd])
+        sim.attitude_control(cmd[None].astype(np.float32))
+        sim.step(1000 // RATE)
+    return [dict(zip(COLUMN_NAMES, x, strict=True)) for x in np.transpose(rows, (1, 2, 0))]
 
 
 @pytest.fixture(scope="module")
 def flight():
-    """Return columns of a simulated flight of cf2x_L250 with the fitted model, which starts in hover."""
-    sim = Sim(drone="cf2x_L250", dynamics=MODEL, control="attitude", freq=1000, attitude_freq=RATE, integrator="rk4")
-    airframe, rng = load_airframe("cf2x_L250"), np.random.default_rng(0)
-    hover = float(airframe.value("rigid_body.mass")) * 9.81 / float(airframe.value(f"fitted.{MODEL}.cmd_f_coef"))
-    states = sim.data.states
-    start_pos = states.pos + np.array([0, 0, 50.0], np.float32)
-    sim.data = sim.data.replace(states=states.replace(pos=start_pos, rotor_vel=np.full_like(states.rotor_vel, hover)))
-    cmd, rows = np.array([0, 0, 0, hover]), []
-    for k in range(SECONDS * RATE):
-        states = sim.data.states
-        pos, quat, vel = (np.asarray(x)[0, 0] for x in (states.pos, states.quat, states.vel))
-        if k >= RATE and k % 25 == 0:
-            back = np.clip([0.1 * vel[1], -0.1 * vel[0]], -0.2, 0.2)
-            lift = rng.uniform(0.8, 1.25) - np.clip(0.15 * vel[2] + 0.02 * (pos[2] - 50), -0.25, 0.25)
-            cmd = np.array([*rng.uniform(-0.35, 0.35, 2) + back, rng.uniform(-0.5, 0.5), hover * lift])
-        rows.append([k / RATE, *pos, *quat, *cmd])
-        sim.attitude_control(cmd[None, None])
-        sim.step(1000 // RATE)
-    names = "t x y z qx qy qz qw roll_command pitch_command yaw_command thrust_command".split()
-    return dict(zip(names, np.array(rows).T, strict=True))
+    return fly(["cf2x_L250"])[0]
 
 
 def stack_columns(flight, *names):
@@ -59,6 +74,48 @@ def test_names_of_crazyflow_find_the_parameters(flight):
     rotation = sys_id_rotation(log)
     for key, x in rotation.items():
         np.testing.assert_allclose(x, airframe.value(f"fitted.{MODEL}.{key}"), rtol=0.01, err_msg=key)
+
+
+def list_numbers(parameters):
+    """Return the numbers of parameters by name, without those of pitch and y, which equal those of roll and x."""
+    return np.concatenate(
+        [np.ravel(parameters[name])[[0, -1][: np.size(parameters[name])]] for name in PARAMETER_NAMES]
+    )
+
+
+def draw_model(rng, k):
+    """Return an airframe whose fitted model is drawn about that of cf2x_L250, and its numbers."""
+    base = load_airframe("cf2x_L250")
+    spreads = {"cmd_f_coef": (0.9, 1.1), "thrust_dyn_coef": (0.5, 1.5), "drag_coefficients": (0.5, 2.0)}
+    truth = {"acc_coef": 0.0}
+    for name in PARAMETER_NAMES:
+        value = np.asarray(base.value(f"fitted.{MODEL}.{name}"))
+        factors = rng.uniform(*spreads.get(name, (0.7, 1.4)), 2)
+        truth[name] = (value * (factors[[0, 0, 1]] if value.ndim else factors[0])).tolist()
+    return {"name": f"drawn{k}", "base": "cf2x_L250", "fitted": {MODEL: truth}}, list_numbers(truth)
+
+
+@pytest.mark.long("flies eight airframes for 30 s and fits each twice")
+def test_errors_are_as_large_as_their_deviations():
+    """Of 80 numbers with noise, whose shares scatter by 5% of 1, and of 80 without.
+
+    Without noise, most errors are far below the 0.05% by which integrals between samples may be off.
+    """
+    rng = np.random.default_rng(1)
+    airframes, truths = zip(*(draw_model(rng, k) for k in range(8)), strict=True)
+    flights = fly(list(airframes))
+    for noise, largest_share in ((0.0, 1.0), (NOISE_STD, 0.95)):
+        errors = []
+        for truth, columns in zip(truths, flights, strict=True):
+            noisy = {k: x + noise * rng.normal(size=len(x)) * (k[0] in "xyzq") for k, x in columns.items()}
+            fit, text = identify_attitude([read_log(noisy)], "cf2x_L250", MODEL, "flight")
+            lines = re.findall(r"^# \w+: ([\d., e-]+)$", text, re.MULTILINE)
+            deviations = [float(x) for line in lines for x in line.split(", ")[-2:]]
+            values = list_numbers({name: fit.value(f"fitted.{MODEL}.{name}") for name in PARAMETER_NAMES})
+            errors += list((values - truth) / deviations)
+        shares = np.array([np.mean(np.abs(errors) <= k) for k in (1, 2, 3)])
+        assert np.all(shares >= [0.63, 0.93, 0.985]), shares
+        assert shares[0] <= largest_share, shares
 
 
 def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
