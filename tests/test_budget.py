@@ -15,7 +15,7 @@ BUDGET = {
     "core": 1899,
     "crazysim": 1404,
     "drones": 514,
-    "dynamics": 584,
+    "dynamics": 576,
     "engine": 5804,
     "envs": 3830,
     "geometry": 1089,

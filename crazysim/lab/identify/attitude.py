@@ -122,10 +122,9 @@ def identify_attitude(
     data = [derivatives_svf(preprocessing(_to_crazyflow_columns(log))) for log in logs]
     force, force_influences = fit_translation(dynamics, flight_mass, data)
     rotation_params, influences = fit_rotation(data)
-    duration = sum(float(log.t[-1] - log.t[0]) for log in logs)
-    force_spread = _deviations(np.array([*force.values()]), force_influences, duration)
+    force_spread = _deviations(np.array([*force.values()]), force_influences, logs)
     tilt, yaw = (
-        _deviations(np.array([x[2 * k] for x in rotation_params.values()]), influences[:, k], duration) for k in (0, 1)
+        _deviations(np.array([x[2 * k] for x in rotation_params.values()]), influences[:, k], logs) for k in (0, 1)
     )
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
     if "thrust_dyn_coef" in force:
@@ -151,5 +150,8 @@ def identify_attitude(
     return load_airframe(tables), "\n".join(lines) + "\n"
 
 
-def _deviations(values: NDArray, influences: NDArray, duration: float) -> NDArray:
-    return np.hypot(deviation_of_sum(sum_pieces(influences, duration)), SAMPLING_ERROR * values)
+def _deviations(values: NDArray, influences: NDArray, logs: Sequence[Log]) -> NDArray:
+    return np.hypot(
+        deviation_of_sum(sum_pieces(influences, sum(float(log.t[-1] - log.t[0]) for log in logs))),
+        SAMPLING_ERROR * values,
+    )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns
 from crazysim.lab.identify.motion import body_rates, integrate
 
@@ -112,11 +112,11 @@ def check_motion(
         return is_kept
     fault = laws[broken[0]].fault
     span = float(np.max(np.ptp(data["pos"], axis=0)))
-    if span < MIN_SPAN:
-        raise ConfigError(
-            f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
-            f"{MIN_SPAN:g} m or more, or give metres_per_unit."
-        )
+    require(
+        span >= MIN_SPAN,
+        f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
+        f"{MIN_SPAN:g} m or more, or give metres_per_unit.",
+    )
     remedy, n_faults = "", len(broken)
     for remedy_text, changed_data in _propose_remedies(data, derived_keys):
         new_laws = _check_laws(t, changed_data, derived_keys)
@@ -141,11 +141,11 @@ def check_motion(
 def check_turning(logs: Sequence[Log]) -> None:
     """Check that the logs turn enough about the x and y axes for a fit of the rotation."""
     rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
-    if np.any(rates < MIN_TURN_RATE):
-        raise ConfigError(
-            f"expected a flight that turns about x and y, got body rates whose standard deviations are "
-            f"{rates[0]:.2g} and {rates[1]:.2g} rad/s. Take a log of a flight with changes of direction."
-        )
+    require(
+        np.all(rates >= MIN_TURN_RATE),
+        f"expected a flight that turns about x and y, got body rates whose standard deviations are "
+        f"{rates[0]:.2g} and {rates[1]:.2g} rad/s. Take a log of a flight with changes of direction.",
+    )
 
 
 class Law(NamedTuple):

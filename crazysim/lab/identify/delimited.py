@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 
 MAX_COLUMNS = 10_000
@@ -43,11 +43,11 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected names of columns in the first line, with commas between them, got {got}. "
             "Export the log with commas, decimal points and a header."
         )
-    if not any(math.isnan(parse_number(x)) for x in names):
-        raise ConfigError(
-            f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
-            "Add a first line such as t,x,y,z,qx,qy,qz,qw."
-        )
+    require(
+        any(math.isnan(parse_number(x)) for x in names),
+        f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
+        "Add a first line such as t,x,y,z,qx,qy,qz,qw.",
+    )
     if duplicates := sorted(x for x, n in Counter(names).items() if n > 1):
         raise ConfigError(
             f"{path.name}: expected columns of different names, got {duplicates[0][:60]!r} twice. Rename one."
@@ -76,11 +76,11 @@ def split_rows(
             rows.append(cells)
         elif line.strip():
             damaged_rows.append(f"{len(cells)} in line {number}")
-    if len(damaged_rows) > MAX_REPAIRED_SHARE * (len(rows) + len(damaged_rows)) or not rows:
-        raise ConfigError(
-            f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and "
-            f"{len(damaged_rows)} others{f', the first with {damaged_rows[0]}' if damaged_rows else ''}. {remedy}"
-        )
+    require(
+        rows and len(damaged_rows) <= MAX_REPAIRED_SHARE * (len(rows) + len(damaged_rows)),
+        f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and "
+        f"{len(damaged_rows)} others{f', the first with {damaged_rows[0]}' if damaged_rows else ''}. {remedy}",
+    )
     if damaged_rows:
         repairs.append(
             f"dropped {len(damaged_rows)} rows that have another number of cells, the first {damaged_rows[0]}"

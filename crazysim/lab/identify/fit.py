@@ -358,12 +358,12 @@ def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
             "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy).",
         )
         medians = np.median(log.rotor_vel, axis=0)
-        if np.any((medians < 0.4 * hover) | (medians > 2.5 * hover)):
-            raise ConfigError(
-                f"{log.name}: expected each rotor near {hover.mean():.0f} rpm, as in hover, got medians of "
-                f"{', '.join(f'{x:.0f}' for x in medians)}. Correct the column of a rotor that does not turn, or "
-                f"give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole pairs for electrical rpm."
-            )
+        require(
+            np.all((medians >= 0.4 * hover) & (medians <= 2.5 * hover)),
+            f"{log.name}: expected each rotor near {hover.mean():.0f} rpm, as in hover, got medians of "
+            f"{', '.join(f'{x:.0f}' for x in medians)}. Correct the column of a rotor that does not turn, or "
+            f"give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole pairs for electrical rpm.",
+        )
 
 
 def _check_rotor_order(logs: Sequence[Log], airframe: Airframe) -> None:

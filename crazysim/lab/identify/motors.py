@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_acceleration
 from crazysim.dynamics.utils.identification import lag_signal
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 from crazysim.lab.identify.rotation import MEDIAN_OVER_MEAN, deviation_of_sum, sum_pieces
@@ -52,11 +52,11 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     if "battery.thrust_over_voltage" not in airframe.values:
         return log
     is_valid = (command >= 0) & (command <= 1)
-    if np.sum(~is_valid) > MAX_REPAIRED_SHARE * is_valid.size:
-        raise ConfigError(
-            f"{log.name}: expected commands from 0 to 1, shares of the battery's voltage, got {command.min():.4g} to "
-            f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535."
-        )
+    require(
+        np.sum(~is_valid) <= MAX_REPAIRED_SHARE * is_valid.size,
+        f"{log.name}: expected commands from 0 to 1, shares of the battery's voltage, got {command.min():.4g} to "
+        f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535.",
+    )
     command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, is_valid.T, strict=True)], axis=-1)
     half_window = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
     window = np.hanning(2 * half_window + 3)[1:-1]
