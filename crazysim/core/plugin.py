@@ -82,8 +82,8 @@ class StagePlacement:
     stage: Callable[[SimData], SimData]
     """The stage, declared with ``crazysim.stage``."""
     before: str = "integration"
-    """Name of the stage before which it is inserted; ``"measurements"`` for the first stage of a sensor behind the
-    integration, or ``"increment_steps"`` without sensors, so that sensors added earlier see what it moves."""
+    """Name of the stage before which it is inserted: ``"increment_steps"`` for a stage that measures or judges what a
+    step has done, and ``"measurements"``, the first of these, for one that moves something after the integration."""
     replaces: str | None = None
     """Name of a stage to replace; if the pipeline has none of that name, ``before`` is used. Removing the plugin
     restores the replaced stage."""

@@ -13,7 +13,6 @@ from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.stage import Stage, is_first_step
 from crazysim.errors import ConfigError
-from crazysim.plugins.sensors.sensor import Sensor
 
 
 class Edit(NamedTuple):
@@ -112,7 +111,6 @@ class PluginStages:
         measurements = {
             placement.name or name
             for name, made in self._made.items()
-            if isinstance(self.plugins[name], Sensor)
             for placement in made.placements
             if placement.before == "increment_steps"
         }

@@ -15,6 +15,7 @@ from crazysim import (
     IMU,
     Battery,
     Camera,
+    Cars,
     ConfigError,
     ContactLog,
     ContactResponse,
@@ -27,6 +28,7 @@ from crazysim import (
     Lidar,
     MotionCapture,
     Pillars,
+    Radar,
     Randomize,
     RangeFinder,
     RotorJet,
@@ -279,14 +281,15 @@ def test_a_stage_stays_where_it_was_inserted_when_its_neighbours_go():
     assert list(sim.step_pipeline)[2:] == names
 
 
-@pytest.mark.parametrize("make_plugin", [DroneCollisions, ContactResponse, lambda: FreeBodies(1, size=0.05)])
-def test_sensors_measure_behind_stages_that_move_drones(make_plugin):
+@pytest.mark.parametrize("make_sensor", [IMU, RangeFinder, lambda: Radar((0, 0, 0)), ContactLog])
+@pytest.mark.parametrize("make_plugin", [DroneCollisions, ContactResponse, Cars, lambda: FreeBodies(1, size=0.05)])
+def test_sensors_measure_behind_stages_that_move_drones(make_plugin, make_sensor):
     """Whatever was added first: an impact within a step is in the IMU's measurement of that step."""
     sims = [Sim(n_drones=2), Sim(n_drones=2)]
-    sims[0].add(IMU())
+    sims[0].add(make_sensor())
     for sim in sims:
         sim.add(make_plugin())
-    sims[1].add(IMU())
+    sims[1].add(make_sensor())
     assert list(sims[0].step_pipeline) == list(sims[1].step_pipeline)
 
 

@@ -90,7 +90,7 @@ class Land(TouchDown):
         record = PadLanding(circle=zero, ang_vel=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
         placements = [StagePlacement(self.touch_down_stage(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
-            placements.insert(0, StagePlacement(move_pads, before="increment_steps", name=f"{TASK_RECORD_NAME}_pads"))
+            placements.insert(0, StagePlacement(move_pads, before="measurements", name=f"{TASK_RECORD_NAME}_pads"))
         self.add_record(sim, record, placements)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
