@@ -243,7 +243,6 @@ def test_the_show_command_writes_a_report(tmp_path, capsys):
         ["--film", "show.txt"],
         ["--page", "page.txt"],
         ["--report", "nowhere/report.json"],
-        ["--seconds", "0"],
     ):
         assert main(["show", str(tmp_path / "show.skyc"), *wrong]) == 2
         assert "expected" in capsys.readouterr().err
