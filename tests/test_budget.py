@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 9874,
     "media": 986,
-    "plugins": 7269,
+    "plugins": 7268,
     "scene": 3102,
     "sim": 1215,
     "train": 2497,
