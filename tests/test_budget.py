@@ -24,7 +24,7 @@ BUDGET = {
     "plugins": 7268,
     "scene": 3102,
     "sim": 1215,
-    "train": 2497,
+    "train": 2455,
     "trajectories": 1398,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""

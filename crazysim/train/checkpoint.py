@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.storage import open_file, open_replacement, read_arrays, wrap_read_errors
 
 T = TypeVar("T")
@@ -75,11 +75,11 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], template: T) -> T:
         with wrap_checkpoint_errors(path):
             value = jax.device_put(arrays[name])
             value = jax.random.wrap_key_data(value) if is_key else value
-        if value.shape != x.shape or value.dtype != x.dtype:
-            raise ConfigError(
-                f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "
-                f"settings it was saved with, or another folder"
-            )
+        require(
+            value.shape == x.shape and value.dtype == x.dtype,
+            f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "
+            f"settings it was saved with, or another folder",
+        )
         leaves.append(value)
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 

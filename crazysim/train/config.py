@@ -16,7 +16,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.references import absolute_reference, is_reference, reference_of, split_reference
 from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 from crazysim.train import apg, dagger, ppo
 from crazysim.train.devices import Devices, device_options, evaluation_device
 from crazysim.train.hyperparameters import SWEEPABLE, check_seed
@@ -170,8 +170,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not isinstance(self.algorithm, str) or self.algorithm not in ALGORITHMS:
-            raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}")
+        require(
+            isinstance(self.algorithm, str) and self.algorithm in ALGORITHMS,
+            f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}",
+            UnknownNameError,
+        )
         check_seed(self.seed)
         names = [f.name for f in dataclasses.fields(ALGORITHMS[self.algorithm].Config)]
         if unknown := [name for name in self.config if name not in names]:
@@ -184,8 +187,10 @@ class TrainConfig:
                 f"or devices='all' in Python: the worlds are then distributed over a mesh of these devices."
             )
         if self.network is not None:
-            if self.algorithm != "ppo":
-                raise ConfigError(f"expected no custom network for {self.algorithm}, got one. Use algorithm='ppo'.")
+            require(
+                self.algorithm == "ppo",
+                f"expected no custom network for {self.algorithm}, got one. Use algorithm='ppo'.",
+            )
             choose_network(self.config.get("memory", 0), self.network, self.config.get("convolution", ()))
             object.__setattr__(self, "own_network", True)
         config = dataclasses.asdict(self.algorithm_config())
@@ -235,8 +240,7 @@ class TrainConfig:
             )
         elif is_reference(task):
             task = absolute_reference(task) if split_reference(task)[1] else reference_of(entry.task)
-        if not isinstance(algorithm, (str, type(None))):
-            raise ConfigError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {short_repr(algorithm)}")
+        expect(isinstance(algorithm, (str, type(None))), f"an algorithm of {', '.join(ALGORITHMS)}", algorithm)
         recipe = find_recipe(task, algorithm)
         if resumed is not None:
             seed = resumed.seed if seed is None else seed
@@ -244,8 +248,7 @@ class TrainConfig:
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
         for name, value in (("options", options), ("config", config)):
-            if not isinstance(value, (Mapping, type(None))):
-                raise ConfigError(f"expected {name} as a dict of values by name, got {short_repr(value)}")
+            expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())

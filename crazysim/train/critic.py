@@ -7,7 +7,7 @@ from jax import Array
 
 from crazysim.envs.state import PRIVILEGED, Obs, flatten
 from crazysim.envs.statistics import EPSILON, RunningStats
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.train.networks import Weights
 
 PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
@@ -23,11 +23,11 @@ def critic_obs(obs: Obs, critic: str) -> Array:
     """Join the observations of the policy and, after them, those that only the critic may use. (..., k)"""
     if critic not in PRIVILEGED_CRITICS:
         return flatten(obs)
-    if PRIVILEGED not in obs:
-        raise ConfigError(
-            f"expected the observation {PRIVILEGED!r} for critic={critic!r}, got {', '.join(obs)}. Use "
-            f"AutoReset(PrivilegedObservation(env))."
-        )
+    require(
+        PRIVILEGED in obs,
+        f"expected the observation {PRIVILEGED!r} for critic={critic!r}, got {', '.join(obs)}. Use "
+        f"AutoReset(PrivilegedObservation(env)).",
+    )
     return jnp.concatenate([flatten(policy_obs(obs, critic)), obs[PRIVILEGED]], axis=-1)
 
 

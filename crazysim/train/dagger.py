@@ -26,7 +26,7 @@ from crazysim.envs.registry import entry_of
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
-from crazysim.errors import ConfigError, DivergedError, require_callable
+from crazysim.errors import ConfigError, DivergedError, require, require_callable
 from crazysim.pytree import PyTree, static
 from crazysim.train.convolution import images_of
 from crazysim.train.evaluation import as_tree
@@ -159,17 +159,16 @@ def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     Raises:
         ConfigError: If there is no teacher, or the student's task does not have the teacher's task record.
     """
-    if not config.teacher:
-        raise ConfigError("expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
+    require(config.teacher, "expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
     _, teacher_config, _ = _load_teacher_run(config.teacher)
     entry = entry_of(teacher_config.task, is_named=False)
     task = entry.task(**{name: x for name, x in teacher_config.options.items() if name in entry.options})
     teacher_record, student_record = type(task).Record, type(env.task).Record
-    if teacher_record is not None and not (student_record is not None and issubclass(student_record, teacher_record)):
-        raise ConfigError(
-            f"expected a teacher whose task has the same record as {env.task.name!r}, got {config.teacher} of "
-            f"{teacher_config.title!r}. Train the teacher with the same task, or with the base class of its class."
-        )
+    require(
+        teacher_record is None or (student_record is not None and issubclass(student_record, teacher_record)),
+        f"expected a teacher whose task has the same record as {env.task.name!r}, got {config.teacher} of "
+        f"{teacher_config.title!r}. Train the teacher with the same task, or with the base class of its class.",
+    )
     return TeacherObservation(env, task.observe)
 
 
@@ -285,8 +284,7 @@ def imitate(
             command level or another rate.
         DivergedError: If weights or losses become non-finite, or the teacher's actions are NaN.
     """
-    if not isinstance(config, (Mapping, type(None))):
-        raise ConfigError(f"expected config as a dict of values by name, got {config!r}")
+    require(isinstance(config, (Mapping, type(None))), f"expected config as a dict of values by name, got {config!r}")
     names = [field.name for field in dataclasses.fields(Config) if field.name != "teacher"]
     if unknown := [name for name in config or {} if name not in names]:
         raise ConfigError(f"expected hyperparameters of dagger, got {', '.join(unknown)}; use {', '.join(names)}")
@@ -323,18 +321,20 @@ def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
     """Return the result of ``load_policy`` for a teacher's folder; the error for a missing folder names the teacher."""
     from crazysim.train.training import load_policy
 
-    if not Path(folder).exists():
-        raise ConfigError(
-            f"expected the run of the teacher in {folder!r}, got no such folder. Use the folder of a run; if you "
-            f"resume a student, move its teacher back there."
-        )
+    require(
+        Path(folder).exists(),
+        f"expected the run of the teacher in {folder!r}, got no such folder. Use the folder of a run; if you "
+        f"resume a student, move its teacher back there.",
+    )
     return load_policy(folder)
 
 
 def _check_teacher(teacher: Any, env: Env, teacher_obs: Obs, folder: str) -> None:
     """Check that a teacher acts on its observations, and with the meaning of the student's actions."""
-    if isinstance(teacher, Policy) and teacher.has_memory:
-        raise ConfigError("expected a teacher without memory, got one with a memory. Train the teacher with memory=0.")
+    require(
+        not isinstance(teacher, Policy) or not teacher.has_memory,
+        "expected a teacher without memory, got one with a memory. Train the teacher with memory=0.",
+    )
     interface = getattr(teacher, "interface", None)
     if isinstance(interface, Interface):
         description = describe_env(env, sizes_of(teacher_obs)) | {"task": None, "task_code": None, "images": {}}

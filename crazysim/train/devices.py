@@ -13,7 +13,7 @@ from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.core.settings import find_device
 from crazysim.core.sharding import WORLD_AXIS, shardings_of, world_mesh
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.sim.sim import Sim
 from crazysim.train.seeds import are_seeds_divided
 
@@ -89,15 +89,17 @@ def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, An
     """
     training_devices = find_devices(device, devices)
     n = len(training_devices)
-    if n_worlds % n:
-        raise ConfigError(
-            f"expected a number of worlds that {n} devices divide, got {n_worlds}. Use for example --worlds "
-            f"{-(-n_worlds // n) * n}, or another number of --devices."
-        )
+    require(
+        n_worlds % n == 0,
+        f"expected a number of worlds that {n} devices divide, got {n_worlds}. Use for example --worlds "
+        f"{-(-n_worlds // n) * n}, or another number of --devices.",
+    )
     n_hosts = jax.process_count()
     local_devices = [x for x in training_devices if x.process_index == jax.process_index()]
-    if len({x.process_index for x in training_devices}) < n_hosts:
-        raise ConfigError(f"expected devices of all {n_hosts} hosts, got {devices!r}. Use --devices all.")
+    require(
+        len({x.process_index for x in training_devices}) >= n_hosts,
+        f"expected devices of all {n_hosts} hosts, got {devices!r}. Use --devices all.",
+    )
     return {"device": local_devices[0]} | ({"mesh": world_mesh(training_devices)} if n > 1 else {})
 
 
@@ -187,9 +189,9 @@ def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:
     except (TypeError, ValueError):
         selection = 0
     indices = selection if isinstance(selection, tuple) else (selection - 1,)
-    if isinstance(devices, bool) or not indices or min(indices) < 0 or len(set(indices)) < len(indices):
-        raise ConfigError(
-            f"expected 'all', a number of devices, or their indices, each once, got {devices!r}. Use for example "
-            f"--devices 2, or --devices 0,2,3."
-        )
+    require(
+        not isinstance(devices, bool) and indices and min(indices) >= 0 and len(set(indices)) == len(indices),
+        f"expected 'all', a number of devices, or their indices, each once, got {devices!r}. Use for example "
+        f"--devices 2, or --devices 0,2,3.",
+    )
     return selection

@@ -26,7 +26,7 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import ConfigError, not_installed, require_type
+from crazysim.errors import ConfigError, not_installed, require, require_type
 from crazysim.storage import as_path, write_file
 from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
 from crazysim.train.interface import Interface, describe_env, sizes_text
@@ -100,11 +100,11 @@ class PolicyNumbers(NamedTuple):
 def describe(env: Env) -> dict[str, Any]:
     """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
     require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
-    if env.actions.centre.ndim > 1:
-        raise ConfigError(
-            "expected an environment whose drones have the same actions, got drones of several airframes. Describe "
-            "one with a single airframe for each of them."
-        )
+    require(
+        env.actions.centre.ndim <= 1,
+        "expected an environment whose drones have the same actions, got drones of several airframes. Describe "
+        "one with a single airframe for each of them.",
+    )
     return describe_env(env)
 
 
@@ -248,8 +248,10 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     Returns:
         The path.
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
+    require(
+        isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name),
+        f"expected the name of a C function, got {name!r}; use letters, digits and underscores",
+    )
     numbers = _policy_numbers(policy, meta)
     n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
     guard = f"CRAZYSIM_{name.upper()}_H"
@@ -298,11 +300,11 @@ def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     described = Interface.read(meta)
     if policy.interface is not None:
         policy.interface.require(described, "a description")
-    if not policy.network.is_built_in:
-        raise ConfigError(
-            "expected a policy with the built-in network, got one with a custom network. Export it with its "
-            "library, or with jax.export."
-        )
+    require(
+        policy.network.is_built_in,
+        "expected a policy with the built-in network, got one with a custom network. Export it with its "
+        "library, or with jax.export.",
+    )
     host_policy = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
     mean, var, layers = host_policy.stats.mean, host_policy.stats.var, host_policy.layers
     body, convolutions = host_policy.body, ()
@@ -314,8 +316,10 @@ def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
             f"expected a policy from {sizes_text(described.sizes)} to {n_actions} actions, got one from {len(mean)} to "
             f"{len(layers[-1][1])}. Describe the environment that it was trained in."
         )
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)):
-        raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
+    require(
+        all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)),
+        "expected finite weights, got NaN or infinity; the training diverged, so train again",
+    )
     gru = []
     if isinstance(body, Gru):
         arrays = (body.inputs, body.recurrent, body.bias)

@@ -10,7 +10,7 @@ import numpy as np
 
 from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 SWEEPABLE = ("learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm")
 """Hyperparameters that may differ between the seeds of one program, and may change when a run is resumed: shapes and
@@ -53,10 +53,10 @@ def check_hyperparameters(config: Any) -> None:
             value = _check_number(field.name, value, default)
         object.__setattr__(config, field.name, value)
     critic = getattr(config, "critic", "")
-    if critic.startswith("all_drones") and config.convolution:
-        raise ConfigError(
-            f"expected a critic of one drone with a convolution, got {critic!r}. Use critic='privileged'."
-        )
+    require(
+        not critic.startswith("all_drones") or not config.convolution,
+        f"expected a critic of one drone with a convolution, got {critic!r}. Use critic='privileged'.",
+    )
 
 
 def _check_text(name: str, value: object) -> str:
@@ -96,6 +96,7 @@ def _check_number(name: str, value: Any, default: Any) -> float:
     else:
         low, high, expected = np.finfo(np.float32).tiny, np.finfo(np.float32).max, "a finite number larger than 0"
     is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not is_number or not low <= value <= high:
-        raise ConfigError(f"expected {name} as {expected}, got {value!r}. Use for example {default}.")
+    require(
+        is_number and low <= value <= high, f"expected {name} as {expected}, got {value!r}. Use for example {default}."
+    )
     return float(value)

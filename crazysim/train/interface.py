@@ -11,7 +11,7 @@ import numpy as np
 
 import crazysim
 from crazysim.envs.env import Env
-from crazysim.errors import ConfigError, require_type, short_repr, warn
+from crazysim.errors import ConfigError, expect, require, require_type, short_repr, warn
 from crazysim.train.task_code import task_digest
 
 REMEDY = (
@@ -81,10 +81,10 @@ class Interface:
         ):
             if None not in (mine, theirs) and mine != theirs:
                 differences.append(f"{text.format(theirs)} in place of {text.format(mine)}")
-        if differences:
-            raise ConfigError(
-                f"expected {source} with the interface of the policy, got {', '.join(differences)}. {REMEDY}"
-            )
+        require(
+            not differences,
+            f"expected {source} with the interface of the policy, got {', '.join(differences)}. {REMEDY}",
+        )
         if None not in (self.task_code, other.task_code) and self.task_code != other.task_code:
             warn(
                 "the code of the task differs from that of the policy's training: observations may have other units or "
@@ -145,11 +145,12 @@ def check_policy(policy: Any, env: Env) -> None:
 def check_callable(policy: Any, env: Env) -> None:
     """Check the types of a policy and an environment."""
     require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
-    if not callable(policy):
-        raise ConfigError(
-            f"expected a policy, got {short_repr(policy)}. Use the first result of load_policy, or a function from "
-            f"observations to actions."
-        )
+    expect(
+        callable(policy),
+        "a policy",
+        policy,
+        "Use the first result of load_policy, or a function from observations to actions.",
+    )
 
 
 def sizes_of(obs: Any) -> dict[str, int]:

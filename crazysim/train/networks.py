@@ -21,7 +21,7 @@ from jax import Array
 
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.train.convolution import KERNEL_SIZE, Image, convolve, scale_depth
 from crazysim.train.interface import Interface, sizes_of, sizes_text
@@ -224,14 +224,14 @@ def choose_network(
         return _convolution_network(tuple(convolution), images, base) if convolution else base
     if not isinstance(network, Network):
         raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
-    if convolution:
-        raise ConfigError(
-            f"expected no convolution with a custom network, got {list(convolution)}. Put it into the network."
-        )
-    if memory:
-        raise ConfigError(
-            f"expected memory=0 with a custom network, got {memory}. Give the network an initial_memory instead."
-        )
+    require(
+        not convolution,
+        f"expected no convolution with a custom network, got {list(convolution)}. Put it into the network.",
+    )
+    require(
+        not memory,
+        f"expected memory=0 with a custom network, got {memory}. Give the network an initial_memory instead.",
+    )
     return network
 
 
@@ -257,11 +257,11 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
     network_weights = network.init(jax.random.fold_in(key, 1), n_obs)
     output_shapes = jax.eval_shape(network.apply, network_weights, jnp.zeros(n_obs), network.make_memory())
     features, memory = output_shapes if isinstance(output_shapes, tuple) and len(output_shapes) == 2 else (None, None)
-    if getattr(features, "ndim", None) != 1:
-        raise ConfigError(
-            f"expected apply(weights, obs, memory) to return features (n_features,) of one drone and the memory, got "
-            f"{output_shapes}. Return a tuple of the two."
-        )
+    require(
+        getattr(features, "ndim", None) == 1,
+        f"expected apply(weights, obs, memory) to return features (n_features,) of one drone and the memory, got "
+        f"{output_shapes}. Return a tuple of the two.",
+    )
     expected = jax.eval_shape(network.make_memory)
     if jax.tree.structure(memory) != jax.tree.structure(expected) or any(
         (x.shape, x.dtype) != (y.shape, y.dtype)
@@ -353,11 +353,11 @@ class Policy(PyTree):
         Raises:
             ConfigError: If the policy has a memory, or was trained with observations of other names or sizes.
         """
-        if self.has_memory:
-            raise ConfigError(
-                "expected a memory besides the observations, got none for a policy that has one. Use action, memory = "
-                "policy.act(obs, memory), and begin episodes with policy.initial_memory(n_worlds, n_drones)."
-            )
+        require(
+            not self.has_memory,
+            "expected a memory besides the observations, got none for a policy that has one. Use action, memory = "
+            "policy.act(obs, memory), and begin episodes with policy.initial_memory(n_worlds, n_drones).",
+        )
         return self.act(obs, ())[0]
 
     def act(self, obs: dict[str, Array], memory: Any) -> tuple[Array, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError, require_type
+from crazysim.errors import require, require_type
 from crazysim.storage import as_path, write_file
 from crazysim.train.export import POLICY_REMEDY, float_literal, to_c
 from crazysim.train.interface import Interface
@@ -62,37 +62,39 @@ def to_out_of_tree(
     """
     require_type(policy, Policy, POLICY_REMEDY)
     require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")
-    if policy.has_memory:
-        raise ConfigError(
-            "expected a policy without memory, got one with a memory. Use the export as C, and keep its policy_state "
-            "in your controller."
-        )
+    require(
+        not policy.has_memory,
+        "expected a policy without memory, got one with a memory. Use the export as C, and keep its policy_state "
+        "in your controller.",
+    )
     freq = positive_integer("freq", freq)
-    if MAIN_LOOP_RATE % freq:
-        raise ConfigError(
-            f"expected a rate that divides the firmware's {MAIN_LOOP_RATE} Hz, got {freq} Hz. Train with a divisor as "
-            f"freq."
-        )
+    require(
+        MAIN_LOOP_RATE % freq == 0,
+        f"expected a rate that divides the firmware's {MAIN_LOOP_RATE} Hz, got {freq} Hz. Train with a divisor as "
+        f"freq.",
+    )
     interface = Interface.read(meta)
-    if interface.freq not in (None, freq):
-        raise ConfigError(
-            f"expected the rate of the training, {interface.freq} Hz, got {freq} Hz. Use freq=meta['freq']."
-        )
+    require(
+        interface.freq in (None, freq),
+        f"expected the rate of the training, {interface.freq} Hz, got {freq} Hz. Use freq=meta['freq'].",
+    )
     observations = interface.sizes
     unknown = [name for name, size in observations.items() if OBSERVATION_FIELDS.get(name, ("", 0))[1] != size]
-    if unknown:
-        raise ConfigError(
-            f"expected observations of a drone's state and its goal, {', '.join(OBSERVATION_FIELDS)}, got "
-            f"{', '.join(unknown)}. Use the export as C, and compute the others in your controller."
-        )
+    require(
+        not unknown,
+        f"expected observations of a drone's state and its goal, {', '.join(OBSERVATION_FIELDS)}, got "
+        f"{', '.join(unknown)}. Use the export as C, and compute the others in your controller.",
+    )
     level = Control(interface.level)
-    if level == Control.state:
-        raise ConfigError(
-            "expected a policy that commands attitudes or a lower level, got one of positions. Fly it over the radio "
-            "with fly_policy."
-        )
-    if level == Control.rotor_vel and len(interface.ranges) != 4:
-        raise ConfigError(f"expected four rotors, got {len(interface.ranges)}. Use a quadrotor.")
+    require(
+        level != Control.state,
+        "expected a policy that commands attitudes or a lower level, got one of positions. Fly it over the radio "
+        "with fly_policy.",
+    )
+    require(
+        level != Control.rotor_vel or len(interface.ranges) == 4,
+        f"expected four rotors, got {len(interface.ranges)}. Use a quadrotor.",
+    )
     header, source = as_path(folder) / HEADER_FILE, as_path(folder) / SOURCE_FILE
     to_c(policy, header, meta)
     write_file(source, "\n".join(_source_lines(meta, level, airframe, freq)) + "\n")

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError, RenderError, short_repr
+from crazysim.errors import ConfigError, RenderError, expect, require
 from crazysim.storage import as_path
 from crazysim.train.config import TrainConfig
 from crazysim.train.convolution import images_of
@@ -206,10 +206,7 @@ def make_variants(
         ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
             is not one of ``SWEEPABLE`` or is also in ``config``.
     """
-    if not isinstance(sweep, Mapping):
-        raise ConfigError(
-            f"expected sweep as a dict of values by name, got {short_repr(sweep)}. Use {{'clip': [0.1, 0.2]}}."
-        )
+    expect(isinstance(sweep, Mapping), "sweep as a dict of values by name", sweep, "Use {'clip': [0.1, 0.2]}.")
     for name, values in {"seeds": seeds, **sweep}.items():
         _require_iterable(name, values)
     values_by_name: dict[str, list[Any]] = {
@@ -221,17 +218,16 @@ def make_variants(
             f"several calls."
         )
     for name, values in values_by_name.items():
-        if not values or len(set(map(str, values))) < len(values):
-            raise ConfigError(
-                f"expected at least one value of {name}, and each once, got {values or 'none'}. Leave out the others."
-            )
-        if name != "seeds" and name not in SWEEPABLE:
-            raise ConfigError(
-                f"expected hyperparameters to sweep among {', '.join(SWEEPABLE)}, got {name}, on which shapes or "
-                f"counters depend. Train its values one after another, with --config {name}=VALUE and --out."
-            )
-        if name in config:
-            raise ConfigError(f"expected {name} to be swept or given, got both. Leave it out of the config.")
+        require(
+            values and len(set(map(str, values))) == len(values),
+            f"expected at least one value of {name}, and each once, got {values or 'none'}. Leave out the others.",
+        )
+        require(
+            name == "seeds" or name in SWEEPABLE,
+            f"expected hyperparameters to sweep among {', '.join(SWEEPABLE)}, got {name}, on which shapes or "
+            f"counters depend. Train its values one after another, with --config {name}=VALUE and --out.",
+        )
+        require(name not in config, f"expected {name} to be swept or given, got both. Leave it out of the config.")
     names = list(sweep)
     return {
         "-".join([*(f"{name}-{value}" for name, value in zip(names, values, strict=True)), f"seed-{seed}"]): (
@@ -266,8 +262,10 @@ def _train_teacher(
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
         return False
     require_no_run(folder)
-    if resume and not (folder / TEACHER_FOLDER / CHECKPOINT_FILE).exists():
-        raise ConfigError(f"expected a run to resume in {folder}, got none. Train without --resume first.")
+    require(
+        not resume or (folder / TEACHER_FOLDER / CHECKPOINT_FILE).exists(),
+        f"expected a run to resume in {folder}, got none. Train without --resume first.",
+    )
     _check_student(student)
     log(
         f"first the teacher of {student.title}, then the student by {student.algorithm}; if the teacher is "
@@ -301,17 +299,19 @@ def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
 def _stored_config(folder: Path) -> TrainConfig:
     """Return the configuration of the run in a folder, which must have a single training."""
     configs = stored_configs(folder)
-    if list(configs) != [""]:
-        raise ConfigError(
-            f"expected a run of one training in {folder}, got one of {', '.join(configs)}. Resume it with the same "
-            f"--seeds and --sweep."
-        )
+    require(
+        list(configs) == [""],
+        f"expected a run of one training in {folder}, got one of {', '.join(configs)}. Resume it with the same "
+        f"--seeds and --sweep.",
+    )
     return configs[""]
 
 
 def _require_iterable(name: str, values: object) -> None:
     """Check that an argument is a list of values, or another iterable."""
-    if not np.iterable(values) or isinstance(values, str):
-        raise ConfigError(
-            f"expected {name} as a list of values, got {short_repr(values)}. Use [{values!r}], for example."
-        )
+    expect(
+        np.iterable(values) and not isinstance(values, str),
+        f"{name} as a list of values",
+        values,
+        f"Use [{values!r}], for example.",
+    )

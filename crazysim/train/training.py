@@ -32,7 +32,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
-from crazysim.errors import ConfigError, DivergedError, require_callable, warn
+from crazysim.errors import ConfigError, DivergedError, require, require_callable, warn
 from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
 from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, open_replacement, read_text, write_file
@@ -366,11 +366,11 @@ def train_many(
 
 def require_no_run(folder: Path) -> None:
     """Raise ``ConfigError`` if a folder holds the checkpoint of a run."""
-    if (folder / CHECKPOINT_FILE).exists():
-        raise ConfigError(
-            f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
-            f"with --out"
-        )
+    require(
+        not (folder / CHECKPOINT_FILE).exists(),
+        f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
+        f"with --out",
+    )
 
 
 @dataclass
@@ -510,8 +510,9 @@ def load_policy(
         ConfigError: If the folder holds no policy that this version can read, or its policy has another network.
     """
     folder = as_path(folder)
-    if folder.is_file():
-        raise ConfigError(f"expected the folder of a run, got the file {str(folder)!r}. Use {str(folder.parent)!r}.")
+    require(
+        not folder.is_file(), f"expected the folder of a run, got the file {str(folder)!r}. Use {str(folder.parent)!r}."
+    )
     path = folder / POLICY_FILE
     if not path.exists() and (folder / TABLE_FILE).exists():
         names = [row["name"] for row in json.loads(read_text(folder / TABLE_FILE, MAX_TEXT_BYTES))]
@@ -594,12 +595,12 @@ def _read_run(
                 f"new run in another folder with --out"
             )
         runs = meta["runs"]
-        if list(runs) != list(configs):
-            raise ConfigError(
-                f"expected the seeds and the sweep of {path}, {', '.join(runs) or 'none'}, got "
-                f"{', '.join(configs) or 'none'}; resume with the same ones, or start a new run in another folder with "
-                f"--out"
-            )
+        require(
+            list(runs) == list(configs),
+            f"expected the seeds and the sweep of {path}, {', '.join(runs) or 'none'}, got "
+            f"{', '.join(configs) or 'none'}; resume with the same ones, or start a new run in another folder with "
+            f"--out",
+        )
         for name, config in configs.items():
             _require_same_settings(path, runs[name]["settings"], config)
         return arrays, runs, meta["code"], float(meta["seconds"])
