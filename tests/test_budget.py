@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 5804,
     "envs": 3830,
     "geometry": 1089,
-    "lab": 9874,
+    "lab": 9751,
     "media": 986,
     "plugins": 7268,
     "scene": 3102,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, not_installed, require
 from crazysim.lab.identify.columns import Columns, without_huge_numbers
 from crazysim.lab.identify.readers import Stream, resample
 from crazysim.storage import check_file, read_text
@@ -183,8 +183,7 @@ def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, s
                 f"{name}: expected fields {', '.join(fields.values())} of {topic} ({kind}), got {error}. "
                 f"ros2 interface show {kind} lists its fields."
             ) from error
-    if not rows:
-        raise ConfigError(f"{name}: expected messages of {topic}, got none. Record it while the drone flies.")
+    require(rows, f"{name}: expected messages of {topic}, got none. Record it while the drone flies.")
     columns: dict[str, NDArray] = {}
     for column, values in zip(fields, zip(*rows, strict=True), strict=True):
         x = without_huge_numbers(np.array(values, np.float64))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import without_huge_numbers
 from crazysim.lab.identify.delimited import parse_number, split_rows
 from crazysim.lab.identify.readers import decimate
@@ -62,8 +62,10 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         key, _, unit_text = name.partition(" (")
         units[key] = unit_text.rstrip(")")
     keys = list(units)
-    if len(keys) != len(names):
-        raise ConfigError(f"{path.name}: expected columns of different names, got some twice. Export the log again.")
+    require(
+        len(keys) == len(names),
+        f"{path.name}: expected columns of different names, got some twice. Export the log again.",
+    )
     names_read = [
         key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
     ]
@@ -87,8 +89,10 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     resolution_factor = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
     gyro_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(units["gyroADC[0]"], math.pi / 180 / resolution_factor)
     poles = parse_number(settings.get("motor_poles", str(MOTOR_POLES)))
-    if not 2 <= poles < math.inf:
-        raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
+    require(
+        2 <= poles < math.inf,
+        f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.",
+    )
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(units["time"], 1e-6)}
     table |= {f"w{axis}": gyro_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
     table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}

@@ -10,7 +10,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 NAME_COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
 """Allowed numbers of column names of a field; 0 where the field may be absent."""
@@ -77,8 +77,10 @@ class Columns:
                 got, order = repr(names) if isinstance(names, str) else len(names), NAME_ORDERS.get(key, "x, y, z")
                 raise ConfigError(f"expected {counts[-1]} names of columns as {key}, got {got}. Give {order}.")
         for key, x in vars(self).items():
-            if "_per_" in key and not (isinstance(x, Real) and math.isfinite(x) and x != 0):
-                raise ConfigError(f"expected a finite number that is not zero as {key}, got {x!r}")
+            require(
+                "_per_" not in key or (isinstance(x, Real) and math.isfinite(x) and x != 0),
+                f"expected a finite number that is not zero as {key}, got {x!r}",
+            )
 
     @property
     def names(self) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify import motion as motion_module
 from crazysim.lab.identify.checks import check_motion
 from crazysim.lab.identify.columns import (
@@ -97,11 +97,11 @@ def read_log(
     """
     repairs: list[str] = []
     if isinstance(columns, str):
-        if columns not in KNOWN_COLUMNS:
-            raise ConfigError(
-                f"expected columns as one of {', '.join(KNOWN_COLUMNS)} or a Columns, got {columns!r}. "
-                "Name the columns in a Columns."
-            )
+        require(
+            columns in KNOWN_COLUMNS,
+            f"expected columns as one of {', '.join(KNOWN_COLUMNS)} or a Columns, got {columns!r}. "
+            "Name the columns in a Columns.",
+        )
         columns = KNOWN_COLUMNS[columns]
     name, table = read_table(path, repairs, columns)
     if motion is not None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns, stack_columns, unsigned_name
 from crazysim.lab.identify.readers import Stream, resample
 
@@ -56,11 +56,11 @@ def join_motion_capture(
         is_valid = np.isfinite(times) & np.all(np.isfinite(rates), axis=-1)
         order = np.unique(times[is_valid], return_index=True)[1]
         span = np.ptp(times[is_valid]) if len(order) > 1 else 0.0
-        if not 0 < span < MAX_MEAN_INTERVAL * len(order):
-            raise ConfigError(
-                f"{name}: expected samples at least every {MAX_MEAN_INTERVAL:g} s on average, got {len(order)} valid "
-                f"samples over {span:.3g} s. Cut the log and its motion capture to the flight."
-            )
+        require(
+            0 < span < MAX_MEAN_INTERVAL * len(order),
+            f"{name}: expected samples at least every {MAX_MEAN_INTERVAL:g} s on average, got {len(order)} valid "
+            f"samples over {span:.3g} s. Cut the log and its motion capture to the flight.",
+        )
         grid = np.arange(times[is_valid].min(), times[is_valid].max(), LAG_STEP)
         speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(n_smoothing) / n_smoothing, "same")))

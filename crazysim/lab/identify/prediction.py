@@ -17,7 +17,7 @@ from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import not_installed, require
 from crazysim.lab.identify.logs import Log
 from crazysim.plugins.effects.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
 from crazysim.pytree import PyTree
@@ -150,11 +150,11 @@ def cut_windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
             for key, values in pieces.items():
                 padding = PADDING if key == "rotor_vel" else 0
                 values.append(getattr(log, key)[start - padding : start + n + padding])
-    if not pieces["pos"]:
-        raise ConfigError(
-            f"expected a log longer than {duration:g} s plus {2 * PADDING + 1} samples without a gap, got none. "
-            "Use longer logs."
-        )
+    require(
+        pieces["pos"],
+        f"expected a log longer than {duration:g} s plus {2 * PADDING + 1} samples without a gap, got none. "
+        "Use longer logs.",
+    )
     return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
 
 

@@ -65,8 +65,9 @@ def resample(
         order = order[np.isfinite(stream.t[order])]
         if len(order) < len(stream.t) or np.any(np.diff(stream.t) <= 0):
             repairs.append(f"sorted {key} and left out {len(stream.t) - len(order)} samples with the time of another")
-        if len(order) < 2:
-            raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
+        require(
+            len(order) >= 2, f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often."
+        )
         values = {c: without_huge_numbers(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIOD_RANGE[1] and not set(values) <= slow_columns:
@@ -140,11 +141,11 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
         "Tables need the ending .csv or .npz, PX4's logs .ulg, ROS bags .bag, .mcap or .db3.",
     )
     version, n_events = struct.unpack_from("<HH", content, 1)
-    if version not in (1, 2):
-        raise ConfigError(
-            f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
-            "firmware's tools/usdlog."
-        )
+    require(
+        version in (1, 2),
+        f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
+        "firmware's tools/usdlog.",
+    )
     end = len(content) - 4
     if crc32(content[:end]) != struct.unpack_from("<I", content, end)[0]:
         repairs.append("the checksum does not match: read up to the last whole record")
@@ -179,8 +180,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
                 attitude = decompress_quat(values[x].astype(np.uint32))
                 values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
             streams[name] = Stream(table[:, 0], values)
-    if not streams:
-        raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
+    require(streams, f"{path.name}: expected records, got none. Start the log before the flight.")
     if columns is not None:
         streams = {key: x for key, x in streams.items() if set(columns.names) & set(x.columns)} or streams
     return resample(path.name, streams, repairs, columns)

@@ -7,7 +7,7 @@ from bisect import bisect_left
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 MAX_REPAIRED_SHARE = 0.05
 """Largest share of samples that may be repaired; a log with more is an error."""
@@ -73,11 +73,11 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
             f"{name}: expected a different time for each sample, got {n_different} times of {len(t)} samples. "
             "Export the time with more digits, or name another column as time."
         )
-    if len(t) < MIN_SAMPLES or n_bad > MAX_REPAIRED_SHARE * len(t):
-        raise ConfigError(
-            f"{name}: expected at least {MIN_SAMPLES} samples whose time increases, got {len(t)} of which {n_bad} do "
-            "not. Cut the log into flights."
-        )
+    require(
+        len(t) >= MIN_SAMPLES and n_bad <= MAX_REPAIRED_SHARE * len(t),
+        f"{name}: expected at least {MIN_SAMPLES} samples whose time increases, got {len(t)} of which {n_bad} do "
+        "not. Cut the log into flights.",
+    )
     if n_bad:
         repairs.append(f"dropped {n_bad} samples whose time is not between those of their neighbours")
     return is_kept
@@ -162,11 +162,11 @@ def interpolate_missing(
             lost_keys.append(key)
             is_kept &= is_known
         n_filled = int(np.sum(is_known & ~is_valid))
-        if n_filled > MAX_REPAIRED_SHARE * len(t):
-            raise ConfigError(
-                f"{name}: expected finite {key}, got {n_filled} samples of {len(t)} that are not. "
-                "Cut the log to where it is whole, or leave the column out."
-            )
+        require(
+            n_filled <= MAX_REPAIRED_SHARE * len(t),
+            f"{name}: expected finite {key}, got {n_filled} samples of {len(t)} that are not. "
+            "Cut the log to where it is whole, or leave the column out.",
+        )
         if n_filled:
             repairs.append(
                 f"interpolated {n_filled} samples of {key} that were not finite{' or zero' * (key == 'quat')}"
@@ -200,10 +200,10 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
     order = np.argsort(smoothed)
     weight = np.cumsum(smoothed[order] ** 2)  # Idling rotors have little weight, however long they idle.
     median_thrust = smoothed[order[np.searchsorted(weight, weight[-1] / 2)]]
-    if not median_thrust > 0:
-        raise ConfigError(
-            f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log."
-        )
+    require(
+        median_thrust > 0,
+        f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log.",
+    )
     is_low = np.r_[False, smoothed < CARRIED_SHARE * median_thrust, False]
     starts, ends = np.flatnonzero(np.diff(is_low.astype(int)) == 1), np.flatnonzero(np.diff(is_low.astype(int)) == -1)
     is_kept = np.ones(len(t), bool)
@@ -230,11 +230,11 @@ def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
     """Return rotor speeds, interpolated where they are negative or more than three times their median. (n, n_rotors)"""
     is_valid = (x >= 0) & (x <= 3 * np.median(x, axis=0))
     n_invalid = int(np.sum(~is_valid))
-    if n_invalid > MAX_REPAIRED_SHARE * x.size:
-        raise ConfigError(
-            f"{name}: expected rotor speeds from 0 to three times their median, got {n_invalid} others. "
-            "Cut the log to the flight, and check that the columns are speeds."
-        )
+    require(
+        n_invalid <= MAX_REPAIRED_SHARE * x.size,
+        f"{name}: expected rotor speeds from 0 to three times their median, got {n_invalid} others. "
+        "Cut the log to the flight, and check that the columns are speeds.",
+    )
     if not n_invalid:
         return x
     repairs.append(f"interpolated {n_invalid} rotor speeds that were negative or more than three times the median")

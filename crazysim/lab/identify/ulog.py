@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim import rotation
-from crazysim.errors import ConfigError, DamagedFileError
+from crazysim.errors import ConfigError, DamagedFileError, require
 from crazysim.lab.identify.columns import without_huge_numbers
 from crazysim.lab.identify.readers import Stream, resample
 from crazysim.lab.identify.repairs import unwrap_angles
@@ -141,10 +141,11 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
         DamagedFileError: If the file is not a ULog, or a topic has no format.
     """
     content = path.read_bytes()
-    if len(content) < HEADER_SIZE or not content.startswith(MAGIC):
-        raise DamagedFileError(
-            f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
-        )
+    require(
+        len(content) >= HEADER_SIZE and content.startswith(MAGIC),
+        f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again.",
+        DamagedFileError,
+    )
     message_header, formats, ids, payloads = struct.Struct("<HB"), {}, {}, {}
     offset, n_skipped_bytes, n_dropouts = HEADER_SIZE, 0, 0
     while offset + message_header.size <= len(content):
@@ -214,12 +215,16 @@ def _read_layout(
                 else _read_layout(file, formats, kind, f"{path}.", depth + 1)
             )
             fields += field_layout
-            if not field_layout or len(fields) > MAX_MESSAGE_BYTES:
-                raise DamagedFileError(
-                    f"{file}: expected a format of 1 to {MAX_MESSAGE_BYTES} bytes, got another of {quoted}. {remedy}"
-                )
+            require(
+                field_layout and len(fields) <= MAX_MESSAGE_BYTES,
+                f"{file}: expected a format of 1 to {MAX_MESSAGE_BYTES} bytes, got another of {quoted}. {remedy}",
+                DamagedFileError,
+            )
     while not depth and fields and fields[-1][0].startswith("_padding"):
         fields.pop()
-    if len({field for field, _ in fields}) < len(fields):
-        raise DamagedFileError(f"{file}: expected fields of different names in {quoted}, got some twice. {remedy}")
+    require(
+        len({field for field, _ in fields}) == len(fields),
+        f"{file}: expected fields of different names in {quoted}, got some twice. {remedy}",
+        DamagedFileError,
+    )
     return fields

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.browser_panel import BrowserPanel
 from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
@@ -75,8 +75,7 @@ class Browser(Viewer[Live]):
             plot: Quantity that is plotted at first.
         """
         for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
-            if not np.isfinite(value) or value < 0:
-                raise ConfigError(f"expected a {name} of 0 or more, got {value!r}")
+            require(np.isfinite(value) and value >= 0, f"expected a {name} of 0 or more, got {value!r}")
         self._access = Access(host, port)
         self._worlds, self._spacing = worlds, spacing
         self._trail, self._contacts, self._wind = float(trail), contacts, wind

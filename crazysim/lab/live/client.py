@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.lab.show_files.show_trajectory import format_trajectory
 from crazysim.storage import Closeable, read_bytes
@@ -65,8 +65,7 @@ class DroneClient(_Client):
         Raises:
             ConfigError: If there is no server, or the drone is not free.
         """
-        if not 1 <= drone <= 99:
-            raise ConfigError(f"expected the ID of a drone from 1 to 99, got {drone!r}")
+        require(1 <= drone <= 99, f"expected the ID of a drone from 1 to 99, got {drone!r}")
         super().__init__(host, port, timeout)
         try:
             self._socket.sendall(f"REQ_{drone:02d}".encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.framing import Message, ShowFile
 from crazysim.lab.show_files import Show
 from crazysim.lab.show_files.show_trajectory import parse_trajectory
@@ -111,18 +111,18 @@ def parse_command(message: Message | ShowFile, drone: int | None = None) -> Comm
             raise ConfigError(f"expected a trajectory in JSON after {name!r}, got none")
         value = checks.parse_json(message.payload, "a received trajectory")
         return Upload(drone, parse_trajectory(value, "a received trajectory")[0])
-    if message.payload is not None:
-        raise ConfigError(f"expected no JSON after {name!r}, got one")
+    require(message.payload is None, f"expected no JSON after {name!r}, got one")
     if name == "takeoff":
         return TakeOff(drone, _parse_number(argument, 0.0, MAX_HEIGHT))
     if name == "start":
-        if argument.lower() not in ("absolute", "abs", "relative", "rel", ""):
-            raise ConfigError(f"expected start_absolute or start_relative, got {argument!r}")
+        require(
+            argument.lower() in ("absolute", "abs", "relative", "rel", ""),
+            f"expected start_absolute or start_relative, got {argument!r}",
+        )
         return Start(drone, argument.lower().startswith("rel"))
     if name == "param":
         parameter, separator, value = argument.partition("=")
-        if not separator or not parameter:
-            raise ConfigError(f"expected param_NAME=VALUE, got {argument!r}")
+        require(separator and parameter, f"expected param_NAME=VALUE, got {argument!r}")
         return SetParameter(drone, parameter, _parse_number(value, -math.inf, math.inf))
     commands_without_argument = {"land": Land, "hover": Hover}
     if name in commands_without_argument:
@@ -137,6 +137,8 @@ def _parse_number(text: str, low: float, high: float) -> float:
         value = float(text)
     except ValueError:
         raise ConfigError(f"expected a number, got {text[:40]!r}") from None
-    if not math.isfinite(value) or not low < value <= high:
-        raise ConfigError(f"expected a number above {low:g} and up to {high:g}, got {value!r}")
+    require(
+        math.isfinite(value) and low < value <= high,
+        f"expected a number above {low:g} and up to {high:g}, got {value!r}",
+    )
     return value

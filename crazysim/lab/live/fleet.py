@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.lab.live.host_trajectory import HostTrajectory
@@ -65,14 +65,16 @@ class Fleet:
             teleport: True to move a drone to the start of its first trajectory, if no command has moved it before.
             name: Name of the plugin that follows the trajectories.
         """
-        if sim.n_worlds != 1:
-            raise ConfigError(
-                f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories in several worlds."
-            )
+        require(
+            sim.n_worlds == 1,
+            f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories in several worlds.",
+        )
         self.sim, self.teleport = sim, teleport
         self.ids = dict(ids or {})
-        if len(set(self.ids.values())) < len(self.ids) or not all(0 <= i < sim.n_drones for i in self.ids.values()):
-            raise ConfigError(f"expected one drone of {sim.n_drones} for each ID, got {self.ids}")
+        require(
+            len(set(self.ids.values())) == len(self.ids) and all(0 <= i < sim.n_drones for i in self.ids.values()),
+            f"expected one drone of {sim.n_drones} for each ID, got {self.ids}",
+        )
         pos = np.asarray(sim.data.states.pos[0], float)
         self._active_trajectories = [_hover_trajectory(np.append(p, 0.0)) for p in pos]
         self._start_times = np.zeros(sim.n_drones)
@@ -132,8 +134,10 @@ class Fleet:
     def _apply_command(self, command: Command) -> None:
         if isinstance(command, LoadShow):
             show = command.show
-            if show.n_drones > self.sim.n_drones:
-                raise ConfigError(f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}")
+            require(
+                show.n_drones <= self.sim.n_drones,
+                f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}",
+            )
             trajectories = [_remove_padding(show.trajectory(i)) for i in range(show.n_drones)]
             for trajectory in trajectories:
                 self._check_trajectory(trajectory)
@@ -141,8 +145,7 @@ class Fleet:
                 self._receive_trajectory(drone, trajectory)
             self._lights, self._show_start = show.lights, None
         elif isinstance(command, StartShow):
-            if not self._uploaded_trajectories:
-                raise ConfigError("expected trajectories to start, got none. Upload some first.")
+            require(self._uploaded_trajectories, "expected trajectories to start, got none. Upload some first.")
             for drone in self._uploaded_trajectories:
                 self._start_trajectory(drone, relative=False)
             self._show_start = self._current_time()
@@ -188,16 +191,16 @@ class Fleet:
 
     def _check_trajectory(self, trajectory: Trajectory) -> None:
         n_pieces = self.follow.read(self.sim.data).ends.shape[1]
-        if np.ndim(trajectory.ends) != 1 or trajectory.degree > MAX_DEGREE:
-            raise ConfigError(
-                f"expected a trajectory of one vehicle of degree {MAX_DEGREE} or less, got ends of shape "
-                f"{np.shape(trajectory.ends)} and degree {trajectory.degree}. Fit shorter pieces."
-            )
-        if trajectory.n_pieces > n_pieces:
-            raise ConfigError(
-                f"expected a trajectory of at most {n_pieces} pieces, got {trajectory.n_pieces}. Use "
-                f"Fleet(..., max_pieces={trajectory.n_pieces})."
-            )
+        require(
+            np.ndim(trajectory.ends) == 1 and trajectory.degree <= MAX_DEGREE,
+            f"expected a trajectory of one vehicle of degree {MAX_DEGREE} or less, got ends of shape "
+            f"{np.shape(trajectory.ends)} and degree {trajectory.degree}. Fit shorter pieces.",
+        )
+        require(
+            trajectory.n_pieces <= n_pieces,
+            f"expected a trajectory of at most {n_pieces} pieces, got {trajectory.n_pieces}. Use "
+            f"Fleet(..., max_pieces={trajectory.n_pieces}).",
+        )
 
     def _receive_trajectory(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded_trajectories[drone] = trajectory

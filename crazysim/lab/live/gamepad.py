@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.loop import Live
 
 DEADBAND = 0.12
@@ -39,8 +39,7 @@ class Gamepad:
         self._glfw = _import_glfw() if glfw is None else glfw
         numbers = range(N_JOYSTICKS) if number is None else [number]
         gamepads = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
-        if not gamepads:
-            raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
+        require(gamepads, "expected a gamepad, got none. Connect it before the program starts.")
         self._number = gamepads[0]
         self._callbacks: dict[int, Callable[[Live], object]] = {}
         self._last_buttons: list[int] = []
@@ -92,8 +91,7 @@ def _import_glfw() -> Any:
 
     with warnings.catch_warnings(action="ignore"):
         is_initialized = glfw.init()
-    if not is_initialized:
-        raise ConfigError(
-            "expected a screen, which GLFW needs for gamepads, got none. Run on a machine with a display."
-        )
+    require(
+        is_initialized, "expected a screen, which GLFW needs for gamepads, got none. Run on a machine with a display."
+    )
     return glfw

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.keyboard import Keyboard
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
 from crazysim.lab.live.viewer import Button, Slider, Widget
@@ -61,23 +61,24 @@ class Interaction:
         self, name: str, low: float, high: float, value: float, callback: Callable[[Self, float], object]
     ) -> None:
         """Add a slider to viewers that are shown from now on; the function is called with the loop and the value."""
-        if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
-            raise ConfigError(
-                f"expected low < high, and a value between them, of slider {name!r}, got low {low!r}, value {value!r} "
-                f"and high {high!r}"
-            )
-        if name in self.slider_values:
-            raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
+        require(
+            np.isfinite([low, high]).all() and low < high and low <= value <= high,
+            f"expected low < high, and a value between them, of slider {name!r}, got low {low!r}, value {value!r} "
+            f"and high {high!r}",
+        )
+        require(
+            name not in self.slider_values, f"expected a new name of a slider, got {name!r} twice. Use another name."
+        )
         self.widgets.append(Slider(name, low, high, value, partial(callback, self)))
         self.slider_values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
         """Move a slider, clipped to its limits, and call its function."""
         slider = next((slider for slider in self._sliders if slider.name == name), None)
-        if slider is None or not np.isfinite(value):
-            raise ConfigError(
-                f"expected a slider of {list(self.slider_values)} and a finite value, got {name!r}, {value!r}"
-            )
+        require(
+            slider is not None and np.isfinite(value),
+            f"expected a slider of {list(self.slider_values)} and a finite value, got {name!r}, {value!r}",
+        )
         self.slider_values[name] = float(np.clip(value, slider.low, slider.high))
         slider.callback(self.slider_values[name])
 
@@ -108,11 +109,11 @@ class Interaction:
 
     def select(self, world: int, drone: int) -> None:
         """Select a drone to follow, plot and pilot."""
-        if world not in range(self.sim.n_worlds) or drone not in range(self.sim.n_drones):
-            raise ConfigError(
-                f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
-                f"{world!r} and {drone!r}"
-            )
+        require(
+            world in range(self.sim.n_worlds) and drone in range(self.sim.n_drones),
+            f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
+            f"{world!r} and {drone!r}",
+        )
         self.selected, self._followed_body = (int(world), int(drone)), None
 
     def select_next(self) -> None:
@@ -138,8 +139,7 @@ class Interaction:
         if kind == DRONE:
             self.select(world, index)
             return
-        if world not in range(self.sim.n_worlds):
-            raise ConfigError(f"expected a world below {self.sim.n_worlds}, got {world!r}")
+        require(world in range(self.sim.n_worlds), f"expected a world below {self.sim.n_worlds}, got {world!r}")
         self.sim.scene.compile_if_edited()
         SceneBodies(self.sim).find(kind, index)
         self._followed_body = int(world), kind, int(index)

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 L = TypeVar("L")
 
@@ -54,8 +54,10 @@ class Keyboard(Generic[L]):
 
     def bind(self, key: str, callback: Callable[[L], object]) -> None:
         """Make a key call a function of the loop when it is pressed, instead of its previous function."""
-        if key not in KEY_NAMES and (len(key) != 1 or key != key.lower()):
-            raise ConfigError(f"expected a lower-case character or one of {', '.join(KEY_NAMES)} as a key, got {key!r}")
+        require(
+            key in KEY_NAMES or (len(key) == 1 and key == key.lower()),
+            f"expected a lower-case character or one of {', '.join(KEY_NAMES)} as a key, got {key!r}",
+        )
         self._callbacks[key] = callback
 
     def run(self, live: L) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.swarm import DroneState, Swarm
 from crazysim.tables import read_numbers
@@ -129,19 +129,19 @@ class TrainedPolicy:
         self._names = list(self.interface.sizes)
         self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
         unknown_names = sorted(set(self._names) - set(self._compute_observations(_rest_state())))
-        if unknown_names:
-            raise ConfigError(
-                f"expected observations of a drone's state, got {', '.join(unknown_names)}. Use a policy without them."
-            )
+        require(
+            not unknown_names,
+            f"expected observations of a drone's state, got {', '.join(unknown_names)}. Use a policy without them.",
+        )
 
     def require_commands(self, level: str, freq: float) -> None:
         """Check that a flight has the command level and the rate of the training, if they are known."""
-        if (level, freq) != (self.interface.level, self.interface.freq or freq):
-            raise ConfigError(
-                f"expected {self.interface.level} commands at {self.interface.freq or freq} Hz, as in the policy's "
-                f"training, got {level} commands at {freq} Hz. Use fly_policy(..., freq=meta['freq'], "
-                f"level=meta['actions']['level'])."
-            )
+        require(
+            (level, freq) == (self.interface.level, self.interface.freq or freq),
+            f"expected {self.interface.level} commands at {self.interface.freq or freq} Hz, as in the policy's "
+            f"training, got {level} commands at {freq} Hz. Use fly_policy(..., freq=meta['freq'], "
+            f"level=meta['actions']['level']).",
+        )
 
     def reset(self) -> None:
         """Restore the initial memory of a recurrent policy, before a new flight."""

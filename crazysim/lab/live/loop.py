@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.settings import positive_integer
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
 from crazysim.lab.live.pace import LiveReport, Pace, Speed, protect_loop
@@ -76,11 +76,12 @@ class Live(Interaction, Closeable):
             n_snapshots: Largest number of snapshots to keep in addition to the first.
         """
         control_freq = positive_integer("control_freq", control_freq)
-        if sim.freq % control_freq:
-            raise ConfigError(f"expected a control_freq that divides freq={sim.freq} Hz, got {control_freq!r} Hz")
+        require(
+            sim.freq % control_freq == 0,
+            f"expected a control_freq that divides freq={sim.freq} Hz, got {control_freq!r} Hz",
+        )
         for name, value in (("fps", fps), ("snapshot_s", snapshot_s)):
-            if not np.isfinite(value) or value <= 0:
-                raise ConfigError(f"expected a positive {name}, got {value!r}")
+            require(np.isfinite(value) and value > 0, f"expected a positive {name}, got {value!r}")
         super().__init__(sim)
         self.control_freq = control_freq
         self.n_substeps = sim.freq // control_freq
@@ -148,8 +149,7 @@ class Live(Interaction, Closeable):
         advances from there. Processes and events are called on the way. After a jump backwards, ``reset(live)`` of the
         processes is called first.
         """
-        if not np.isfinite(time) or time < 0:
-            raise ConfigError(f"expected a time of 0 s or more, got {time!r}")
+        require(np.isfinite(time) and time >= 0, f"expected a time of 0 s or more, got {time!r}")
         self._between_steps(lambda _: self._go_to(round(time * self.control_freq)))
 
     def stop(self) -> None:
@@ -184,10 +184,8 @@ class Live(Interaction, Closeable):
             on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for external
                 sources such as motion capture.
         """
-        if not callable(process):
-            raise ConfigError(f"expected a function of the loop, got {process!r}")
-        if on_error not in ("raise", "report"):
-            raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
+        require(callable(process), f"expected a function of the loop, got {process!r}")
+        require(on_error in ("raise", "report"), f"expected on_error 'raise' or 'report', got {on_error!r}")
         label = str(name or getattr(process, "__name__", type(process).__name__))
         period = steps_per_call(freq, self.control_freq, label)
         reset, compile_fn = (partial(getattr(process, x, lambda _: None), self) for x in ("reset", "compile"))
@@ -197,8 +195,7 @@ class Live(Interaction, Closeable):
     def call_at(self, time: float, callback: Callable[[Live], object], name: str | None = None) -> None:
         """Call a function with the loop when the simulation reaches a time, s, and again after every reset."""
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
-        if step < self.step:
-            raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
+        require(step >= self.step, f"expected a time of {self.time:g} s or later, got {time!r}")
         self._events[step].append(Event(step, partial(callback, self), name or getattr(callback, "__name__", "event")))
 
     def show(self, viewer: V) -> V:
@@ -251,8 +248,10 @@ class Live(Interaction, Closeable):
         Args:
             seconds: Simulated time, s; None for no end.
         """
-        if seconds is not None and (not np.isfinite(seconds) or seconds <= 0):
-            raise ConfigError(f"expected a positive duration, s, got {seconds!r}")
+        require(
+            seconds is None or (np.isfinite(seconds) and seconds > 0),
+            f"expected a positive duration, s, got {seconds!r}",
+        )
         end = None if seconds is None else self.n_steps_run + round(seconds * self.control_freq)
         self._is_stopped = False
         self._warm_up()

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.process import Process
 
 Speed = float | Literal["max"]
@@ -39,8 +39,10 @@ def check_speed(speed: Speed) -> Speed:
     """
     if speed == "max":
         return "max"
-    if isinstance(speed, (bool, str)) or not np.isfinite(speed) or speed <= 0:
-        raise ConfigError(f"expected a positive speed or 'max', got {speed!r}")
+    require(
+        not isinstance(speed, (bool, str)) and np.isfinite(speed) and speed > 0,
+        f"expected a positive speed or 'max', got {speed!r}",
+    )
     return float(speed)
 
 

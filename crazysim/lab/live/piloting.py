@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.attitude import from_yaw, yaw_from_quat
 from crazysim.lab.live.loop import Live
 
@@ -73,11 +73,9 @@ class Pilot:
             high: Upper limits, m. (3,)
         """
         for name, value in (("speed", speed), ("yaw_rate", yaw_rate)):
-            if not np.isfinite(value) or value <= 0:
-                raise ConfigError(f"expected a positive {name}, got {value!r}")
+            require(np.isfinite(value) and value > 0, f"expected a positive {name}, got {value!r}")
         self._low, self._high = (np.broadcast_to(np.asarray(x, float), 3) for x in (low, high))
-        if not (self._low <= self._high).all():
-            raise ConfigError(f"expected low <= high, got {low!r} and {high!r}")
+        require((self._low <= self._high).all(), f"expected low <= high, got {low!r} and {high!r}")
         self._sticks, self._speed, self._yaw_rate = tuple(sticks), float(speed), float(yaw_rate)
 
     def __call__(self, live: Live) -> None:
@@ -115,10 +113,10 @@ class Pilot:
 
 def require_state_control(live: Live) -> None:
     """Check that setpoints can be commanded."""
-    if live.sim.control != Control.state:
-        raise ConfigError(
-            f"expected a simulation with control='state', got {live.sim.control.value!r}. Use Sim(control='state')."
-        )
+    require(
+        live.sim.control == Control.state,
+        f"expected a simulation with control='state', got {live.sim.control.value!r}. Use Sim(control='state').",
+    )
 
 
 def command_setpoint(command: NDArray) -> NDArray:

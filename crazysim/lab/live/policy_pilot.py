@@ -21,7 +21,7 @@ from crazysim.envs.phases import vectorize_over_worlds
 from crazysim.envs.state import Obs, state_of_data
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import FLOOR, GoalTask
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.loop import Live
 from crazysim.storage import MAX_TEXT_BYTES, open_file, wrap_read_errors
 from crazysim.train.evaluation import act, initial_memory
@@ -62,8 +62,10 @@ class PolicyPilot:
         check_policy(policy, env)
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
-        if self._points is not None and not len(self._points):
-            raise ConfigError("expected at least one point, got none. Use points=None for the goal of the task.")
+        require(
+            self._points is None or len(self._points),
+            "expected at least one point, got none. Use points=None for the goal of the task.",
+        )
         self._set_goal_fn = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
         self._command_fn = jax.jit(partial(_compute_command, env, policy))
         self._memory = self._initial_memory = initial_memory(policy, env)
@@ -86,11 +88,11 @@ class PolicyPilot:
 
     def add_to(self, live: Live) -> None:
         """Fly in a loop from now on; clicks set goals, and viewers mark them."""
-        if live.control_freq != self.env.base.freq:
-            raise ConfigError(
-                f"expected a loop at the rate of the environment, {self.env.base.freq} Hz, got {live.control_freq} Hz. "
-                f"Use Live(env.sim, env.base.freq)."
-            )
+        require(
+            live.control_freq == self.env.base.freq,
+            f"expected a loop at the rate of the environment, {self.env.base.freq} Hz, got {live.control_freq} Hz. "
+            f"Use Live(env.sim, env.base.freq).",
+        )
         live.add(self, name="policy")
         live.on_click, live.goals = self.click, self.goals
 
@@ -130,8 +132,7 @@ class PolicyPilot:
             ConfigError: If the task has no goals that can be set, the goal lies outside of its arena, or no drone is
                 selected.
         """
-        if live.selected is None:
-            raise ConfigError("expected a selected drone, got none. Click on one, or press tab.")
+        require(live.selected is not None, "expected a selected drone, got none. Click on one, or press tab.")
         pos = np.asarray(pos, float)
         self._check_goal(pos)
         self._follows_points[live.selected] = False
@@ -173,10 +174,10 @@ class PolicyPilot:
     def _check_goal(self, pos: NDArray, prefix: str = "") -> None:
         """Check that a point can be a goal."""
         task = self.env.task
-        if type(task).set_goal is Task.set_goal:
-            raise ConfigError(
-                f"{prefix}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover."
-            )
+        require(
+            type(task).set_goal is not Task.set_goal,
+            f"{prefix}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover.",
+        )
         high = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
         low = np.append(-high[:2], FLOOR if self.arena else -np.inf)
         if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= high)).all():
@@ -231,8 +232,7 @@ def read_points(path: str | Path) -> NDArray:
     for number, line in enumerate(lines, 1):
         if text := line.partition("#")[0].strip():
             points.append(parse_point(text, f"{path}, line {number}: "))
-    if not points:
-        raise ConfigError(f"expected points in {path}, got none. Write x,y,z in each line, m.")
+    require(points, f"expected points in {path}, got none. Write x,y,z in each line, m.")
     return np.array(points)
 
 

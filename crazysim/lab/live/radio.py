@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control
 from crazysim.drones import load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, not_installed, require
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
 from crazysim.storage import Closeable
@@ -131,8 +131,7 @@ class Radio(Closeable):
         """Send a command of level state, (16,), attitude, (4,), or body rate, (4,), with the numbers for one drone."""
         level = Control(level)
         sizes = {Control.state: 16, Control.attitude: 4, Control.body_rate: 4}
-        if level not in sizes:
-            raise ConfigError(f"expected a command of level state, attitude or body_rate, got {level.value!r}")
+        require(level in sizes, f"expected a command of level state, attitude or body_rate, got {level.value!r}")
         x = np.asarray(values, float)
         if x.shape != (sizes[level],) or not np.isfinite(x).all():
             raise ConfigError(f"expected {sizes[level]} finite numbers for {level.value}, got {x.tolist()}")
@@ -183,10 +182,9 @@ class Radio(Closeable):
             self._sync_crazyflie = None
 
     def _require_armed(self) -> None:
-        if not self.armed:
-            raise ConfigError(
-                f"expected a link that is armed, got one to {self.name} that is not. Use Radio(..., arm=True)."
-            )
+        require(
+            self.armed, f"expected a link that is armed, got one to {self.name} that is not. Use Radio(..., arm=True)."
+        )
 
     def _set_flight_mode(self, level: Control) -> None:
         """Set whether the firmware reads angles or rates."""

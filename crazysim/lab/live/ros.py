@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.control import Control
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.attitude import rotate, to_rpy
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.swarm import DroneState, Swarm
@@ -93,8 +93,7 @@ class RosBridge:
         Raises:
             ConfigError: If ROS is missing, an object does not exist, or the rate is not positive.
         """
-        if not 0 < freq < math.inf:
-            raise ConfigError(f"expected a positive rate of messages, got {freq} Hz")
+        require(0 < freq < math.inf, f"expected a positive rate of messages, got {freq} Hz")
         self.swarm, self.node, self.frame = swarm, node, frame
         self.messages = m = import_message_classes() if messages is None else messages
         names = swarm.sim.data.objects.names if swarm.sim.data.objects is not None else ()
@@ -204,15 +203,16 @@ class RosBridge:
         self.swarm.commanders[drone].velocity(_read_fields(message.linear), float(message.angular.z))
 
     def _command_pose(self, drone: int, message: Any) -> None:
-        if message.header.frame_id not in ("", self.frame):
-            raise ConfigError(f"expected a pose in the frame {self.frame!r}, got {message.header.frame_id!r}")
+        require(
+            message.header.frame_id in ("", self.frame),
+            f"expected a pose in the frame {self.frame!r}, got {message.header.frame_id!r}",
+        )
         quat = _read_fields(message.pose.orientation, "xyzw")
         self.swarm.commanders[drone].position(_read_fields(message.pose.position), _normalized_rpy(quat)[2])
 
     def _set_thrust(self, drone: int, message: Any) -> None:
         thrust = float(message.data)
-        if not 0 <= thrust < math.inf:
-            raise ConfigError(f"expected a collective thrust of 0 N or more, got {thrust}")
+        require(0 <= thrust < math.inf, f"expected a collective thrust of 0 N or more, got {thrust}")
         self._thrust[drone] = thrust
 
     def _command_attitude(self, drone: int, message: Any) -> None:

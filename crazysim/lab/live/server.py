@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from crazysim.errors import ConfigError, address_message
+from crazysim.errors import ConfigError, address_message, require
 from crazysim.lab.live.commands import Command, parse_command
 from crazysim.lab.live.framing import FramingError, Message, MessageBuffer, Request, ShowFile
 from crazysim.storage import Closeable
@@ -287,8 +287,11 @@ def _read_messages(
         except TimeoutError:
             continue
         if not received:
-            if buffer.has_partial_message:
-                raise FramingError("expected a complete message, got the end of the connection")
+            require(
+                not buffer.has_partial_message,
+                "expected a complete message, got the end of the connection",
+                FramingError,
+            )
             return
         for message in buffer.feed(received):
             deadline = None

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 import crazysim
 from crazysim.core.settings import check_image_size
-from crazysim.errors import ConfigError, RenderError
+from crazysim.errors import ConfigError, RenderError, require
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import Picture, PictureSource, list_quantities
 from crazysim.lab.live.scene_bodies import SceneBodies
@@ -79,8 +79,7 @@ class Window(Viewer[Live]):
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
         check_image_size(self.width, self.height)
-        if not np.isfinite(self.trail) or self.trail < 0:
-            raise ConfigError(f"expected a trail of 0 s or more, got {self.trail!r}")
+        require(np.isfinite(self.trail) and self.trail >= 0, f"expected a trail of 0 s or more, got {self.trail!r}")
         self._process: subprocess.Popen[bytes] | None = None
         self._next_picture: Picture | None = None
         self._picture_changed = threading.Condition()

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import require, short_repr
 from crazysim.storage import ZipReader, wrap_read_errors, write_file
 from crazysim.trajectories.files import checks
 
@@ -57,8 +57,7 @@ class Archive:
         if name in self._parsed:
             return self._parsed[name]
         location = f"{self.location}: {name}"
-        if name not in self._zip.names:
-            raise ConfigError(f"expected a file {name!r} in {self.location}, got an archive without it")
+        require(name in self._zip.names, f"expected a file {name!r} in {self.location}, got an archive without it")
         with wrap_read_errors(location, "a file that can be unpacked", REMEDY):
             self._parsed[name] = checks.parse_json(self._zip.read(name), location)
         return self._parsed[name]

@@ -11,7 +11,7 @@ import binascii
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.show_files.lights import Lights
 
 TIME_UNIT = 0.02
@@ -63,8 +63,7 @@ def decode_lights(
             program = base64.b64decode(program, validate=True)
         except (binascii.Error, ValueError) as error:
             raise ConfigError(f"expected base64 in {location}, got {str(error)[:60]}") from error
-    if len(program) > MAX_BYTES:
-        raise ConfigError(f"expected at most {MAX_BYTES} bytes in {location}, got {len(program)}")
+    require(len(program) <= MAX_BYTES, f"expected at most {MAX_BYTES} bytes in {location}, got {len(program)}")
     machine = _Machine(program, location)
     machine.run(round(until / TIME_UNIT), len(program) + max_repeated)
     return machine.lights()
@@ -189,8 +188,7 @@ def encode_lights(lights: Lights) -> bytes:
         lights: Lights of one drone.
     """
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
-    if times.ndim != 1:
-        raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
+    require(times.ndim == 1, f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
     unit_times = np.maximum(np.round((times - min(times[0], 0.0)) / TIME_UNIT), 0).astype(int)
     start_colors, end_colors = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
     code = bytearray()
@@ -229,11 +227,11 @@ def _encode_color(code: int, color: np.ndarray, duration: int) -> bytes:
 
 
 def _encode_varint(value: int) -> bytes:
-    if value > MAX_VARINT:
-        raise ConfigError(
-            f"expected durations of at most {MAX_VARINT * TIME_UNIT:g} s, got {value * TIME_UNIT:g} s. "
-            "Split longer pieces."
-        )
+    require(
+        value <= MAX_VARINT,
+        f"expected durations of at most {MAX_VARINT * TIME_UNIT:g} s, got {value * TIME_UNIT:g} s. "
+        "Split longer pieces.",
+    )
     code = bytearray()
     while value >= 0x80:
         code.append(value & 0x7F | 0x80)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import PyTree, float_dtype, leaf
 
 
@@ -39,15 +39,19 @@ class Lights(PyTree):
         """
         t, a = np.asarray(times, float), np.asarray(starts, float)
         b = a.copy() if ends is None else np.array(ends, float)
-        if t.ndim != 1 or not t.size or a.shape != (len(t), 3) or b.shape != a.shape:
-            raise ConfigError(
-                f"expected times (n_pieces,) and colours (n_pieces, 3), got shapes {t.shape}, {a.shape} and "
-                f"{b.shape}. Pass one colour per time."
-            )
-        if not np.all(np.isfinite(t)) or not np.all(np.diff(t) >= 0):
-            raise ConfigError("expected ascending, finite times of lights; sort the pieces by time")
-        if not (np.all((a >= 0) & (a <= 1)) and np.all((b >= 0) & (b <= 1))):
-            raise ConfigError("expected colours from 0 to 1; divide colours from 0 to 255 by 255")
+        require(
+            t.ndim == 1 and t.size and a.shape == (len(t), 3) and b.shape == a.shape,
+            f"expected times (n_pieces,) and colours (n_pieces, 3), got shapes {t.shape}, {a.shape} and "
+            f"{b.shape}. Pass one colour per time.",
+        )
+        require(
+            np.all(np.isfinite(t)) and np.all(np.diff(t) >= 0),
+            "expected ascending, finite times of lights; sort the pieces by time",
+        )
+        require(
+            np.all((a >= 0) & (a <= 1)) and np.all((b >= 0) & (b <= 1)),
+            "expected colours from 0 to 1; divide colours from 0 to 255 by 255",
+        )
         b[-1] = a[-1]
         return Lights(*(x.astype(float_dtype()) for x in (t, a, b)))  # type: ignore[arg-type]
 
@@ -63,8 +67,7 @@ class Lights(PyTree):
     @staticmethod
     def stack(lights: Sequence[Lights]) -> Lights:
         """Return the lights of several drones as one record with a new first axis, padded to a common size."""
-        if not lights:
-            raise ConfigError("expected the lights of at least one drone, got none. Pass a list with one per drone.")
+        require(lights, "expected the lights of at least one drone, got none. Pass a list with one per drone.")
         n = max(x.times.shape[-1] for x in lights)
 
         def pad(x: Array) -> np.ndarray:

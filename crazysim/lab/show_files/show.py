@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.show_files.lights import Lights
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -89,10 +89,10 @@ class Show:
         sizes = {name: len(getattr(self, name)) for name in defaults}
         sizes |= {"trajectories": len(self.trajectories.ends), "lights": len(self.lights.times)}
         wrong_sizes = {name: size for name, size in sizes.items() if size != n}
-        if wrong_sizes:
-            raise ConfigError(
-                f"expected one entry for each of {n} drones, got {wrong_sizes}. Pass as many as there are names."
-            )
+        require(
+            not wrong_sizes,
+            f"expected one entry for each of {n} drones, got {wrong_sizes}. Pass as many as there are names.",
+        )
 
     @property
     def n_drones(self) -> int:

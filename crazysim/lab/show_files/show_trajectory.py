@@ -7,7 +7,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import require, short_repr
 from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
@@ -135,8 +135,7 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", with
         encoding: ``COMPRESSED`` or ``POLY4D``.
         with_yaw: True to write the yaw as the fourth coordinate, degrees.
     """
-    if encoding not in ENCODINGS:
-        raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
+    require(encoding in ENCODINGS, f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
     ends, c = trajectory_pieces(trajectory)
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
     c = c if with_yaw else c[:, :3]
@@ -151,8 +150,10 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", with
     points: list[Any] = [[0.0, format_point(c[0, :, 0]), []]]
     for end, axes in zip(ends, c, strict=True):
         lowest_degree = significant_degree(axes, COEFFICIENT_TOLERANCE)
-        if lowest_degree > MAX_DEGREE:
-            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {lowest_degree}")
+        require(
+            lowest_degree <= MAX_DEGREE,
+            f"expected polynomials of degree {MAX_DEGREE} at most, got degree {lowest_degree}",
+        )
         degree = min(d for d in degrees if d >= lowest_degree)
         curve = control_points(axes[:, : degree + 1], degree)
         points.append([float(end), format_point(curve[-1]), [format_point(x) for x in curve[1:-1]]])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import require, short_repr
 from crazysim.lab.show_files.archive import Archive, write_archive
 from crazysim.lab.show_files.led import MAX_REPEATED_COMMANDS, decode_lights, encode_lights
 from crazysim.lab.show_files.lights import Lights
@@ -252,8 +252,10 @@ def save_show(show: Show, path: str | Path) -> None:
     Raises:
         ConfigError: If the name has another ending, the folder does not exist, or a trajectory has a degree above 7.
     """
-    if Path(path).suffix != ".skyc":
-        raise ConfigError(f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.")
+    require(
+        Path(path).suffix == ".skyc",
+        f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.",
+    )
     files: dict[str, Any] = {}
     drones = []
     for i, name in enumerate(show.names):

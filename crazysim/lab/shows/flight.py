@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.show_files.show import Show
 from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
@@ -69,8 +69,7 @@ def fly_show(show: Show, seconds: float | None = None, progress: Progress | None
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
     """
     end = show.duration if seconds is None else min(float(seconds), show.duration)
-    if not np.isfinite(end) or end <= 0:
-        raise ConfigError(f"expected a positive duration of the flight, s, got {seconds!r}")
+    require(np.isfinite(end) and end > 0, f"expected a positive duration of the flight, s, got {seconds!r}")
     sim = start_simulation(show, settings)
     rate = _recording_rate(sim.freq, end, show.n_drones)
     n = max(int(np.ceil(end * rate - 1e-6)), 1)

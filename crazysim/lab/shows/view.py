@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazysim.arguments import check_flag
 from crazysim.drones.body import LED_MATERIALS
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
 from crazysim.lab.show_files.show import Show
@@ -78,8 +78,7 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
     Raises:
         RenderError: If there is no screen.
     """
-    if not np.isfinite(speed) or speed <= 0:
-        raise ConfigError(f"expected a positive speed, got {speed!r}")
+    require(np.isfinite(speed) and speed > 0, f"expected a positive speed, got {speed!r}")
     sim, recorded, camera = flight.sim, media_flight(flight), create_view(flight, **view)
     data = sim.data
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.validate.rows import Row, measure_sections
 from crazysim.lab.validate.sections import NAMES, sections
 
@@ -26,8 +26,8 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
     if unknown_names := [name for name in only if name not in NAMES]:
         raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown_names[0]!r}")
     folder = None if data is None else Path(data)
-    if folder is not None and not folder.is_dir():
-        raise ConfigError(
-            f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it."
-        )
+    require(
+        folder is None or folder.is_dir(),
+        f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it.",
+    )
     return measure_sections([section for section in sections(folder) if section.name in only])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.airframes import AirframeSource
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.tables import read_table
 from crazysim.plugins.estimators import Estimator, Kalman
 from crazysim.plugins.sensors import IMU, MotionCapture
@@ -126,8 +126,7 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
         ConfigError: If no setpoint is above the floor.
     """
     commanded = np.flatnonzero(height > 0)
-    if not len(commanded):
-        raise ConfigError(f"{name}: expected a setpoint above the floor, got none. Give the log of a flight.")
+    require(len(commanded), f"{name}: expected a setpoint above the floor, got none. Give the log of a flight.")
     return commanded
 
 

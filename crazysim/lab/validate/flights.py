@@ -8,7 +8,7 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from crazysim.drones import load_airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.identify import Model, aligned, fast_rotation, prediction_errors, read_log
 from crazysim.lab.identify.prediction import HORIZONS
 from crazysim.lab.validate.closed_loop import compare_tracking, laboratory_estimator, read_flight
@@ -33,11 +33,10 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
         ConfigError: If there are none.
     """
     paths = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
-    if not paths:
-        raise ConfigError(
-            f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md says where to get "
-            f"them."
-        )
+    require(
+        paths,
+        f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md says where to get them.",
+    )
     return paths
 
 

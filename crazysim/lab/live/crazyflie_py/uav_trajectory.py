@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.storage import MAX_TEXT_BYTES, read_text
 
@@ -77,8 +77,10 @@ class Trajectory:
             rows = np.loadtxt(lines, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
         except ValueError as error:
             raise ConfigError(f"expected rows of 33 numbers in {str(filename)!r}, got: {error}") from error
-        if not len(rows) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
-            raise ConfigError(f"expected finite numbers and positive durations in {str(filename)!r}")
+        require(
+            len(rows) and np.isfinite(rows).all() and (rows[:, 0] > 0).all(),
+            f"expected finite numbers and positive durations in {str(filename)!r}",
+        )
         parts = [[Polynomial(row[1 + 8 * k : 9 + 8 * k]) for k in range(4)] for row in rows]
         self.polynomials = [
             Polynomial4D(float(row[0]), *polynomials) for row, polynomials in zip(rows, parts, strict=True)
@@ -106,14 +108,9 @@ class Trajectory:
         durations = np.array([p.duration for p in self.polynomials], float)
         n = max((len(c) for piece in pieces for c in piece), default=0)
         coefficients = np.array([[np.pad(c, (0, n - len(c))) for c in piece] for piece in pieces], float)
-        if (
-            not n
-            or not np.isfinite(coefficients).all()
-            or not (durations > 0).all()
-            or not np.isfinite(durations).all()
-        ):
-            raise ConfigError(
-                f"expected pieces of finite coefficients and positive durations, got {len(pieces)} pieces"
-            )
+        require(
+            n and np.isfinite(coefficients).all() and (durations > 0).all() and np.isfinite(durations).all(),
+            f"expected pieces of finite coefficients and positive durations, got {len(pieces)} pieces",
+        )
         scaled_coefficients = coefficients * durations[:, None, None] ** np.arange(n)
         return HostTrajectory(np.cumsum(durations), scaled_coefficients, repeats=False)

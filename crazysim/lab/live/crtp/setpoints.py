@@ -8,7 +8,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.commander import Commander
 from crazysim.trajectories.bezier import power_coefficients
@@ -73,10 +73,10 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         return
     if kind == 6:
         trajectory_id, location, encoding, offset, n_pieces = struct.unpack("<BBBIB", content)
-        if location != 1 or encoding not in (0, 1):
-            raise ConfigError(
-                f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
-            )
+        require(
+            location == 1 and encoding in (0, 1),
+            f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}",
+        )
         trajectory = (
             _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n_pieces)
         )
@@ -111,8 +111,10 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
 
 def _polynomial_trajectory(memory: bytes, offset: int, n_pieces: int) -> HostTrajectory:
     """Return the trajectory of polynomials in memory."""
-    if not n_pieces or offset + PIECE_SIZE * n_pieces > len(memory):
-        raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n_pieces} from {offset} on")
+    require(
+        n_pieces and offset + PIECE_SIZE * n_pieces <= len(memory),
+        f"expected 1 or more pieces within {len(memory)} bytes, got {n_pieces} from {offset} on",
+    )
     with np.errstate(invalid="ignore"):  # NaN is refused below
         numbers = np.frombuffer(memory, "<f4", 33 * n_pieces, offset).astype(float).reshape(n_pieces, 33)
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n_pieces, 4, 8)

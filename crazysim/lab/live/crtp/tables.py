@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
 from crazysim.lab.live.swarm.sensors import read_battery, read_ranges
 
@@ -55,10 +55,11 @@ class Table:
         self.variables, self.types = variables, types
         self.ids = {variable.name: k for k, variable in enumerate(variables)}
         for variable in variables:
-            if variable.name.count(".") != 1 or len(variable.name) > 24 or variable.ctype not in types:
-                raise ConfigError(f"expected group.name of up to 24 letters and one of {list(types)}, got {variable}")
-        if len(self.ids) < len(variables):
-            raise ConfigError("expected different names of variables, got one twice")
+            require(
+                variable.name.count(".") == 1 and len(variable.name) <= 24 and variable.ctype in types,
+                f"expected group.name of up to 24 letters and one of {list(types)}, got {variable}",
+            )
+        require(len(self.ids) >= len(variables), "expected different names of variables, got one twice")
         self.checksum = zlib.crc32(b"".join(self.describe(k) for k in range(len(variables))))
 
     def describe(self, k: int) -> bytes:

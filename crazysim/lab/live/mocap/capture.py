@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, not_installed, require
 from crazysim.lab.live.mocap.frames import Convention, Frame
 from crazysim.lab.live.mocap.source import ThreadSource
 
@@ -55,8 +55,7 @@ class MotionCaptureSource(ThreadSource):
         Raises:
             ConfigError: If the system or the package does not exist.
         """
-        if system not in SYSTEMS:
-            raise ConfigError(f"expected one of {', '.join(SYSTEMS)}, got {system!r}")
+        require(system in SYSTEMS, f"expected one of {', '.join(SYSTEMS)}, got {system!r}")
         if command is None and find_spec("motioncapture") is None:
             raise ConfigError(not_installed("motion capture needs", "motioncapture", "mocap"))
         super().__init__(f"{system} at {hostname}", convention)
@@ -94,6 +93,5 @@ def parse_frame(message: dict) -> Frame:
         raise ValueError(f"expected bodies of a name and 7 numbers, got {bodies!r:.200}")
     poses = np.array([body[1:] for body in bodies], float).reshape(len(bodies), 7)
     stamp = float(message["t"])
-    if not math.isfinite(stamp):
-        raise ValueError(f"expected a finite time, got {stamp}")
+    require(math.isfinite(stamp), f"expected a finite time, got {stamp}", ValueError)
     return Frame(stamp, tuple(body[0] for body in bodies), poses[:, :3], poses[:, 3:], stamp)

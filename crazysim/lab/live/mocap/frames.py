@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class Convention:
     """Length of the unit of positions, m; 0.001 for millimetres."""
 
     def __post_init__(self) -> None:
-        if self.up not in ("y", "z") or self.quat not in ("xyzw", "wxyz") or not 0 < self.unit < np.inf:
-            raise ConfigError(
-                f"expected up as 'y' or 'z', quat as 'xyzw' or 'wxyz' and a positive unit, got {self.up!r}, "
-                f"{self.quat!r} and {self.unit!r}. Use Convention('y', 'xyzw', 0.001) for millimetres with y up, for "
-                f"example."
-            )
+        require(
+            self.up in ("y", "z") and self.quat in ("xyzw", "wxyz") and 0 < self.unit < np.inf,
+            f"expected up as 'y' or 'z', quat as 'xyzw' or 'wxyz' and a positive unit, got {self.up!r}, "
+            f"{self.quat!r} and {self.unit!r}. Use Convention('y', 'xyzw', 0.001) for millimetres with y up, for "
+            f"example.",
+        )
 
     def to_world(self, pos: ArrayLike, quat: ArrayLike) -> tuple[NDArray, NDArray]:
         """Return poses of the source in the world frame: positions, m (..., 3), and attitudes, xyzw (..., 4)."""

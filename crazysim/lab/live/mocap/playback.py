@@ -13,7 +13,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.objects import Handle
 
@@ -51,12 +51,13 @@ class Playback(Plugin):
     def record(self, sim: Simulation) -> PlaybackData:
         pos, quat, start = (np.asarray(x, float) for x in (self.pos, self.quat, self.start))
         n = len(self.handles)
-        if pos.ndim != 3 or pos.shape[1:] != (n, 3) or quat.shape != (*pos.shape[:2], 4) or len(pos) < 2:
-            raise ConfigError(
-                f"expected at least two samples of {n} positions and attitudes, got shapes {pos.shape} and {quat.shape}"
-            )
-        if start.shape not in ((), (sim.n_worlds,)):
-            raise ConfigError(f"expected start of shape () or ({sim.n_worlds},), got {start.shape}")
+        require(
+            pos.ndim == 3 and pos.shape[1:] == (n, 3) and quat.shape == (*pos.shape[:2], 4) and len(pos) >= 2,
+            f"expected at least two samples of {n} positions and attitudes, got shapes {pos.shape} and {quat.shape}",
+        )
+        require(
+            start.shape in ((), (sim.n_worlds,)), f"expected start of shape () or ({sim.n_worlds},), got {start.shape}"
+        )
         signs = np.where((quat[1:] * quat[:-1]).sum(-1) < 0, -1.0, 1.0)
         quat = quat * np.concatenate([np.ones((1, n)), np.cumprod(signs, axis=0)])[..., None]
         vel = np.gradient(pos, 1 / self.freq, axis=0)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source import MocapSource, Poll
 from crazysim.media.journal import Journal, read_journal
@@ -102,8 +102,7 @@ class ReplaySource(MocapSource):
         Raises:
             ConfigError: If the file does not exist or is not a recording.
         """
-        if by not in ("poll", "time"):
-            raise ConfigError(f"expected by as 'poll' or 'time', got {by!r}")
+        require(by in ("poll", "time"), f"expected by as 'poll' or 'time', got {by!r}")
         self.name, self.by, self.path = f"replay of {Path(path).name}", by, path
         self.simulated = by == "time"
         self._polls = list(read_polls(path))

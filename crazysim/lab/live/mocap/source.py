@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.host_trajectory import to_host_trajectories
 from crazysim.lab.live.mocap.frames import Convention, Frame
@@ -82,8 +82,7 @@ class FunctionSource(MocapSource):
             convention: Convention of the poses; None for crazysim's.
             name: Name in reports.
         """
-        if not 0 < freq < np.inf:
-            raise ConfigError(f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
+        require(0 < freq < np.inf, f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
         self.name, self.freq = name, float(freq)
         self._function, self._convention, self._next_sample = function, convention or Convention(), 0
 
@@ -113,11 +112,11 @@ def show_source(
     """
     paths = to_host_trajectories(trajectories)
     names = [f"vcf{k}" for k in range(len(paths))] if names is None else list(names)
-    if len(names) != len(paths) or len(set(names)) < len(names):
-        raise ConfigError(
-            f"expected {len(paths)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
-            f"vcf1, ..."
-        )
+    require(
+        len(names) == len(paths) and len(set(names)) == len(names),
+        f"expected {len(paths)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
+        f"vcf1, ...",
+    )
 
     def poses_at(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
         points = [path.setpoint(stamp) for path in paths]

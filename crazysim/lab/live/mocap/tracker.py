@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.settings import check_settings, setting
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source_events import Reports
 
@@ -86,8 +86,7 @@ class Tracker:
             rules: Limits; None for the defaults.
             source: Name of the source in reports.
         """
-        if len(set(names)) < len(names):
-            raise ConfigError(f"expected different names, got {list(names)}. List each body once.")
+        require(len(set(names)) == len(names), f"expected different names, got {list(names)}. List each body once.")
         n = len(names)
         self.names, self.rules, self.source = tuple(names), rules or Rules(), source
         self.reports = Reports()

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import load_airframe
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.lab.live.attitude import from_rpy, multiply, rotate, to_rpy
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.mocap.playback import Playback
@@ -170,11 +170,11 @@ class Twins(Closeable):
         self._compute_poses()
         data = sim.data
         objects = data.objects
-        if objects is None:
-            raise ConfigError(
-                "expected the simulation whose scene has the twins, got one without movable objects. Pass the one that "
-                "Twins(sim, ...) was made for."
-            )
+        require(
+            objects is not None,
+            "expected the simulation whose scene has the twins, got one without movable objects. Pass the one that "
+            "Twins(sim, ...) was made for.",
+        )
         new_poses = _write_poses((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
         sim.data = data.replace(objects=objects.replace(pos=new_poses[0], quat=new_poses[1], vel=new_poses[2]))
 
@@ -204,8 +204,7 @@ class Twins(Closeable):
             start: Time of the recording at the reset of a world, s. () or (n_worlds,)
             name: Name of the plugin.
         """
-        if not 2 <= seconds * freq <= 1e7:
-            raise ConfigError(f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
+        require(2 <= seconds * freq <= 1e7, f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
         saved_state = self.tracker, self._poses
         self.tracker = Tracker(self.names, self.tracker.rules, source.name)
         samples = []

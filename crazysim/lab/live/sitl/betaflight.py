@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_flag
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
 from crazysim.lab.live.sitl.measured import COS_45_DEGREES, ZURICH, Measurements, Origin, check_origin, to_frd
 from crazysim.tables import range_between, read_numbers
@@ -66,10 +66,12 @@ class Betaflight(FirmwareLink):
             Rate("rc_freq", rc_freq),
         )
         self._start_position: tuple[float, float] | None = None
-        if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
-            raise ConfigError(
-                f"expected ports of the motors, the state and the remote control, got {short_repr(ports)}. Use {PORTS}."
-            )
+        expect(
+            isinstance(ports, (tuple, list)) and len(ports) == len(PORTS),
+            "ports of the motors, the state and the remote control",
+            ports,
+            f"Use {PORTS}.",
+        )
         motor_port, self._state_port, self._rc_port = ports
         for port in (self._state_port, self._rc_port):
             check_address(host, port, min_port=1)

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect
 from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.storage import Closeable
 from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
@@ -81,8 +81,7 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
         port: Port.
         min_port: Smallest valid port; 0 also allows port 0, which means any free port.
     """
-    if not isinstance(host, str):
-        raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
+    expect(isinstance(host, str), "host as text", host, "Use '127.0.0.1'.")
     read_numbers("port", port, range_between(min_port, MAX_PORT), ((),), whole=True)
 
 

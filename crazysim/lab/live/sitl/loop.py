@@ -15,7 +15,7 @@ from crazysim.control import Control
 from crazysim.core.airframes import as_airframes
 from crazysim.core.settings import dividing_rate
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.pace import Pace, Speed
 from crazysim.lab.live.sitl.link import ROUNDING_TOLERANCE, FirmwareLink
@@ -71,18 +71,17 @@ class SoftwareInTheLoop(Closeable):
         self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT_RANGE), motors
         self.links = _check_links(links)
         freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
-        if sim.control != Control.rotor_vel:
-            raise ConfigError(
-                f"expected control='rotor_vel', got {sim.control.value!r}. Use Sim(control='rotor_vel'), as a firmware "
-                f"commands motors."
-            )
-        if len(self.links) != sim.n_worlds * sim.n_drones:
-            raise ConfigError(
-                f"expected a link for each of {sim.n_worlds * sim.n_drones} drones, got {len(self.links)}. "
-                f"Pass one for each drone."
-            )
-        if motors not in ("speed", "thrust"):
-            raise ConfigError(f"expected motors as 'speed' or 'thrust', got {motors!r}")
+        require(
+            sim.control == Control.rotor_vel,
+            f"expected control='rotor_vel', got {sim.control.value!r}. Use Sim(control='rotor_vel'), as a firmware "
+            f"commands motors.",
+        )
+        require(
+            len(self.links) == sim.n_worlds * sim.n_drones,
+            f"expected a link for each of {sim.n_worlds * sim.n_drones} drones, got {len(self.links)}. "
+            f"Pass one for each drone.",
+        )
+        require(motors in ("speed", "thrust"), f"expected motors as 'speed' or 'thrust', got {motors!r}")
         reversed = check_flag("reversed", reversed)
         self._n_steps = sim.freq // freq
         airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
@@ -233,10 +232,10 @@ def _check_links(links: object) -> tuple[FirmwareLink, ...]:
         raise ConfigError(
             f"expected a link to firmware or a list of them, got {short_repr(links)}. Use ArduPilot(), say."
         )
-    if len(set(map(id, sequence))) < len(sequence):
-        raise ConfigError(
-            f"expected one link for each of {len(sequence)} drones, got one twice. Create each with its own ports."
-        )
+    require(
+        len(set(map(id, sequence))) == len(sequence),
+        f"expected one link for each of {len(sequence)} drones, got one twice. Create each with its own ports.",
+    )
     return tuple(sequence)
 
 
@@ -255,13 +254,14 @@ def _silence_error(link: FirmwareLink, seconds: float) -> ConfigError:
 
 def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:
     """Return the index of the rotor of an airframe that each motor of a firmware drives. (4,)"""
-    if airframe.n_rotors != 4:
-        raise ConfigError(f"expected an airframe with 4 rotors, got {airframe.name!r} with {airframe.n_rotors}")
+    require(
+        airframe.n_rotors == 4, f"expected an airframe with 4 rotors, got {airframe.name!r} with {airframe.n_rotors}"
+    )
     signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]
-    if sorted(signs) != sorted(link.positions):
-        raise ConfigError(
-            f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame."
-        )
+    require(
+        sorted(signs) == sorted(link.positions),
+        f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame.",
+    )
     order = np.array([signs.index(position) for position in link.positions])
     torque_signs = tuple(map(int, airframe.value("rotors.yaw_torque_sign")[order]))
     expected = tuple(-sign if reversed else sign for sign in link.yaw_torque_signs)

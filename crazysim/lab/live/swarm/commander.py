@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.lab.live.attitude import yaw_from_quat
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.motion import PlannedMotion, nearest_yaw, plan_move
@@ -132,10 +132,10 @@ class Commander:
             trajectory: Trajectory.
             compressed: True if the firmware stores it compressed; it can then be neither stretched nor reversed.
         """
-        if not 0 <= trajectory_id < N_TRAJECTORIES:
-            raise ConfigError(
-                f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {trajectory_id}"
-            )
+        require(
+            0 <= trajectory_id < N_TRAJECTORIES,
+            f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {trajectory_id}",
+        )
         self.trajectories[trajectory_id] = trajectory
         (self._compressed_ids.add if compressed else self._compressed_ids.discard)(trajectory_id)
 
@@ -160,8 +160,10 @@ class Commander:
             raise ConfigError(
                 f"expected one of the trajectories {sorted(self.trajectories)}, got {trajectory_id}. Upload it."
             )
-        if not MIN_DURATION <= timescale <= MAX_DURATION:
-            raise ConfigError(f"expected a timescale from {MIN_DURATION:g} to {MAX_DURATION:g}, got {timescale}")
+        require(
+            MIN_DURATION <= timescale <= MAX_DURATION,
+            f"expected a timescale from {MIN_DURATION:g} to {MAX_DURATION:g}, got {timescale}",
+        )
         if trajectory_id in self._compressed_ids and (timescale != 1 or reversed):
             raise ConfigError(
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
@@ -383,15 +385,15 @@ class Commander:
         return self._drone_motion()
 
     def _require_level(self, level: Control) -> None:
-        if self.locked or not self.armed:
-            raise ConfigError(
-                f"expected a drone that is armed, got one that is {'locked' if self.locked else 'disarmed'}"
-            )
-        if level != self.control:
-            raise ConfigError(
-                f"expected a command that Sim(control={self.control.value!r}) takes, got one of level {level.value!r}. "
-                f"Use Sim(control={level.value!r})."
-            )
+        require(
+            not self.locked and self.armed,
+            f"expected a drone that is armed, got one that is {'locked' if self.locked else 'disarmed'}",
+        )
+        require(
+            level == self.control,
+            f"expected a command that Sim(control={self.control.value!r}) takes, got one of level {level.value!r}. "
+            f"Use Sim(control={level.value!r}).",
+        )
 
 
 def _check_numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE) -> NDArray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE = 0, 7, 13, 14
 """Effects of the LED ring (``effectsFct`` in ledring12.c of crazyflie-firmware): dark, ``ring.solidRed`` and so on, the
@@ -115,15 +115,16 @@ class Parameters(Mapping[str, float]):
         return self._values[name]
 
     def _require_parameter(self, name: str) -> None:
-        if name not in self.definitions:
-            raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {GUIDE_REMARK}")
+        require(name in self.definitions, f"expected a parameter that the simulation has, got {name!r}. {GUIDE_REMARK}")
 
     def set(self, name: str, value: float, now: float) -> None:
         """Set a value."""
         self._require_parameter(name)
         definition = self.definitions[name]
-        if definition.read_only or not math.isfinite(value):
-            raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
+        require(
+            not definition.read_only and math.isfinite(value),
+            f"expected a finite value of a parameter that can be written, got {name} = {value:g}",
+        )
         # Clients read values in their format, so 0.0045 comes back with the rounding of float32.
         is_same = math.isclose(value, self._values[name], rel_tol=1e-6)
         is_known_effect = name != "ring.effect" or value in (LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE)

@@ -18,7 +18,7 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import UnknownNameError, require
 from crazysim.lab.live.attitude import from_yaw, rotate, to_rpy
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.mocap.source_events import Reports
@@ -62,11 +62,14 @@ class Swarm(Closeable):
                 those command levels.
             names: Names of the drones; None for ``cf1``, ``cf2``, ...
         """
-        if sim.n_worlds != 1:
-            raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1).")
+        require(
+            sim.n_worlds == 1, f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1)."
+        )
         names = [f"cf{k + 1}" for k in range(sim.n_drones)] if names is None else list(names)
-        if len(names) != sim.n_drones or len(set(names)) < len(names):
-            raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
+        require(
+            len(names) == sim.n_drones and len(set(names)) == len(names),
+            f"expected {sim.n_drones} different names, got {names}",
+        )
         self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
         self.commanders = [Commander(sim.control, functools.partial(self._report_refusal, name)) for name in names]
         has_ranger = "front" in read_ranges(sim, 0)
@@ -158,16 +161,15 @@ class Swarm(Closeable):
     def run_in(self, live: Live) -> None:
         """Make ``advance`` and ``sleep`` run a live loop, at its speed and with its viewers."""
         self._check_loop(live)
-        if self._thread is not None:
-            raise ConfigError("expected a swarm that no thread advances, got a running one. Call close first.")
+        require(self._thread is None, "expected a swarm that no thread advances, got a running one. Call close first.")
         live.add(self, name="swarm")
         self._live = live
 
     def _check_loop(self, live: Live) -> None:
-        if live.sim is not self.sim:
-            raise ConfigError(
-                "expected the loop of the swarm's simulation, got the loop of another simulation. Make a Swarm for it."
-            )
+        require(
+            live.sim is self.sim,
+            "expected the loop of the swarm's simulation, got the loop of another simulation. Make a Swarm for it.",
+        )
 
     def update(self) -> None:
         """Read the states and stage the active commands, between two control steps."""
@@ -182,8 +184,7 @@ class Swarm(Closeable):
 
     def advance(self, seconds: float) -> None:
         """Advance by a time, s, rounded to control steps, at the speed of its live loop after ``run_in``."""
-        if self._thread is not None:
-            raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
+        require(self._thread is None, "expected a swarm that no thread advances, got a running one. Use sleep.")
         if self._live is not None:
             if seconds > 0:
                 self._live.run(seconds)
@@ -211,8 +212,7 @@ class Swarm(Closeable):
 
     def start(self, speed: float = 1.0) -> Swarm:
         """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm."""
-        if self._live is not None:
-            raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
+        require(self._live is None, "expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
         self.compile_step()
         self._stop_event.clear()
         self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
