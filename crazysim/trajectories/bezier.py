@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 @lru_cache
 def _power_matrix(degree: int) -> NDArray:
     """Return the matrix that converts control points to power coefficients. (degree + 1, degree + 1)"""
-    matrix = np.zeros((degree + 1, degree + 1))
-    for j in range(degree + 1):
-        for i in range(j + 1):
-            matrix[j, i] = (-1) ** (j - i) * comb(degree, j) * comb(j, i)
-    return matrix
+    orders = range(degree + 1)
+    return np.array([[(-1) ** (j + i) * comb(degree, j) * comb(j, i) for i in orders] for j in orders], float)
 
 
 @lru_cache
 def bernstein_matrix(degree: int) -> NDArray:
     """Return the matrix that converts power coefficients to control points. (degree + 1, degree + 1)"""
-    matrix = np.zeros((degree + 1, degree + 1))
-    for i in range(degree + 1):
-        for j in range(i + 1):
-            matrix[i, j] = comb(i, j) / comb(degree, j)
-    return matrix
+    orders = range(degree + 1)
+    return np.array([[comb(i, j) / comb(degree, j) for j in orders] for i in orders])
 
 
 def power_coefficients(points: NDArray) -> NDArray:
@@ -68,12 +62,9 @@ def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArra
     Returns:
         (k, n)
     """
-    n = coefficients.shape[1]
-    matrix = np.zeros((n, n))
-    for j in range(n):
-        for i in range(j + 1):
-            matrix[j, i] = comb(j, i) * start ** (j - i) * (end - start) ** i
-    return coefficients @ matrix
+    orders = range(coefficients.shape[1])
+    scales = [(end - start) ** i for i in orders]
+    return coefficients @ [[comb(j, i) * start ** max(j - i, 0) * scales[i] for i in orders] for j in orders]
 
 
 def significant_degree(coefficients: NDArray, tolerance: float) -> int:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.arguments import check_flag
 from crazysim.errors import ConfigError, require
 from crazysim.tables import MAX_NUMBER, read_floats
+from crazysim.trajectories.interpolation import unit_coefficients
 from crazysim.trajectories.trajectory import Trajectory
 
 FIT_TOLERANCE = 5e-6
@@ -198,14 +199,7 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
     n = max(1, math.ceil(duration / max_piece_duration))
     h = duration / n
     knots = np.linspace(0.0, duration, n + 1)
-    # Derivatives with respect to u = t / h, divided by k!: at the start they are the first four coefficients, at the
-    # end they give four conditions for the other coefficients.
-    knot_coefficients = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
-    binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
-    end_residuals = knot_coefficients[1:] - knot_coefficients[:-1] @ binomials[:, :4].T
-    coefficients = np.concatenate(
-        [knot_coefficients[:-1], np.linalg.solve(binomials[:, 4:], end_residuals[..., None])[..., 0]], axis=-1
-    )
+    coefficients = unit_coefficients(np.stack([curve(knots, k) for k in range(4)], axis=1), np.full(n, h))
     return Trajectory.of_pieces(np.full(n, h), coefficients / h ** np.arange(8), repeats)
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments, check_flag
@@ -312,11 +313,9 @@ class Trajectory(PyTree):
     def _end_derivatives(self, at_end: bool) -> np.ndarray:
         """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
         lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
-        nonempty_pieces = np.flatnonzero(lengths > 0)
-        k, u = (nonempty_pieces[-1], 1.0) if at_end else (nonempty_pieces[0], 0.0)
-        Polynomial = np.polynomial.polynomial.Polynomial
-        polynomials = [Polynomial(x) for x in np.asarray(self.coefficients[k], float)]
-        return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
+        k = np.flatnonzero(lengths > 0)[-1 if at_end else 0]
+        coefficients = np.asarray(self.coefficients[k], float).T
+        return np.array([polyval(float(at_end), polyder(coefficients, m)) / lengths[k] ** m for m in range(4)])
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0) -> Trajectory:
         """Return the trajectory rotated around the z axis of the world, then translated; leading axes are allowed.

@@ -12,6 +12,7 @@ from crazysim.storage import read_text, write_file
 from crazysim.tables import read_floats
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.polynomials import trajectory_from_rows, trajectory_rows
+from crazysim.trajectories.interpolation import unit_coefficients
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -72,21 +73,11 @@ def _fit_samples(rows: NDArray, location: str) -> Trajectory:
     checks.require_ascending(times, checks.MIN_LENGTH, location)
     if times[-1] > checks.MAX_TIME:
         checks.raise_error(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", location)
-    values = np.zeros((len(rows), 4))
-    values[:, : rows.shape[1] - 1] = rows[:, 1:]
-    values[:, 3] = np.unwrap(values[:, 3])
-    derivatives = np.zeros_like(values)
-    derivatives[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
-    lengths = np.diff(times)[:, None]
-    start, end, start_slope, end_slope = values[:-1], values[1:], derivatives[:-1] * lengths, derivatives[1:] * lengths
-    # Cubic Hermite polynomial of u in [0, 1].
-    c = [
-        start,
-        start_slope,
-        3 * (end - start) - 2 * start_slope - end_slope,
-        2 * (start - end) + start_slope + end_slope,
-    ]
-    return trajectory_from_unit_pieces(np.diff(times), np.stack(c, axis=-1))
+    nodes = np.zeros((len(rows), 2, 4))  # values and first derivatives
+    nodes[:, 0, : rows.shape[1] - 1] = rows[:, 1:]
+    nodes[:, 0, 3] = np.unwrap(nodes[:, 0, 3])
+    nodes[1:-1, 1] = (nodes[2:, 0] - nodes[:-2, 0]) / (times[2:] - times[:-2])[:, None]
+    return trajectory_from_unit_pieces(np.diff(times), unit_coefficients(nodes, np.diff(times)))
 
 
 def save_csv(trajectory: Trajectory, path: str | Path) -> None:
