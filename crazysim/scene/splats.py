@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim import rotation
 from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, require
 from crazysim.pytree import PyTree
@@ -78,7 +79,7 @@ class SplatScene:
         mujoco.mju_mat2Quat(quat_wxyz, rot.reshape(-1))
         self.gaussians = Gaussians(
             pos=jnp.asarray(scale * points @ rot.T + origin, np.float32),
-            quat=jnp.asarray(_multiply(np.roll(quat_wxyz, -1), values["quat"]), np.float32),
+            quat=rotation.multiply(*[jnp.asarray(q, np.float32) for q in (np.roll(quat_wxyz, -1), values["quat"])]),
             log_scale=jnp.asarray(values["log_scale"] + np.log(scale), np.float32),
             color=jnp.asarray(_rotate_colors(values["color"], rot), np.float32),
             logit_opacity=jnp.asarray(values["logit_opacity"], np.float32),
@@ -165,12 +166,6 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
             f"without in {str(path)!r}. Drop these Gaussians."
         )
     return values
-
-
-def _multiply(p: NDArray, q: NDArray) -> NDArray:
-    """Return the product of quaternions, xyzw. (4,), (n, 4) -> (n, 4)"""
-    vector = p[3] * q[:, :3] + q[:, 3:] * p[:3] + np.cross(p[:3], q[:, :3])
-    return np.concatenate([vector, p[3] * q[:, 3:] - q[:, :3] @ p[:3, None]], axis=1)
 
 
 def _rotate_colors(color: NDArray, rot: NDArray) -> NDArray:

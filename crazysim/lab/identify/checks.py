@@ -16,6 +16,7 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns
 from crazysim.lab.identify.motion import body_rates, integrate
+from crazysim.lab.live.attitude import rotate
 
 if TYPE_CHECKING:
     from crazysim.lab.identify.logs import Log
@@ -35,6 +36,8 @@ MIN_SPAN = 0.3
 """Span of the position below which the drone counts as resting, m. The estimator of a resting drone drifts."""
 PIECE_DURATION = 2.0
 """Duration of the pieces that are left out where a rate has diverged, s."""
+Z_AXIS = np.array([0.0, 0.0, 1.0])
+"""Direction of the thrust, body frame. (3,)"""
 
 
 class Pair(NamedTuple):
@@ -159,7 +162,7 @@ class Law(NamedTuple):
 
 def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> list[Law]:
     """Check the laws that the columns must obey."""
-    upward = float(np.median(_thrust_axis(data["quat"])[:, 2]))
+    upward = float(np.median(rotate(data["quat"], Z_AXIS)[:, 2]))
     fault = f"a thrust that points up in most samples, got {upward:.2f} as the median of its z component"
     laws = [Law("" if upward > 0 else fault, True)]
     for pair in (*(pair for pair, _ in _rate_pairs(t, data, derived_keys)), _thrust_pair(t, data)):
@@ -192,7 +195,7 @@ def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     component is the weight. Without rotor speeds, its vertical component is the weight, unless the tilt is large.
     Constant accelerations, such as from drag in cruise, cancel in the difference between consecutive windows.
     """
-    axis = _thrust_axis(data["quat"])
+    axis = rotate(data["quat"], Z_AXIS)
     if data["rotor_vel"].shape[1]:
         squares = np.sum(data["rotor_vel"] ** 2, axis=1)
         median_lift = float(np.median(squares * axis[:, 2]))
@@ -230,12 +233,6 @@ def _diverged_windows(pair: Pair, size: int) -> NDArray:
             typical_motion, float(np.median(motion[part]))
         )
     return is_diverged
-
-
-def _thrust_axis(quat: NDArray) -> NDArray:
-    """Return the z axis of the body in the world frame. (n, 3)"""
-    x, y, z, w = quat.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 def _propose_remedies(

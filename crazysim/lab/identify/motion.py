@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns, stack_columns, unsigned_name
 from crazysim.lab.identify.readers import Stream, resample
+from crazysim.lab.live.attitude import multiply
 
 LAG_STEP = 0.005
 """Interval at which angular velocities are compared, s."""
@@ -114,9 +115,8 @@ def _find_lag(a: NDArray, b: NDArray) -> tuple[float, float]:
 
 def body_rates(t: NDArray, quat: NDArray) -> NDArray:
     """Return the angular velocities between consecutive attitudes, body frame, rad/s. (n - 1, 3)"""
-    (a, aw), (b, bw) = [(q[:, :3], q[:, 3:]) for q in (quat[:-1], quat[1:])]
-    vector, scalar = aw * b - bw * a - np.cross(a, b), aw * bw + np.sum(a * b, axis=-1, keepdims=True)
-    return 2 * vector * np.sign(scalar) / np.diff(t)[:, None]
+    turn = multiply(quat[:-1] * [-1, -1, -1, 1], quat[1:])
+    return 2 * turn[:, :3] * np.sign(turn[:, 3:]) / np.diff(t)[:, None]
 
 
 def fit_velocity(t: NDArray, pos: NDArray) -> NDArray:

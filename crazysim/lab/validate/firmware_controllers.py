@@ -22,6 +22,7 @@ from crazysim.control.pid import PID
 from crazysim.core.airframes import AirframeSource
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import quadratic_curve
+from crazysim.lab.live.attitude import from_rpy
 from crazysim.lab.validate.rows import Row
 
 FREQ, POSITION_PERIOD = 500, 5
@@ -96,9 +97,7 @@ def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray,
     pos, vel = smooth_signal(3, 2 * amplitude, 1.0), smooth_signal(3, 3 * amplitude, 0.7)
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
     tilt, yaw = smooth_signal(2, 1.2 * amplitude, 0.5) * [1.0, 0.5], 3.0 + smooth_signal(1, 2.0, 0.9)
-    quat = np.array(
-        [[quat_from_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
-    )
+    quat = from_rpy(np.concatenate([tilt, yaw], axis=-1))
     ang_vel = smooth_signal(3, 10 * amplitude, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
@@ -122,17 +121,6 @@ def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray,
             [angles if mode == "attitude" else smooth_signal(3, 8 * amplitude, 0.3), thrust], axis=-1
         )
     return states, commands
-
-
-def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
-    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), xyzw."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(np.array([roll, pitch, yaw]) / 2), np.sin(np.array([roll, pitch, yaw]) / 2)
-    return (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
 
 
 def compiled_pwm(

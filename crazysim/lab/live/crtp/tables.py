@@ -12,6 +12,7 @@ import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import require
+from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
 from crazysim.lab.live.swarm.sensors import read_battery, read_ranges
 
@@ -114,9 +115,7 @@ def _acceleration_reading(k: int) -> Reading:
     """
 
     def reading(state: DroneState, _: Commander) -> float:
-        axis, w = state.quat[:3], state.quat[3]
-        world_acc = state.acc + 2 * np.cross(axis, np.cross(axis, state.acc) + w * state.acc)
-        return float(world_acc[k]) / GRAVITY_MAGNITUDE - (k == 2)
+        return float(rotate(state.quat, state.acc)[k]) / GRAVITY_MAGNITUDE - (k == 2)
 
     return reading
 
