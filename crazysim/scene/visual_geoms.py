@@ -59,9 +59,8 @@ def _geom_kind(model: mujoco.MjModel, geom: int) -> str:
 
 
 def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
-    body = int(model.geom_bodyid[geom])
-    while body and model.body_mocapid[body] < 0:
-        body = int(model.body_parentid[body])
+    root = int(model.body_rootid[model.geom_bodyid[geom]])
+    body = root if model.body_mocapid[root] >= 0 else 0
     pos, quat = np.zeros(3), np.zeros(4)
     geom_quat = np.zeros(4)
     mujoco.mju_mat2Quat(geom_quat, data.geom_xmat[geom])

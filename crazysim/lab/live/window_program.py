@@ -209,10 +209,8 @@ class Program:
         if hit is None:
             return
         k, geom, point = hit
-        body = int(self._model.geom_bodyid[geom])
-        while body and self._model.body_mocapid[body] < 0:
-            body = int(self._model.body_parentid[body])
-        mocap, world = int(self._model.body_mocapid[body]), int(picture.worlds[k])
+        root, world = self._model.body_rootid[self._model.geom_bodyid[geom]], int(picture.worlds[k])
+        mocap = int(self._model.body_mocapid[root])
         if mocap >= 0:
             followed = self._bodies.items[self._bodies.owner[mocap]]
             self._send("follow", world, followed.kind, followed.index)
