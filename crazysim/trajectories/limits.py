@@ -13,7 +13,7 @@ from crazysim.arguments import check_arguments
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError, expect, require
+from crazysim.errors import expect, require
 from crazysim.trajectories.approaches import Approach, closest_approaches
 from crazysim.trajectories.peaks import QUANTITIES, Peak, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
@@ -55,18 +55,18 @@ class Limits:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if self.floor is not None and self.height is not None and self.floor >= self.height:
-            raise ConfigError(
-                f"expected a floor below the height of {self.height} m, got {self.floor} m. Lower it, or raise height."
-            )
-        if self.thrust is not None and self.thrust <= 1:
-            raise ConfigError(
-                f"expected a largest thrust of more than 1 weight, got {self.thrust}. A drone with less cannot hover."
-            )
-        if self.min_thrust is not None and self.min_thrust >= 1:
-            raise ConfigError(
-                f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. With more, it must climb."
-            )
+        require(
+            self.floor is None or self.height is None or self.floor < self.height,
+            f"expected a floor below the height of {self.height} m, got {self.floor} m. Lower it, or raise height.",
+        )
+        require(
+            self.thrust is None or self.thrust > 1,
+            f"expected a largest thrust of more than 1 weight, got {self.thrust}. A drone with less cannot hover.",
+        )
+        require(
+            self.min_thrust is None or self.min_thrust < 1,
+            f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. With more, it must climb.",
+        )
 
     def as_dict(self) -> dict[str, float]:
         """Return the limits that are not None, by name."""
