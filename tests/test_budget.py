@@ -19,13 +19,13 @@ BUDGET = {
     "engine": 5804,
     "envs": 3830,
     "geometry": 1089,
-    "lab": 9751,
+    "lab": 9752,
     "media": 986,
     "plugins": 7268,
-    "scene": 3102,
+    "scene": 3099,
     "sim": 1215,
     "train": 2455,
-    "trajectories": 1398,
+    "trajectories": 1380,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
 
