@@ -85,6 +85,7 @@ def setting(
     high: float = np.inf,
     positive: bool = False,
     shapes: Shapes | None = None,
+    keep: bool = True,
 ) -> Any:
     """Declare a numeric field of a record of settings, such as a task, with the values that it may have.
 
@@ -97,10 +98,12 @@ def setting(
         high: Largest value allowed.
         positive: True to refuse zero and negative values.
         shapes: Shapes of an array, ``"any"`` for an axis of any length; None for any shape.
+        keep: False for a setting of a plugin that is None in ``data.plugins``, such as an array for the scene.
     """
     default = {"default": default} if default_factory is dataclasses.MISSING else {"default_factory": default_factory}
     return dataclasses.field(
-        **default, metadata={"setting": Setting(range_between(low, high, positive), shapes=shapes)}
+        **default,
+        metadata={"setting": Setting(range_between(low, high, positive), shapes=shapes), "static": True, "keep": keep},
     )
 
 
@@ -110,7 +113,7 @@ def color(per_item: bool = False) -> Any:
     Args:
         per_item: True for a field that also accepts an array with one colour for each item. (n, 4)
     """
-    return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if per_item else ((4,),))
+    return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if per_item else ((4,),), keep=False)
 
 
 @functools.cache

@@ -194,6 +194,16 @@ def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
     assert not report.floor.any()
 
 
+def test_a_replaced_log_checks_what_its_new_settings_select():
+    sim = Sim(n_drones=2, plugins=[ContactLog(drones=False)])
+    sim.step()
+    log = sim.replace(ContactLog(floor=False))
+    sim.reset()
+    sim.step()
+    assert not log.read(sim.data).any.any()
+    assert log.read(sim.data).floor is None
+
+
 def test_contacts_are_logged_at_the_step_at_which_they_begin():
     """In the first world a drone flies past a pole, in the second into it; in the third two drones rest in contact."""
     sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel")

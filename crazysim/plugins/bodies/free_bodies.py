@@ -22,7 +22,7 @@ from crazysim.dynamics.rigid_body import free_rotation
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.plugins.contacts.rigid_bodies import BodyContacts, require_few_contacts
-from crazysim.plugins.effects.ground import TerrainData
+from crazysim.plugins.effects.ground import HeightField
 from crazysim.plugins.payloads.colliders import load_shape
 from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
@@ -142,7 +142,7 @@ class FreeBodies(Population):
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
         self.check(sim)
-        terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]
+        terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, HeightField)]
         n_contacts = require_few_contacts(BodyContacts(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
         zero = np.zeros(3)
         record = self.create(

@@ -2,69 +2,61 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, param, state
 from crazysim.core.stage import Stage, StageScope
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, device_array, leaf, static
+from crazysim.pytree import device_array
 from crazysim.scene.contact_report import ContactReport, ObjectSelection, select_bodies
 from crazysim.scene.object_poses import moving_plugins
 
 
-class ContactLogData(PyTree):
-    """Contacts of each drone since its world's last reset."""
+class ContactLog(Plugin):
+    """Log of contacts, checked at the end of every step within the compiled step.
 
-    floor: Array = leaf("drone", 0)
-    """True where the drone has touched the floor. (n_worlds, n_drones)"""
-    objects: Array = leaf("drone", 1)
-    """True where the drone has touched the object. (n_worlds, n_drones, n_objects)"""
-    drones: Array = leaf("drone", 0)
-    """True where the drone has touched another drone. (n_worlds, n_drones)"""
-    first_step: Array = leaf("drone", 0)
+    A reset of a world clears its log. In ``data.plugins`` the settings are the log: True where a drone has touched what
+    they select, None for what is not checked.
+    """
+
+    objects: ObjectSelection = param(default=None, core=("objects",), scope="drone")
+    """Handles, or names of bodies; None for all bodies in the scene, () for none. (n_worlds, n_drones, n_objects)"""
+    floor: bool = param(default=True, core=(), scope="drone")
+    """True to check the floor. Drones that start on the floor touch it at once. (n_worlds, n_drones)"""
+    drones: bool = param(default=True, core=(), scope="drone")
+    """True to check drones against each other. (n_worlds, n_drones)"""
+    first_step: Array = state((), dtype=np.int32)
     """Step in which the drone first touched anything; -1 before. (n_worlds, n_drones)"""
-    object_names: tuple[str, ...] = static()
-    """Names of the bodies of the objects. (n_objects,)"""
+    name: str = "contacts"
+    object_names: tuple[str, ...] = dataclasses.field(default=(), kw_only=True, repr=False)
+    """Names of the bodies of the objects in ``data.plugins``. (n_objects,)"""
 
     @property
     def any(self) -> Array:
         """True where the drone has touched anything. (n_worlds, n_drones)"""
         return self.first_step >= 0
 
-
-class ContactLog(Plugin):
-    """Log of contacts, checked at the end of every step within the compiled step.
-
-    A reset of a world clears its log.
-    """
-
-    objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all bodies in the scene, () for none."""
-    floor: bool = True
-    """True to check the floor. Drones that start on the floor touch it at once."""
-    drones: bool = True
-    """True to check drones against each other."""
-    name: str = "contacts"
-
-    def record(self, sim: Simulation) -> ContactLogData:
+    def bind(self, sim: Simulation) -> ContactLog:
         names = self._object_names(sim)
         if not (names or self.floor or self.drones):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
         shape = (sim.n_worlds, sim.n_drones)
-        return ContactLogData(
-            floor=device_array(np.zeros(shape), bool),
-            objects=device_array(np.zeros((*shape, len(names))), bool),
-            drones=device_array(np.zeros(shape), bool),
-            first_step=device_array(np.full(shape, -1), np.int32),
-            object_names=names,
-        )
+        flags: Any = {
+            "floor": device_array(np.zeros(shape), bool) if self.floor else None,
+            "objects": device_array(np.zeros((*shape, len(names))), bool),
+            "drones": device_array(np.zeros(shape), bool) if self.drones else None,
+        }
+        first_step = device_array(np.full(shape, -1), np.int32)
+        return self.replace(**flags, first_step=first_step, object_names=names, is_bound=True)
 
-    def carry_over(self, record: ContactLogData, old_record: ContactLogData) -> ContactLogData:
+    def carry_over(self, record: ContactLog, old_record: ContactLog) -> ContactLog:
         """Return the record with the log of objects that are in the scene already."""
         old_names = old_record.object_names
         columns = [k for k, name in enumerate(record.object_names) if name in old_names]
@@ -106,7 +98,7 @@ class ContactLog(Plugin):
         return Stage(log_contacts, scope)
 
 
-def _merge_objects(log: ContactLogData, report: ContactReport) -> Array:
+def _merge_objects(log: Any, report: ContactReport) -> Array:
     """Return the log's objects, updated by a report of all or some of them. (..., n_objects)"""
     if report.objects is None or report.object_names == log.object_names:
         return _logical_or(log.objects, report.objects)
@@ -114,5 +106,5 @@ def _merge_objects(log: ContactLogData, report: ContactReport) -> Array:
     return log.objects | jnp.zeros_like(log.objects).at[..., columns].set(report.objects)
 
 
-def _logical_or(old: Array, new: Array | None) -> Array:
+def _logical_or(old: Any, new: Array | None) -> Any:
     return old if new is None else old | new

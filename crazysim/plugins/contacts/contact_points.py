@@ -21,7 +21,7 @@ from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
-from crazysim.plugins.effects.ground import TerrainData
+from crazysim.plugins.effects.ground import HeightField
 from crazysim.plugins.payloads.colliders import LoadBody
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.contact_report import ObjectSelection, select_bodies
@@ -193,7 +193,7 @@ def _height_above_field(
 ) -> tuple[Array, Array]:
     """Return the distance of points to the plane of the terrain's triangle below, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
-    if isinstance(terrain, TerrainData):
+    if isinstance(terrain, HeightField):
         return terrain.gap_at(points)
     gap, normal = field_gap(geom.shape, to_geom(points, True))
     return gap, to_world(normal)

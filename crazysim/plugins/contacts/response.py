@@ -16,7 +16,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, param, state
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage
 from crazysim.plugins.contacts.contact_points import Surface, contact_points, find_surfaces, is_ground
@@ -30,26 +30,7 @@ from crazysim.plugins.contacts.load_contacts import (
     resolve_surface_contacts,
 )
 from crazysim.plugins.payloads.colliders import CollidingPlugin
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ObjectSelection, select_bodies
-
-
-class ContactResponseData(PyTree):
-    """Parameters of the surfaces, and the last impulse on each drone."""
-
-    friction: Array = leaf("parameter", 1, (1,))
-    """Coulomb's coefficient between drone and surface. (1,)"""
-    restitution: Array = leaf("parameter", 1, (1,))
-    """Ratio of the speeds after and before a bounce. (1,)"""
-    softness: Array = leaf("parameter", 1, (1,))
-    """Time constant with which an overlap is pushed out, s. (1,)"""
-    impulse: Array = leaf("drone", 1)
-    """Impulse of all surfaces and loads in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
-
-    @property
-    def material(self) -> Material:
-        """Parameters of the contacts."""
-        return Material(self.friction, self.restitution, self.softness)
 
 
 class ContactResponse(Plugin):
@@ -61,26 +42,28 @@ class ContactResponse(Plugin):
     hooks that are among ``objects`` exchange impulses with drones and with each other.
     """
 
-    objects: ObjectSelection = None
+    objects: ObjectSelection = setting(default=None, keep=False)
     """Handles, or names of bodies; None for all bodies in the scene, () for the floor alone."""
-    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
-    """Coulomb's coefficient."""
-    restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))
-    """Ratio of the speeds after and before a bounce, 0 to 1."""
-    softness: float = parameter(default=0.03, positive=True, high=MAX_SOFTNESS, shapes=((),))
-    """Time constant with which an overlap is pushed out, s; at least two steps."""
+    friction: Param = param(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
+    """Coulomb's coefficient between drone and surface, 1. (1,)"""
+    restitution: Param = param(default=0.2, low=0.0, high=1.0, shapes=((),))
+    """Ratio of the speeds after and before a bounce, 0 to 1. (1,)"""
+    softness: Param = param(default=0.03, positive=True, high=MAX_SOFTNESS, shapes=((),))
+    """Time constant with which an overlap is pushed out, s; at least two steps. (1,)"""
     iterations: int = setting(default=8, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver, for simultaneous contact points."""
+    impulse: Array = state((3,))
+    """Impulse of all surfaces and loads in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
     name: str = "contact_response"
 
-    def record(self, sim: Simulation) -> ContactResponseData:
+    @property
+    def material(self) -> Material:
+        """Parameters of the contacts."""
+        return Material(self.friction, self.restitution, self.softness)
+
+    def bind(self, sim: Simulation) -> ContactResponse:
         check_softness(sim.data.core.freq, self.softness)
-        return ContactResponseData(
-            friction=device_array([self.friction]),
-            restitution=device_array([self.restitution]),
-            softness=device_array([self.softness]),
-            impulse=device_array(np.zeros((sim.n_worlds, sim.n_drones, 3))),
-        )
+        return self.with_arrays(sim)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         boxes = collision_boxes(sim)
@@ -90,11 +73,10 @@ class ContactResponse(Plugin):
 
         def respond(data: SimData) -> SimData:
             results = [
-                (drone_group, _respond_to_contacts(data, self.read(data), surfaces, box, self.iterations))
-                for drone_group, box in boxes
+                (drone_group, self.bound(data).states_after_contact(data, surfaces, box)) for drone_group, box in boxes
             ]
-            states, record = select_airframe(results, data.core.drone_id)
-            return self.write(data.replace(states=states), record)
+            states, response = select_airframe(results, data.core.drone_id)
+            return self.write(data.replace(states=states), response)
 
         placements = [StagePlacement(Stage(respond, "drone"), before="measurements", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
@@ -121,23 +103,23 @@ class ContactResponse(Plugin):
             if plugin.name not in data.plugins:
                 return data
             for collider in colliders:
-                data = resolve_surface_contacts(data, collider, obstacles, self.read(data).material, self.iterations)
+                data = resolve_surface_contacts(data, collider, obstacles, self.bound(data).material, self.iterations)
             return data
 
         def respond_to_drones(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
-            record = self.read(data)
-            impulse = record.impulse
+            response = self.bound(data)
+            impulse = response.impulse
             for collider in colliders:
-                data, load_impulse = resolve_drone_contacts(data, collider, record.material, boxes)
+                data, load_impulse = resolve_drone_contacts(data, collider, response.material, boxes)
                 impulse = impulse + load_impulse
-            return self.write(data, record.replace(impulse=impulse))
+            return self.write(data, response.replace(impulse=impulse))
 
         def respond_to_loads(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
-            return resolve_load_contacts(data, colliders, self.read(data).material)
+            return resolve_load_contacts(data, colliders, self.bound(data).material)
 
         stages = []
         if obstacles:
@@ -148,15 +130,14 @@ class ContactResponse(Plugin):
                 stages.append((Stage(respond_to_loads, "world"), f"{self.name}_between_{plugin.name}"))
         return [StagePlacement(stage, before="measurements", name=name) for stage, name in stages]
 
-
-def _respond_to_contacts(
-    data: SimData, record: ContactResponseData, surfaces: list[Surface], box: np.ndarray, iterations: int
-) -> tuple[SimState, ContactResponseData]:
-    """Return the states with the velocities after contact, and the record with the impulses, for boxes of one size."""
-    states, params = data.states, data.params
-    old_vel = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
-    points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)
-    new_vel = velocity_after_contact(points, old_vel, params.mass, inertia, record.material, iterations)
-    impulse = params.mass * rotation.rotate(states.quat, new_vel[..., :3] - old_vel[..., :3])
-    states = states.replace(vel=rotation.rotate(states.quat, new_vel[..., :3]), ang_vel=new_vel[..., 3:])
-    return states, record.replace(impulse=impulse)
+    def states_after_contact(
+        self, data: SimData, surfaces: list[Surface], box: np.ndarray
+    ) -> tuple[SimState, ContactResponse]:
+        """Return the states with the velocities after contact, and the impulses, for drones with boxes of one size."""
+        states, params = data.states, data.params
+        old_vel = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
+        points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)
+        new_vel = velocity_after_contact(points, old_vel, params.mass, inertia, self.material, self.iterations)
+        impulse = params.mass * rotation.rotate(states.quat, new_vel[..., :3] - old_vel[..., :3])
+        states = states.replace(vel=rotation.rotate(states.quat, new_vel[..., :3]), ang_vel=new_vel[..., 3:])
+        return states, self.replace(impulse=impulse)

@@ -31,7 +31,7 @@ from crazysim.plugins.contacts.pairs import (
     join_contacts,
 )
 from crazysim.plugins.contacts.solver import Bodies, Impulses, SolvedBodies, solve_contacts
-from crazysim.plugins.effects.ground import TerrainData
+from crazysim.plugins.effects.ground import HeightField
 from crazysim.scene.collision import CollisionGeom
 
 MAX_CONTACTS = 250_000
@@ -154,7 +154,7 @@ class BodyContacts:
         for geom in carrier.geoms:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
             for k in free_solids if geom.shape.kind not in EXACT_KINDS else ():
-                if isinstance(terrain, TerrainData):
+                if isinstance(terrain, HeightField):
                     contacts.append(contacts_on_ground(solids, k, carrier_index, terrain.gap_at))
                 else:
                     contacts.append(

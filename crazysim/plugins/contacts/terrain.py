@@ -9,17 +9,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
-from crazysim.core.settings import as_rgba, color, setting
-from crazysim.core.stage import Stage
+from crazysim.core.plugin import Simulation, StagePlacement
+from crazysim.core.settings import as_rgba
 from crazysim.core.stages import stop_at_ground
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON
-from crazysim.plugins.effects.ground import TerrainData, ground_below, ground_height
+from crazysim.plugins.effects.ground import HeightField, ground_below, ground_height
 from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
@@ -35,50 +33,32 @@ MIN_HEIGHT_RANGE = 1e-3
 """Smallest range of heights that is set for MuJoCo's height field, m, also for flat terrain."""
 
 
-class Terrain(Plugin):
+class Terrain(HeightField):
     """A height field on which drones and loads land; replaces the stage ``clip_floor_pos``.
 
     It is part of the scene: images, range finders and depth cameras include it, and it is the floor in contact reports
     and for a ``ContactResponse``, which must be added after it.
     """
 
-    heights: ArrayLike | str | Path = parameter()
-    """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image. Its brightness is
-    the height, zero at the darkest pixel, and its upper edge is at the largest y."""
-    size: ArrayLike = setting(positive=True, shapes=((2,), (3,)))
-    """Full lengths along x and y, m (2,); for an image, also the height of its brightest pixel (3,)."""
-    pos: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
-    """Middle of the terrain at height zero, world frame, m. (3,)"""
-    floor: bool = True
-    """True to keep the flat floor around the terrain. False to remove it, as depressions below z = 0 require; the
-    heights of the border then extend outwards without end."""
-    rgba: ArrayLike | None = color()
-    """Colour; None for the colour of the floor. (4,)"""
-    name: str = "terrain"
-
-    def record(self, sim: Simulation) -> TerrainData:
+    def bind(self, sim: Simulation) -> Terrain:
         heights, size, pos = self._check_heights(sim)
         dtype = sim.data.states.pos.dtype
-        record = TerrainData(
-            heights=device_array(heights, dtype),
-            middle=device_array(pos, dtype),
-            half_size=device_array(size / 2, dtype),
-            height_below=drone_array(sim, 0.0, 1),
-            floor=self.floor,
-        )
+        half_size = device_array(size / 2, dtype)
+        bound = self.with_arrays(sim, heights=device_array(heights, dtype), half_size=half_size)
         _set_height_field(sim.scene, self, heights, size, pos)
-        return record.replace(height_below=record.surface_at(sim.data.states.pos)[0])
+        return bound.replace(height_below=bound.surface_at(sim.data.states.pos)[0])
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
-        stop_stage = Stage(self.stop_drones, scope, batched=True, unfused_reason=UNFUSED_REASON, ground=ground_below)
+        details: Any = {"batched": True, "unfused_reason": UNFUSED_REASON, "ground": ground_below}
+        stop_stage = self.stage(self.stop_drones, scope, **details)
         return [StagePlacement(stop_stage, before="measurements", replaces="clip_floor_pos")]
 
     def stop_drones(self, data: SimData) -> SimData:
         """Return the data with drones that are below the ground, or on it and not rising, on the ground at rest."""
         ground = ground_height(data, data.states.pos)
         states = stop_at_ground(data.states, ground)
-        return self.write(data.replace(states=states), self.read(data).replace(height_below=ground))
+        return self.write(data.replace(states=states), self.replace(height_below=ground))
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights, full lengths along x and y, and the middle, m."""

@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax.numpy as jnp
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Param, Plugin, derived, param, state
+from crazysim.core.settings import color, setting
 from crazysim.eager import jit_eager_calls
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE, surface_at
-from crazysim.pytree import PyTree, leaf, static
 
 
-class TerrainData(PyTree):
-    """Heights of the ground on a grid, and below every drone."""
+class HeightField(Plugin):
+    """Ground with heights on a grid: what ``Terrain``, which adds it to the scene, knows about its surface."""
 
-    heights: Array = leaf("shared", 2)
-    """Heights of the nodes above the middle of the terrain, rows along y and columns along x, m. (n_rows, n_columns)"""
-    middle: Array = leaf("shared", 1)
-    """Position of the middle of the terrain, world frame, m. (3,)"""
-    half_size: Array = leaf("shared", 1)
+    heights: ArrayLike | str | Path = param(core=("rows", "columns"), scope="shared")
+    """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image. Its brightness is
+    the height, zero at the darkest pixel, and its upper edge is at the largest y."""
+    size: ArrayLike = setting(positive=True, shapes=((2,), (3,)), keep=False)
+    """Full lengths along x and y, m (2,); for an image, also the height of its brightest pixel (3,)."""
+    pos: Param = param(default=(0.0, 0.0, 0.0), core=(3,), scope="shared", shapes=((3,),))
+    """Middle of the terrain at height zero, world frame, m. (3,)"""
+    floor: bool = True
+    """True to keep the flat floor around the terrain. False to remove it, as depressions below z = 0 require; the
+    heights of the border then extend outwards without end."""
+    rgba: ArrayLike | None = color()
+    """Colour; None for the colour of the floor. (4,)"""
+    half_size: Array = derived((2,), scope="shared")
     """Half extents along x and y, m. (2,)"""
-    height_below: Array = leaf("drone", 1)
+    height_below: Array = state()
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
-    floor: bool = static()
-    """True if a flat floor at z = 0 surrounds the terrain; False if the terrain's border extends without end."""
+    name: str = "terrain"
 
     @jit_eager_calls()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
@@ -38,11 +49,11 @@ class TerrainData(PyTree):
         Returns:
             Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
         """
-        height, normal, is_inside = surface_at(self.heights, self.half_size, pos - self.middle)
+        height, normal, is_inside = surface_at(self.heights, self.half_size, pos - self.pos)  # type: ignore[arg-type]
         if self.floor:
             normal = jnp.where(is_inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
-            return jnp.where(is_inside, height + self.middle[2], 0.0)[..., None], normal
-        return (height + self.middle[2])[..., None], normal
+            return jnp.where(is_inside, height + self.pos[2], 0.0)[..., None], normal
+        return (height + self.pos[2])[..., None], normal
 
     def gap_at(self, point: Array) -> tuple[Array, Array]:
         """Return the distance of a point above the plane of the triangle below it, and the plane's normal.
@@ -54,8 +65,8 @@ class TerrainData(PyTree):
             Signed distance, m (...), and unit normal (..., 3). Beyond the border of a terrain that a flat floor
             surrounds, the distance is ``OUTSIDE_DISTANCE``.
         """
-        height, normal, is_inside = surface_at(self.heights, self.half_size, point - self.middle)
-        gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
+        height, normal, is_inside = surface_at(self.heights, self.half_size, point - self.pos)  # type: ignore[arg-type]
+        gap = (point[..., 2] - self.pos[2] - height) * normal[..., 2]
         return jnp.where(is_inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
 
 
@@ -74,7 +85,7 @@ def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
     """
     height = jnp.zeros_like(pos[..., :1])
     normal = jnp.zeros_like(pos).at[..., 2].set(1.0)
-    for k, terrain in enumerate(x for x in data.plugins.values() if isinstance(x, TerrainData)):
+    for k, terrain in enumerate(x for x in data.plugins.values() if isinstance(x, HeightField)):
         terrain_height, terrain_normal = terrain.surface_at(pos)
         is_higher = terrain_height > height if k else jnp.ones_like(terrain_height, bool)
         height, normal = jnp.where(is_higher, terrain_height, height), jnp.where(is_higher, terrain_normal, normal)
@@ -88,7 +99,7 @@ def ground_height(data: SimData, pos: Array) -> Array:
 
 def ground_below(data: SimData) -> Array | float:
     """Return the height of the ground below a drone, m, after the last step; zero without terrain. (..., 1)"""
-    heights = [x.height_below for x in data.plugins.values() if isinstance(x, TerrainData)]
+    heights = [x.height_below for x in data.plugins.values() if isinstance(x, HeightField)]
     height: Array | float = heights[0] if heights else 0.0
     for other in heights[1:]:
         height = jnp.maximum(height, other)

@@ -20,7 +20,7 @@ from crazysim.core.settings import color, default_rates
 from crazysim.core.stage import Stage, is_tick
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.ground import TerrainData, ground_at
+from crazysim.plugins.effects.ground import HeightField, ground_at
 from crazysim.plugins.vehicles import appearance, starts
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_params import CarParams
@@ -195,7 +195,7 @@ class Cars(Population):
         model = kinematic if self.model.dynamics == "kinematic" else single_track
         command = car.command if car.applied_command is None else car.applied_command
         force, terrain_rates = car.force[:2], {}
-        if any(isinstance(record, TerrainData) for record in data.plugins.values()):
+        if any(isinstance(record, HeightField) for record in data.plugins.values()):
             force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
             terrain_rates = self._terrain_rates(data, car)
         wrench = jnp.concatenate([to_body_frame(car.yaw, force), car.torque[2:]])
