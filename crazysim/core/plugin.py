@@ -328,12 +328,18 @@ def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any
     if value is None and (metadata.get("optional") or "setting" in metadata):
         return None
     if scope == "shared":
-        return device_array(value, dtype)
+        return device_array(np.array(value, ndmin=1), dtype)
     batch = (sim.n_worlds, 1) if scope == "world" else sim.data.states.pos.shape[:2]
     if value is None or scope == "world":
         return device_array(np.broadcast_to(value or 0, (*batch, *core)), dtype)
     array = _read_parameter(sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis)
     return device_array(np.broadcast_to(array, (*batch, *core)), dtype) if scope == "drone" else array
+
+
+def _as_tuples(value: Any) -> Any:
+    """Return arrays and lists as tuples, which are hashable."""
+    value = getattr(value, "tolist", lambda: value)()
+    return tuple(map(_as_tuples, value)) if type(value) in (list, tuple) else value
 
 
 Requirement = type | Callable[[Simulation, Any], None]
@@ -380,21 +386,32 @@ class Plugin(PyTree):
     results of earlier stages. None to call it at resets, and again in the first step, before all other stages."""
 
     def __init_subclass__(
-        cls, replaces: tuple[str, ...] = (), requires: Requirement | tuple[Requirement, ...] = (), **kwargs: Any
+        cls,
+        replaces: tuple[str, ...] = (),
+        requires: Requirement | tuple[Requirement, ...] = (),
+        abstract: bool = False,
+        **kwargs: Any,
     ) -> None:
-        """Make every subclass a frozen dataclass, whose numbers and states are leaves for JAX."""
+        """Make every subclass a frozen dataclass, whose numbers and states are leaves for JAX.
+
+        An abstract class leaves the field ``name`` to its subclasses.
+        """
         if replaces:
             cls.replaces = replaces
         cls.requires = (*cls.requires, *(requires if isinstance(requires, tuple) else (requires,)))
         _declare_static_fields(cls)
         super().__init_subclass__(**kwargs)
-        if "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
+        if not abstract and "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
             raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation."""
+        """Check the user's settings; a plugin with arrays has been checked."""
         if self.is_bound is not True:
-            check_settings(self)
+            self.check_settings()
+
+    def check_settings(self) -> None:
+        """Check the settings that do not depend on a simulation."""
+        check_settings(self)
 
     def bind(self, sim: Simulation) -> Self:
         """Return the plugin with arrays, as it will be in ``data.plugins``; check it with the simulation.
@@ -410,11 +427,10 @@ class Plugin(PyTree):
             sim: The simulation.
             values: Values of fields. If a value is None, the user's number is still checked.
         """
-        kept = [f.name for f in dataclasses.fields(self) if f.metadata.get("static") and f.metadata.get("keep", True)]
-        for name in kept:
-            value = values.get(name, getattr(self, name))
-            if isinstance(value, list):
-                values[name] = value = tuple(value)
+        for name in [
+            f.name for f in dataclasses.fields(self) if f.metadata.get("static") and f.metadata.get("keep", True)
+        ]:
+            values[name] = value = _as_tuples(values.get(name, getattr(self, name)))
             try:
                 hash(value)
             except TypeError:
@@ -422,13 +438,12 @@ class Plugin(PyTree):
                     f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "
                     f"numbers with param(...), or use a tuple."
                 ) from None
-        bound: dict[str, Any] = {"is_bound": True, **values}
+        bound: dict[str, Any] = {**values, "is_bound": True}
         for field in dataclasses.fields(self):
-            name = field.name
-            if "scope" in field.metadata and values.get(name) is None:
-                bound.setdefault(name, bind_leaf(sim, name, getattr(self, name), field.metadata))
+            if "scope" in field.metadata and values.get(field.name) is None:
+                bound.setdefault(field.name, bind_leaf(sim, field.name, getattr(self, field.name), field.metadata))
             elif not field.metadata.get("keep", True):
-                bound.setdefault(name, None)
+                bound.setdefault(field.name, None)
         return self.replace(**bound)
 
     def bound(self, data: SimData) -> Self:
@@ -654,15 +669,15 @@ class BoundMethod:
 
     plugin: Plugin
     """The plugin that was added."""
-    method: Callable[[Any, SimData], SimData]
+    method: Callable[[Any, SimData], Any]
     """The method, a function of the plugin and the data."""
 
     @property
     def __name__(self) -> str:
         return self.method.__name__
 
-    def __call__(self, data: SimData) -> SimData:
-        """Return the data after the stage."""
+    def __call__(self, data: SimData) -> Any:
+        """Return what the method returns, such as the data after the stage."""
         return self.method(self.plugin.bound(data), data)
 
 

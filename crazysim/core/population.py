@@ -6,7 +6,6 @@ Scopes, masks, seeds, sharding, engines and gradients treat members as they trea
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
@@ -166,7 +165,8 @@ class Population(Plugin):
             pos: Positions, world frame, m. (n_worlds, n_members, 3)
             quat: Attitudes, body to world, xyzw. (n_worlds, n_members, 4)
         """
-        return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in _fields(record)})
+        fields = record.__dataclass_fields__  # type: ignore[attr-defined]
+        return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in fields})
 
     def with_command(self, data: SimData, command: ArrayLike) -> SimData:
         """Return the data of all worlds with a new command for every member. (n_worlds, n_members, k)"""
@@ -231,10 +231,6 @@ def choose_scheme(integrator: Integrator, positions: Sequence[str]) -> Callable[
 def populations(data: SimData) -> dict[str, Members]:
     """Return the records of all populations other than the drones, by name."""
     return {name: x for name, x in data.plugins.items() if isinstance(x, Members) and x.population == name}
-
-
-def _fields(record: Members) -> set[str]:
-    return {f.name for f in dataclasses.fields(record)}  # type: ignore[arg-type]
 
 
 def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: Any) -> Array | np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.core.data import SimData, require_data
-from crazysim.core.plugin import Plugin
+from crazysim.core.plugin import BoundMethod, Plugin
 from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
 
@@ -45,6 +45,6 @@ def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
             f"objects=."
         )
     for plugin in dict.fromkeys(plugins.values()):
-        move = vmap_worlds(plugin.move_objects) if data.states.pos.ndim == 3 else plugin.move_objects
-        data = data.replace(objects=move(data))
+        move = BoundMethod(plugin, type(plugin).move_objects)
+        data = data.replace(objects=(vmap_worlds(move) if data.states.pos.ndim == 3 else move)(data))
     return data

@@ -60,8 +60,6 @@ class DroneCollisions(Plugin):
         n_contacts = require_few_contacts(N_BOX_POINTS * n * (n - 1) // 2, f"{n} drones")
         return self.with_arrays(
             sim,
-            friction=device_array([self.friction]),
-            restitution=device_array([self.restitution]),
             normal_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
             friction_impulse=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )

@@ -7,25 +7,24 @@ import math
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter
+from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, state
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 
-class BodiesInAir(PyTree):
-    """Record of bodies that wind and downwash act on, one body for each drone, such as its load."""
+class BodiesInAir(Plugin, abstract=True):
+    """Base class of plugins with bodies that wind and downwash act on, one body for each drone, such as its load."""
 
-    pos: Array = leaf("drone", 1, (3,))
+    pos: Array = state((3,))
     """Position of the body, world frame, m. (n_worlds, n_drones, 3)"""
-    air_vel: Array | None = leaf("drone", 1, (3,))
+    air_vel: Array | None = state((3,))
     """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
-    wind_vel: Array | None = leaf("drone", 1, (3,))
+    wind_vel: Array | None = state((3,))
     """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
 
@@ -104,10 +103,3 @@ def rotor_positions(sim: Simulation) -> Array:
     """Return the positions of the rotors, body frame, m; zero for rotors that a drone lacks. (..., n_rotors, 3)"""
     positions = airframe_numbers(sim, lambda airframe: airframe.value("rotors.position"), ("rotors", 3))
     return device_array(positions, sim.data.states.pos.dtype)
-
-
-def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
-    """Return the checked radius of propellers, m; for None, the radius of the airframes. (1,) or one per drone"""
-    if radius is None:
-        radius = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
-    return check_parameter(sim, "propeller_radius", radius, positive=True)

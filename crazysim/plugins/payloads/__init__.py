@@ -1,23 +1,19 @@
 """Loads that hang from one drone or several, on rods, cables or hooks, and the jets of rotors on these loads."""
 
-from crazysim.plugins.payloads.hook import Hook, HookData
+from crazysim.plugins.payloads.hook import Hook
 from crazysim.plugins.payloads.jet_table import JetTable, load_jet_table
 from crazysim.plugins.payloads.load_flatness import LoadedState, load_flat_state
-from crazysim.plugins.payloads.point_load import LoadData, direction, load_pos, load_vel
-from crazysim.plugins.payloads.rotor_jet import RotorJet, RotorJetData
-from crazysim.plugins.payloads.shared import SharedLoad, SharedLoadData
+from crazysim.plugins.payloads.point_load import direction, load_pos, load_vel
+from crazysim.plugins.payloads.rotor_jet import RotorJet
+from crazysim.plugins.payloads.shared import SharedLoad
 from crazysim.plugins.payloads.slung import SlungLoad
 
 __all__ = [
     "Hook",
-    "HookData",
     "JetTable",
-    "LoadData",
     "LoadedState",
     "RotorJet",
-    "RotorJetData",
     "SharedLoad",
-    "SharedLoadData",
     "SlungLoad",
     "direction",
     "load_flat_state",

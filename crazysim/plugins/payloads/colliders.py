@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.tables import LENGTH, as_number_array
@@ -47,15 +48,11 @@ class Collider(NamedTuple):
     (n_loads, n_drones)"""
 
 
-class CollidingPlugin:
-    """Interface of plugins whose loads collide, for subclasses of ``Plugin`` to inherit from as well."""
+class CollidingPlugin(Plugin, abstract=True):
+    """Base class of plugins whose loads collide; the loads in the scene are ``name:0``, ...
 
-    coupling: Any
-    """``"drone"`` for loads of one drone each, ``"world"`` for loads of a world."""
-    name: Any
-    """Name of the plugin, and of its loads in the scene: ``name:0``, ..."""
-    size: Any
-    """Radius of a ball, or full lengths of a box, m. () or (3,)"""
+    ``coupling`` is ``"drone"`` for loads of one drone each, ``"world"`` for loads of a world.
+    """
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:
@@ -73,7 +70,7 @@ class CollidingPlugin:
 
     def shape(self) -> Shape:
         """Return the shape of a load."""
-        return load_shape(self.size)
+        return load_shape(self.size)  # type: ignore[attr-defined]
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads of one drone or one world."""

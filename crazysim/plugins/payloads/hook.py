@@ -12,46 +12,28 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
+from crazysim.core.plugin import Param, Simulation, StagePlacement, check_parameter, param, state
 from crazysim.core.settings import as_mask, color, setting
-from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.plugins.effects.ground import ground_height
-from crazysim.plugins.payloads.colliders import Collider, CollidingPlugin, LoadBody, rest_height
+from crazysim.plugins.payloads.colliders import Collider, LoadBody, rest_height
 from crazysim.plugins.payloads.link import MIN_MASS, LinkParams, couple_bodies, end_relative_motion, link_geometry
 from crazysim.plugins.payloads.point_load import (
     HEAD_HEIGHT,
     HEAD_RADIUS,
-    LoadData,
+    HangingLoad,
     clip_to_floor,
     free_acceleration,
     hanging_state,
     rotation_from_z,
 )
-from crazysim.plugins.payloads.slung import load_record, move_loads, shape_axis
-from crazysim.pytree import device_array, leaf, select_worlds
+from crazysim.plugins.payloads.slung import bind_load, move_loads, shape_axis
+from crazysim.pytree import device_array, select_worlds
 from crazysim.rotation import dot
 
 
-class HookData(LoadData):
-    """State and parameters of the hook of each drone, and of its load."""
-
-    tip_pos: Array = leaf("drone", 1, (3,))
-    """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
-    tip_vel: Array = leaf("drone", 1, (3,))
-    """Velocity of the hook, world frame, m/s. (n_worlds, n_drones, 3)"""
-    grip: Array = leaf("drone", 0)
-    """Command: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones)"""
-    hook_mass: Array = leaf("parameter", 1, (1,))
-    """Mass of the hook, kg. (1,)"""
-    reach: Array = leaf("parameter", 1, (1,))
-    """Distance between hook and ring below which the hook picks up the load, m. (1,)"""
-    max_speed: Array = leaf("parameter", 1, (1,))
-    """Relative speed of hook and ring below which the hook picks up the load, m/s. (1,)"""
-
-
-class Hook(CollidingPlugin, Plugin):
+class Hook(HangingLoad):
     """A hook on a rigid rod, with one load for each drone.
 
     With two degrees of freedom the rod swings freely. With one degree of freedom it turns about the body's y axis, and
@@ -60,37 +42,43 @@ class Hook(CollidingPlugin, Plugin):
     falls freely.
     """
 
-    mass: ArrayLike = parameter(low=0.0)
-    """Mass of the load, kg; zero for no load. () or (n_worlds, n_drones)"""
+    mass: Param = param(low=0.0)
+    """Mass of the load, kg; zero for no load. (1,)"""
     dof: int = setting(default=2, low=1, high=2)
     """Degrees of freedom of the rod, 1 or 2."""
-    length: ArrayLike = parameter(default=0.4, positive=True)
-    """Length of the rod, m. () or (n_worlds, n_drones)"""
-    attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Position of the joint relative to the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    hook_mass: ArrayLike = parameter(default=0.0203, low=0.0)
-    """Mass of the hook, kg. () or (n_worlds, n_drones)"""
-    damping: ArrayLike = parameter(default=0.001, low=0.0)
-    """Viscous torque of the joint per angular velocity, N m s. () or (n_worlds, n_drones)"""
-    reach: ArrayLike = parameter(default=0.05, low=0.0)
-    """Distance between hook and ring below which the hook picks up the load, m. () or (n_worlds, n_drones)"""
-    max_speed: ArrayLike = parameter(default=0.5, low=0.0)
-    """Relative speed of hook and ring below which the hook picks up the load, m/s. () or (n_worlds, n_drones)"""
-    drag: ArrayLike = parameter(default=0.0, low=0.0)
-    """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
-    friction: ArrayLike = parameter(default=0.6, low=0.0)
-    """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
-    size: ArrayLike = setting(default=(0.14, 0.14, 0.08), positive=True, shapes=((), (3,)))
+    length: Param = param(default=0.4, positive=True)
+    """Length of the rod, m. (1,)"""
+    attach: Param = param(default=(0.0, 0.0, 0.0), core=(3,), sparse=True)
+    """Position of the joint relative to the drone's centre of mass, body frame, m. (3,)"""
+    hook_mass: Param = param(default=0.0203, low=0.0)
+    """Mass of the hook, kg. (1,)"""
+    damping: Param = param(default=0.001, low=0.0)
+    """Viscous torque of the joint per angular velocity, N m s. (1,)"""
+    reach: Param = param(default=0.05, low=0.0)
+    """Distance between hook and ring below which the hook picks up the load, m. (1,)"""
+    max_speed: Param = param(default=0.5, low=0.0)
+    """Relative speed of hook and ring below which the hook picks up the load, m/s. (1,)"""
+    drag: Param = param(default=0.0, low=0.0)
+    """Linear drag coefficient of the load, N s/m. (1,)"""
+    friction: Param = param(default=0.6, low=0.0)
+    """Coulomb's coefficient between load and floor, 1. (1,)"""
+    size: ArrayLike = setting(default=(0.14, 0.14, 0.08), positive=True, shapes=((), (3,)), keep=False)
     """Radius of a ball, or full lengths of a box, m. () or (3,)"""
     ring: float = setting(default=0.1275, low=0.0)
     """Height of the ring above the middle of the load, m."""
-    load_at: ArrayLike | None = None
+    load_at: ArrayLike | None = setting(default=None, keep=False)
     """Initial position of the loads' rings, world frame, m; None for loads on the hooks. (3,) or (n_worlds, n_drones,
     3)"""
     rgba: ArrayLike | None = color()
     """Colour of the loads; None for the default. (4,)"""
     in_scene: bool = True
     """True to put loads and rods into the scene."""
+    tip_pos: Array = state((3,))
+    """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
+    tip_vel: Array = state((3,))
+    """Velocity of the hook, world frame, m/s. (n_worlds, n_drones, 3)"""
+    grip: Array = state((), dtype=bool)
+    """Command: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones)"""
     name: str = "load"
 
     @staticmethod
@@ -108,74 +96,76 @@ class Hook(CollidingPlugin, Plugin):
         """
         return Hook(mass, dof, **settings)
 
-    def record(self, sim: Simulation) -> HookData:
+    def bind(self, sim: Simulation) -> Hook:
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
-        grip = device_array(np.ones(sim.data.states.pos.shape[:2]), bool)
-        load = load_record(self, sim, HookData, False, rest_height(self.size) + self.ring, self.ring, grip=grip)
+        load = bind_load(self, sim, False, rest_height(self.size) + self.ring, self.ring)
         if self.load_at is None:
-            return load.replace(tip_pos=device_array(load.pos), tip_vel=device_array(load.vel))
+            grip = device_array(load.attached, bool)
+            return load.replace(tip_pos=device_array(load.pos), tip_vel=device_array(load.vel), grip=grip)
         load_pos = check_parameter(sim, "load_at", self.load_at, (3,))
         pos = np.array(np.broadcast_to(load_pos, load.pos.shape))
         pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
         no_clearance = device_array(np.zeros(load.clearance.shape))
         tip_pos, tip_vel = hanging_state(sim.data.states, load.attach, load.length, no_clearance, False)
-        masks = {name: device_array(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
         return load.replace(
-            pos=device_array(pos), vel=device_array(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **masks
+            pos=device_array(pos),
+            vel=device_array(np.zeros_like(pos)),
+            tip_pos=tip_pos,
+            tip_vel=tip_vel,
+            attached=device_array(np.zeros(load.attached.shape), bool),
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [
-            StagePlacement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
-            StagePlacement(Stage(self.stop_at_floor, "drone"), "measurements", name=f"{self.name}_floor"),
+            StagePlacement(self.stage(self.pick_up_and_release), "integration", name=f"{self.name}_grip"),
+            StagePlacement(self.stage(self.stop_at_floor), "measurements", name=f"{self.name}_floor"),
         ]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        load, p = self.read(data), data.params
-        fall_acc = free_acceleration(data, load, self.name, dt)
-        link = self._link_params(load)
+        p, link = data.params, self._link_params()
+        fall_acc = free_acceleration(data, self, dt)
         tip_free_acc = jnp.where(
-            load.attached,
-            p.gravity_vec + load.mass / (link.mass + MIN_MASS) * (fall_acc - p.gravity_vec),
+            self.attached,
+            p.gravity_vec + self.mass / (link.mass + MIN_MASS) * (fall_acc - p.gravity_vec),
             p.gravity_vec,
         )
         motion = couple_bodies(
-            data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, tip_free_acc, dt, data.core.freq
+            data.states, deriv, p.mass, p.J_inv, link, self.tip_pos, self.tip_vel, tip_free_acc, dt, data.core.freq
         )
-        free_pos_rate = load.vel if dt is None else load.vel + dt * fall_acc
+        free_pos_rate = self.vel if dt is None else self.vel + dt * fall_acc
         rates = {
             "tip_pos": motion.pos_rate,
             "tip_vel": motion.acc,
-            "pos": jnp.where(load.attached, motion.pos_rate, free_pos_rate),
-            "vel": jnp.where(load.attached, motion.acc, fall_acc),
+            "pos": jnp.where(self.attached, motion.pos_rate, free_pos_rate),
+            "vel": jnp.where(self.attached, motion.acc, fall_acc),
         }
         return motion.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def pick_up_and_release(self, data: SimData) -> SimData:
-        """Pick up one drone's load if it is near and slow, or let it go, as commanded by ``grip`` of the record.
+        """Pick up one drone's load if it is near and slow, or let it go, as commanded by ``grip``.
 
         Hook and ring stay together after an impact that conserves momentum: they get the mass-weighted mean of their
         velocities. Then the rigid rod transmits an impulse along its axis to the drone.
         """
-        load, p, s = self.read(data), data.params, data.states
-        offset, relative_vel = load.pos - load.tip_pos, load.vel - load.tip_vel
+        p, s = data.params, data.states
+        offset, relative_vel = self.pos - self.tip_pos, self.vel - self.tip_vel
         can_grip = (
-            (dot(offset, offset) < load.reach**2)
-            & (dot(relative_vel, relative_vel) < load.max_speed**2)
-            & (load.mass > 0)
+            (dot(offset, offset) < self.reach**2)
+            & (dot(relative_vel, relative_vel) < self.max_speed**2)
+            & (self.mass > 0)
         )
-        is_picked_up = load.grip & ~load.attached & can_grip[..., 0]
-        new_load = load.replace(attached=load.grip & (load.attached | is_picked_up))
-        link = self._link_params(new_load)
-        common_vel = load.tip_vel + load.mass / (link.mass + MIN_MASS) * relative_vel
-        new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, common_vel)
+        is_picked_up = self.grip & ~self.attached & can_grip[..., 0]
+        new_load = self.replace(attached=self.grip & (self.attached | is_picked_up))
+        link = new_load._link_params()
+        common_vel = self.tip_vel + self.mass / (link.mass + MIN_MASS) * relative_vel
+        new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, self.tip_pos, common_vel)
 
         def select_picked_up(new: Array, old: Array) -> Array:
             return jnp.where(is_picked_up, new, old)
 
-        tip_vel = select_picked_up(tip_vel, load.tip_vel)
+        tip_vel = select_picked_up(tip_vel, self.tip_vel)
         new_load = new_load.replace(
-            tip_vel=tip_vel, vel=select_picked_up(tip_vel, load.vel), pos=select_picked_up(load.tip_pos, load.pos)
+            tip_vel=tip_vel, vel=select_picked_up(tip_vel, self.vel), pos=select_picked_up(self.tip_pos, self.pos)
         )
         states = s.replace(
             vel=select_picked_up(new_state.vel, s.vel), ang_vel=select_picked_up(new_state.ang_vel, s.ang_vel)
@@ -184,13 +174,12 @@ class Hook(CollidingPlugin, Plugin):
 
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop one drone's hook and load at the floor."""
-        load = self.read(data)
-        height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
-        height = height + ground_height(data, load.tip_pos)
-        tip_pos, tip_vel = clip_to_floor(load.tip_pos, load.tip_vel, height, load.friction)
-        pos, vel = clip_to_floor(load.pos, load.vel, load.clearance + ground_height(data, load.pos), load.friction)
-        pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
-        return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
+        height = jnp.where(self.attached, self.clearance, jnp.zeros_like(self.clearance))
+        height = height + ground_height(data, self.tip_pos)
+        tip_pos, tip_vel = clip_to_floor(self.tip_pos, self.tip_vel, height, self.friction)
+        pos, vel = clip_to_floor(self.pos, self.vel, self.clearance + ground_height(data, self.pos), self.friction)
+        pos, vel = jnp.where(self.attached, tip_pos, pos), jnp.where(self.attached, tip_vel, vel)
+        return self.write(data, self.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
 
     def command(self, data: SimData, grip: ArrayLike) -> SimData:
         """Return the data with another command to the hooks.
@@ -236,10 +225,9 @@ class Hook(CollidingPlugin, Plugin):
     def move_objects(self, data: SimData) -> Objects:
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
-        load = self.read(data)
-        has_load = np.ones(load.tip_pos.shape[0], bool)
-        objects = move_loads(data, self.name, load, load.tip_pos, has_load, 1, self.ring, show_free_links=True)  # type: ignore[arg-type]
-        heads = {f"{self.name}_hook": (load.tip_pos, rotation_from_z(-self._rod_directions(data, load)))}
+        has_load = np.ones(self.tip_pos.shape[0], bool)
+        objects = move_loads(data, self, self.tip_pos, has_load, 1, self.ring, show_free_links=True)  # type: ignore[arg-type]
+        heads = {f"{self.name}_hook": (self.tip_pos, rotation_from_z(-self._rod_directions(data)))}
         return objects.with_poses(heads)
 
     @property
@@ -253,9 +241,8 @@ class Hook(CollidingPlugin, Plugin):
     def body(self, data: SimData) -> LoadBody:
         load = self.read(data)
         up = shape_axis(data, load, load.tip_pos)
-        return LoadBody(
-            load.pos - self.ring * up, rotation_from_z(up), load.vel, load.mass + self._held_mass(load, load.hook_mass)
-        )
+        held_mass = jnp.where(load.attached[..., None], load.hook_mass, jnp.zeros_like(load.hook_mass))
+        return LoadBody(load.pos - self.ring * up, rotation_from_z(up), load.vel, load.mass + held_mass)
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
         """Return the data with other velocities of loads and of hooks that hold them. (..., 3)"""
@@ -268,7 +255,7 @@ class Hook(CollidingPlugin, Plugin):
     def head(self, data: SimData) -> LoadBody:
         """Return the heads of the hooks, balls that collide while a hook carries nothing, of one drone or one world."""
         load = self.read(data)
-        up = -self._rod_directions(data, load)
+        up = -load._rod_directions(data)
         mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))
         return LoadBody(load.tip_pos + HEAD_HEIGHT * up, rotation_from_z(up), load.tip_vel, mass, ~load.attached)
 
@@ -281,17 +268,11 @@ class Hook(CollidingPlugin, Plugin):
         """Return True where a hook hangs from a drone, in one world. (n_hooks, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
-    @staticmethod
-    def _rod_directions(data: SimData, load: HookData) -> Array:
+    def _rod_directions(self, data: SimData) -> Array:
         """Return the unit vectors along the rods, world frame. (..., 3)"""
-        return link_geometry(data.states, load.tip_pos, load.tip_vel, load.attach).direction
+        return link_geometry(data.states, self.tip_pos, self.tip_vel, self.attach).direction
 
-    @staticmethod
-    def _held_mass(load: HookData, mass: Array) -> Array:
-        """Return a mass where the load is on the hook, else zero. (..., 1)"""
-        return jnp.where(load.attached[..., None], mass, jnp.zeros_like(mass))
-
-    def _link_params(self, load: HookData) -> LinkParams:
+    def _link_params(self) -> LinkParams:
         """Return the parameters of one rod, with the masses of the hook and of a load on it at the tip."""
-        mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))
-        return LinkParams(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)
+        mass = self.hook_mass + jnp.where(self.attached, self.mass, jnp.zeros_like(self.mass))
+        return LinkParams(self.attach, self.length, mass, self.damping, is_hinge=self.dof == 1)

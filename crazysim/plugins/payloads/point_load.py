@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState
-from crazysim.core.plugin import Simulation
+from crazysim.core.plugin import Simulation, derived, state
 from crazysim.core.settings import as_mask, as_rgba
 from crazysim.eager import jit_eager_calls
 from crazysim.plugins.effects.ground import ground_height
@@ -23,7 +23,7 @@ from crazysim.plugins.effects.wind_field import WindField
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.link import drag_rate, link_geometry
 from crazysim.plugins.payloads.rotor_jet import jet_force
-from crazysim.pytree import leaf, select_worlds
+from crazysim.pytree import select_worlds
 
 CABLE_SEGMENTS = 8
 """Number of straight pieces with which a cable is drawn."""
@@ -41,38 +41,19 @@ DRONE_TOUCH_ATTRIBUTES = 'contype="0" conaffinity="2"'
 """MJCF attributes of a geom that drones touch."""
 
 
-class LoadData(BodiesInAir):
-    """State and parameters of the load of each drone."""
+class HangingLoad(CollidingPlugin, BodiesInAir, abstract=True):
+    """Base class of plugins with a load below each drone."""
 
-    vel: Array = leaf("drone", 1, (3,))
+    vel: Array = state((3,))
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
-    attached: Array = leaf("drone", 0)
+    attached: Array = state((), dtype=bool)
     """True where the load hangs from its drone. (n_worlds, n_drones)"""
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass of the load, kg; zero for no load. (1,)"""
-    length: Array = leaf("parameter", 1, (1,))
-    """Length of rod or cable, m. (1,)"""
-    attach: Array | None = leaf("parameter", 1, (3,), sparse=True)
-    """Attachment point relative to the drone's centre of mass, body frame, m; None for the centre of mass. (3,)"""
-    damping: Array | None = leaf("parameter", 1, (1,))
-    """Viscous torque of the joint per angular velocity, N m s; None without damping. (1,)"""
-    restitution: Array | None = leaf("parameter", 1, (1,))
-    """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
-    drag: Array | None = leaf("parameter", 1, (1,))
-    """Linear drag coefficient of the load, N s/m; None without drag. (1,)"""
-    friction: Array = leaf("parameter", 1, (1,))
-    """Coulomb's coefficient between load and floor, 1. (1,)"""
-    clearance: Array = leaf("parameter", 1, (1,))
+    clearance: Array = derived()
     """Height of the load's position above the floor when it rests there, m. (1,)"""
 
 
-class PointLoad(CollidingPlugin):
-    """Interface of plugins with loads that are point masses on links, for subclasses of ``Plugin`` to inherit from."""
-
-    read: Any
-    """``Plugin.read``."""
-    write: Any
-    """``Plugin.write``."""
+class PointLoad(CollidingPlugin, abstract=True):
+    """Base class of plugins with loads that are point masses on links, one per drone or one for all."""
 
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop the load of one drone or one world at the floor."""
@@ -102,26 +83,25 @@ def find_integrator(sim: Simulation) -> Callable[..., SimData] | None:
     return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
 
 
-def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
+def free_acceleration(data: SimData, load: Any, dt: float | None) -> Array:
     """Return the acceleration of one drone's load by gravity, drag and jets, without its link, m/s^2. (3,)
 
     Drag cannot reverse a motion (``drag_rate``), and a load without mass moves with the air.
 
     Args:
         data: Data of one drone.
-        load: Record of the load.
-        name: Name of the load's plugin.
+        load: Plugin of the load.
         dt: Duration of the step, s; None for the derivative at an instant.
     """
     acc = data.params.gravity_vec
-    jet = jet_force(data, name)
+    jet = jet_force(data, load.name)
     if jet is not None:
         acc = acc + jnp.where(load.mass > 0, jet / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
     if load.air_vel is None or load.drag is None:
         return acc
     air_vel = wind_at(data, load.pos) + load.air_vel
     if any(isinstance(record, WindField) for record in data.plugins.values()):
-        air_vel = air_vel + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
+        air_vel = air_vel + load.wind_vel
     return acc + drag_rate(load.drag, load.mass, dt, data.core.freq) * (air_vel - load.vel)
 
 

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState, SimStateDeriv
 from crazysim.core.integration import euler, rk4
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
+from crazysim.core.plugin import Param, Simulation, StagePlacement, derived, param, state
 from crazysim.core.settings import color, setting
-from crazysim.core.stage import Stage
 from crazysim.eager import jit_eager_calls
 from crazysim.errors import ConfigError
 from crazysim.geometry.small_matrices import matvec, solve_symmetric
@@ -31,7 +30,7 @@ from crazysim.plugins.payloads.point_load import (
     link_pieces,
     rotation_from_z,
 )
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 TENSION_REGULARIZATION = 1e-6
 """Term added to the diagonal of the matrix of tensions, 1. The ratio of the masses of load and drone on the diagonal
@@ -42,27 +41,6 @@ N_BLOCK_PIVOTS, PIVOTS_PER_CABLE = 2, 3
 cable. 100,000 random problems of each n from 2 to 8 needed at most 2.5 n."""
 PIVOT_TOLERANCE = 64.0
 """Negative tension that is zero, relative to the largest number of the problem and in units of its rounding."""
-
-
-class SharedLoadData(PyTree):
-    """State and parameters of the load of each world."""
-
-    pos: Array = leaf("world", 1)
-    """Position, world frame, m. (n_worlds, 1, 3)"""
-    vel: Array = leaf("world", 1)
-    """Velocity, world frame, m/s. (n_worlds, 1, 3)"""
-    attached: Array = leaf("drone", 0)
-    """True for drones that hold the load. (n_worlds, n_drones)"""
-    mass: Array = leaf("shared", 1)
-    """Mass of the load, kg. (1,)"""
-    length: Array = leaf("parameter", 1, (1,))
-    """Length of each rod or cable, m. (1,)"""
-    attach: Array | None = leaf("parameter", 1, (3,))
-    """Attachment points on the drones, body frame, m; None for the centre of mass. (3,)"""
-    friction: Array = leaf("shared", 1)
-    """Coulomb's coefficient between load and floor, 1. (1,)"""
-    clearance: Array = leaf("shared", 1)
-    """Height of the load above the floor when it rests there, m. (1,)"""
 
 
 @jit_eager_calls()
@@ -85,7 +63,7 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
     return jnp.concatenate([mean[..., :2], height], axis=-1), states.vel.mean(axis=1, keepdims=True)
 
 
-class SharedLoad(PointLoad, Plugin):
+class SharedLoad(PointLoad):
     """One load, a point mass, on rods or cables from all drones of a world.
 
     The tensions follow from one system of equations of all drones. The integrator must update positions with the new
@@ -94,83 +72,80 @@ class SharedLoad(PointLoad, Plugin):
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
-    mass: float = parameter(positive=True, shapes=((),))
-    """Mass of the load, kg."""
-    length: ArrayLike = parameter(default=1.0, positive=True)
-    """Length of rods or cables, m. () or (n_worlds, n_drones)"""
+    mass: Param = param(scope="shared", positive=True, shapes=((),))
+    """Mass of the load, kg. (1,)"""
+    length: Param = param(default=1.0, positive=True)
+    """Length of rods or cables, m. (1,)"""
     cable: bool = True
     """True for cables, False for rigid rods."""
-    attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Attachment point relative to the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    friction: float = parameter(default=0.6, low=0.0, shapes=((),))
-    """Coulomb's coefficient between load and floor."""
-    size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)))
+    attach: Param = param(default=(0.0, 0.0, 0.0), core=(3,))
+    """Attachment point relative to the drone's centre of mass, body frame, m. (3,)"""
+    friction: Param = param(default=0.6, scope="shared", low=0.0, shapes=((),))
+    """Coulomb's coefficient between load and floor, 1. (1,)"""
+    size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)), keep=False)
     """Radius of a ball, or full lengths of a box, m. () or (3,)"""
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put load and links into the scene."""
+    pos: Array = state((3,), scope="world")
+    """Position, world frame, m. (n_worlds, 1, 3)"""
+    vel: Array = state((3,), scope="world")
+    """Velocity, world frame, m/s. (n_worlds, 1, 3)"""
+    attached: Array = state((), dtype=bool)
+    """True for drones that hold the load. (n_worlds, n_drones)"""
+    clearance: Array = derived(scope="shared")
+    """Height of the load above the floor when it rests there, m. (1,)"""
     name: str = "load"
 
-    def record(self, sim: Simulation) -> SharedLoadData:
+    def bind(self, sim: Simulation) -> SharedLoad:
         method = find_integrator(sim)
         if method is euler:
             raise ConfigError(
                 "expected an integrator that moves positions with new velocities, which a load between several drones "
                 "needs, got 'euler'. Use Sim(integrator='symplectic_euler') or 'rk4'."
             )
-        length = check_parameter(sim, "length", self.length)
-        attach = check_parameter(sim, "attach", self.attach, (3,))
-        scalars = {}
-        for name, value in (("mass", self.mass), ("friction", self.friction), ("size", rest_height(self.size))):
-            scalars[name] = check_parameter(sim, name, value, low=0.0)
-            if scalars[name].ndim > 1:
-                raise ConfigError(
-                    f"expected {name} as one number, got shape {scalars[name].shape}. The load belongs to all drones."
-                )
+        states = sim.data.states
+        clearance = device_array([rest_height(self.size)], states.pos.dtype)
+        load = self.with_arrays(sim, clearance=clearance, attached=device_array(np.ones(states.pos.shape[:2]), bool))
         if self.in_scene:
             add_to_scene(
-                sim, self.name, self.size, self.rgba, float(np.max(length)), 1,
+                sim, self.name, self.size, self.rgba, float(np.max(load.length)), 1,
                 CABLE_SEGMENTS if self.cable else 1,
             )  # fmt: skip
-        pos, vel = hanging_load(sim.data.states, length, scalars["size"])
-        return SharedLoadData(
-            pos=pos,
-            vel=vel,
-            attached=device_array(np.ones(sim.data.states.pos.shape[:2]), bool),
-            mass=scalars["mass"],
-            length=length,
-            attach=attach if np.any(np.asarray(attach)) else None,
-            friction=scalars["friction"],
-            clearance=scalars["size"],
-        )
+        pos, vel = hanging_load(states, load.length, clearance)
+        return load.replace(pos=pos, vel=vel, attach=load.attach if np.any(np.asarray(load.attach)) else None)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that stops the load at the floor, and with ``rk4`` the stage of the cables' impulses."""
-        placements = [StagePlacement(Stage(self.stop_at_floor, "world"), "measurements", name=f"{self.name}_floor")]
+        placements = [
+            StagePlacement(self.stage(self.stop_at_floor, "world"), "measurements", name=f"{self.name}_floor")
+        ]
         if self.cable and find_integrator(sim) is rk4:
-            placements.append(StagePlacement(Stage(self.become_taut, "world"), "integration", name=f"{self.name}_taut"))
+            placements.append(
+                StagePlacement(self.stage(self.become_taut, "world"), "integration", name=f"{self.name}_taut")
+            )
         return placements
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         # The equations of ``link.couple_bodies``, for all links of a world at once.
-        load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
-        m, n = load.mass, s.pos.shape[0]
+        p, s, freq = data.params, data.states, data.core.freq
+        m, n = self.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
-        link = link_geometry(s, load.pos, load.vel, load.attach)
+        link = link_geometry(s, self.pos, self.vel, self.attach)
         q, radial_speed = link.direction, rotation.dot(link.direction, link.vel)
-        pull = UnitPull.create(q, link.rot, p.J_inv, load.attach)
+        pull = UnitPull.create(q, link.rot, p.J_inv, self.attach)
         swing_factor = 1.0 if dt is None else 0.5
-        rel_acc = gravity - acceleration_at(s, deriv, link.rot, load.attach, swing_factor)
-        rhs = rotation.dot(q, rel_acc) + swing_factor / load.length * (
+        rel_acc = gravity - acceleration_at(s, deriv, link.rot, self.attach, swing_factor)
+        rhs = rotation.dot(q, rel_acc) + swing_factor / self.length * (
             rotation.dot(link.vel, link.vel) - radial_speed * radial_speed
         )
-        is_active = load.attached
+        is_active = self.attached
         if dt is None:
             rhs = rhs + 2 * correction_rate(freq) * radial_speed
-            is_active = is_active & (link.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else is_active
+            is_active = is_active & (link.distance > (1 - TAUT_BAND) * self.length)[..., 0] if self.cable else is_active
         else:
-            gap = jnp.maximum(load.length - link.distance, 0.0) if self.cable else 0.0
+            gap = jnp.maximum(self.length - link.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (radial_speed - freq * gap)
         tension = _solve_tensions(_tension_matrix(pull, m, p.mass), rhs[:, 0], is_active, self.cable)[:, None]
 
@@ -185,39 +160,38 @@ class SharedLoad(PointLoad, Plugin):
             changes["ang_acc"] = deriv.ang_acc + ang_acc
             if dt is not None:
                 changes["ang_vel"] = deriv.ang_vel + dt * ang_acc
-        stretch = link.distance - load.length
+        stretch = link.distance - self.length
         stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
-        error = jnp.sum(jnp.where(load.attached[:, None], stretch * q, 0.0), axis=0) / n
-        pos_rate = load.vel - correction_rate(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
+        error = jnp.sum(jnp.where(self.attached[:, None], stretch * q, 0.0), axis=0) / n
+        pos_rate = self.vel - correction_rate(freq) * error if dt is None else self.vel + dt * tip_acc - freq * error
         rates = {"pos": pos_rate, "vel": tip_acc}
         return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
 
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulses of cables that would be longer than ``length`` after the next step of one world."""
-        load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
-        link = link_geometry(s, load.pos, load.vel, load.attach)
-        pull = UnitPull.create(link.direction, link.rot, p.J_inv, load.attach)
-        gap = jnp.maximum(load.length - link.distance, 0.0)
+        p, s, freq = data.params, data.states, data.core.freq
+        link = link_geometry(s, self.pos, self.vel, self.attach)
+        pull = UnitPull.create(link.direction, link.rot, p.J_inv, self.attach)
+        gap = jnp.maximum(self.length - link.distance, 0.0)
         excess_speed = rotation.dot(link.direction, link.vel) - freq * gap
         speed_change = _solve_tensions(
-            _tension_matrix(pull, load.mass, p.mass), excess_speed[:, 0], load.attached, True
+            _tension_matrix(pull, self.mass, p.mass), excess_speed[:, 0], self.attached, True
         )[:, None]
         change = speed_change * link.direction
-        s = s.replace(vel=s.vel + load.mass / p.mass * change)
+        s = s.replace(vel=s.vel + self.mass / p.mass * change)
         if pull.ang_acc is not None:
-            s = s.replace(ang_vel=s.ang_vel + load.mass * speed_change * pull.ang_acc)
-        return self.write(data.replace(states=s), load.replace(vel=load.vel - jnp.sum(change, axis=0)))
+            s = s.replace(ang_vel=s.ang_vel + self.mass * speed_change * pull.ang_acc)
+        return self.write(data.replace(states=s), self.replace(vel=self.vel - jnp.sum(change, axis=0)))
 
     def move_objects(self, data: SimData) -> Objects:
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
-        load = self.read(data)
-        link = link_geometry(data.states, load.pos, load.vel, load.attach)
-        offset = jnp.where(load.attached[:, None], link.offset, -load.length * link.rot[..., 2])
+        link = link_geometry(data.states, self.pos, self.vel, self.attach)
+        offset = jnp.where(self.attached[:, None], link.offset, -self.length * link.rot[..., 2])
         top = data.states.pos if link.arm is None else data.states.pos + link.arm
-        links = link_pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
-        z_axis = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
-        poses = {self.name: (load.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
+        links = link_pieces(top, offset, self.length, CABLE_SEGMENTS if self.cable else 1)
+        z_axis = jnp.asarray([[0.0, 0.0, 1.0]], self.pos.dtype)
+        poses = {self.name: (self.pos[None], rotation_from_z(z_axis)), f"{self.name}_link": links}
         return data.objects.with_poses(poses)  # type: ignore[union-attr]
 
     def body(self, data: SimData) -> LoadBody:

@@ -34,7 +34,7 @@ def test_picking_up_keeps_momentum(integrator, x64):
     states, record = (
         jax.tree.map(lambda x: np.asarray(x)[0, 0] if np.ndim(x) > 1 else x, part) for part in (sim.data.states, record)
     )
-    after = jax.jit(hook.pick_up_and_release)(sim.data.replace(states=states, plugins={"load": record}))
+    after = jax.jit(record.pick_up_and_release)(sim.data.replace(states=states, plugins={"load": record}))
     after = jax.tree.map(np.asarray, (after.states, after.plugins["load"]))
     (states, load), v, q = after, np.array([0.1, 0, 0]), np.array([0, 0, -1.0])
     assert load.attached
