@@ -47,8 +47,8 @@ class Clutter(Scenery):
     """Smallest distance between two obstacles, m."""
     name: str = "clutter"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check_settings(self) -> None:
+        super().check_settings()
         low, high = np.asarray(self.sizes, np.float64)
         if low > high:
             raise ConfigError(f"expected sizes as smallest and largest, got {self.sizes!r}")
@@ -81,17 +81,17 @@ class Clutter(Scenery):
         ]
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        record, kinds, n = self.read(data), self._kinds(), math.prod(self.n_cells.tolist())
+        layout, kinds, n = self.read(data), self._kinds(), math.prod(self.n_cells.tolist())
         cell = np.concatenate([np.arange(k, n, len(kinds)) for k in range(len(kinds))])
         radius = np.concatenate(
             [np.full(len(range(k, n, len(kinds))), _bounding_radius(x[2])) for k, x in enumerate(kinds)]
         )
-        u = [record.uniform(cell + k * n) for k in range(10)]
+        u = [layout.uniform(cell + k * n) for k in range(10)]
         dtype = u[0].dtype
         radius, *middle = jnp.asarray(np.concatenate([radius[:, None], self._middles()[cell]], axis=1).T, dtype)
         region_length = self.cell - self.gap - 2 * radius
         pos = [middle[k] + self.wander(data, u[k], u[k + 3], region_length) for k in range(3)]
-        is_present = (u[6] < record.difficulty) & self.is_free(pos[:2], middle[:2], radius, region_length)
+        is_present = (u[6] < layout.difficulty) & self.is_free(pos[:2], middle[:2], radius, region_length)
         pos[2] = jnp.where(is_present, pos[2], pos[2] - HIDDEN_DEPTH)
         r1, r2 = jnp.sqrt(1 - u[7]), jnp.sqrt(u[7])
         a, b = 2 * jnp.pi * u[8], 2 * jnp.pi * u[9]

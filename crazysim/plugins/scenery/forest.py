@@ -85,8 +85,8 @@ class StandingObstacles(Scenery):
         """
         raise NotImplementedError
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check_settings(self) -> None:
+        super().check_settings()
         low, high = self.sizes
         if low > high:
             raise ConfigError(f"expected the smallest before the largest size of {self.name!r}, got {(low, high)}")
@@ -139,10 +139,10 @@ class StandingObstacles(Scenery):
             column: Index of each cell along x, integer; it broadcasts with the axes of worlds. (...)
             row: Index of each cell along y, integer. (...)
         """
-        record, (n_x, n_y) = self.read(data), self.n_cells
+        layout, (n_x, n_y) = self.read(data), self.n_cells
         cell = column * n_y + row
-        start_x, start_y, random_number = (record.uniform(3 * cell + k) for k in range(3))
-        turn, vel_x, vel_y = (record.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
+        start_x, start_y, random_number = (layout.uniform(3 * cell + k) for k in range(3))
+        turn, vel_x, vel_y = (layout.uniform(4 * n_x * n_y + 3 * cell + k) for k in range(3))
         size = self._size(self._size_index(cell)).astype(start_x.dtype)
         region_length = self.cell - self.gap - 2 * self.radius(size)
         middle_x, middle_y = self._middle(column, row)
@@ -151,7 +151,7 @@ class StandingObstacles(Scenery):
         y = middle_y + self.wander(data, start_y, vel_y, region_length)
         is_inside = (column >= 0) & (column < n_x) & (row >= 0) & (row < n_y)
         is_free = self.is_free((x, y), (middle_x, middle_y), self.radius(size), region_length)
-        is_standing = is_inside & (random_number < record.difficulty) & is_free
+        is_standing = is_inside & (random_number < layout.difficulty) & is_free
         return CellObstacles(x, y, jnp.pi * turn, size, is_standing)
 
     def clearance(self, data: SimData, pos: Array) -> Array:

@@ -39,8 +39,8 @@ class Gates(Scenery):
     """Thickness of the frames, m."""
     name: str = "gates"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check_settings(self) -> None:
+        super().check_settings()
         lowest = float(np.asarray(self.start)[2] - np.asarray(self.offset)[2] - np.asarray(self.opening)[1] / 2)
         if lowest < self.bar:
             raise ConfigError(
@@ -57,15 +57,15 @@ class Gates(Scenery):
         return [Model("gate", options, shapes, self._undisplaced_positions())]
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        record, gate = self.read(data), np.arange(self.count)
-        u = [record.uniform(gate + k * self.count) for k in range(7)]
+        layout, gate = self.read(data), np.arange(self.count)
+        u = [layout.uniform(gate + k * self.count) for k in range(7)]
         region_length = 2 * np.asarray(self.offset, np.float64)
         pos = [
             self._undisplaced_positions()[:, k]
-            + self.wander(data, u[k], u[k + 3], record.difficulty * region_length[k])
+            + self.wander(data, u[k], u[k + 3], layout.difficulty * region_length[k])
             for k in range(3)
         ]
-        half_yaw = (u[6] - 0.5) * self.turn * record.difficulty
+        half_yaw = (u[6] - 0.5) * self.turn * layout.difficulty
         quat = [0 * half_yaw, 0 * half_yaw, jnp.sin(half_yaw), jnp.cos(half_yaw)]
         return jnp.stack([x.astype(half_yaw.dtype) for x in pos], axis=-1), jnp.stack(quat, axis=-1)
 

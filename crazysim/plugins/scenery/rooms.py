@@ -39,8 +39,8 @@ class Rooms(Scenery):
     """Thickness of the walls, m."""
     name: str = "rooms"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check_settings(self) -> None:
+        super().check_settings()
         if self.n_panels < 2:
             raise ConfigError(
                 f"expected rooms at least twice as wide as a door between their walls, got rooms of {self.room:g} m, "
@@ -72,14 +72,14 @@ class Rooms(Scenery):
         return (n_x - 1) * n_y + n_x * (n_y - 1)
 
     def poses(self, data: SimData) -> tuple[Array, Array]:
-        record, n_panels = self.read(data), self.n_panels
+        layout, n_panels = self.read(data), self.n_panels
         wall, panel = np.divmod(np.arange(self.n_walls * n_panels), n_panels)
         is_along_x = wall >= (self._room_counts()[0] - 1) * self._room_counts()[1]
-        is_standing = record.uniform(self.n_walls + wall) < record.difficulty
-        is_door = jnp.floor(record.uniform(wall) * n_panels) == panel
+        is_standing = layout.uniform(self.n_walls + wall) < layout.difficulty
+        is_door = jnp.floor(layout.uniform(wall) * n_panels) == panel
         is_post_standing = jnp.repeat(is_standing[..., ::n_panels], 2, axis=-1)
         is_present = jnp.concatenate([is_standing & ~is_door, is_post_standing], axis=-1)
-        depth = jnp.where(is_present, 0.0, HIDDEN_DEPTH).astype(record.difficulty.dtype)
+        depth = jnp.where(is_present, 0.0, HIDDEN_DEPTH).astype(layout.difficulty.dtype)
         outer_walls = np.array([middle for _, middle in self._outer_walls()])
         pos = jnp.asarray(np.concatenate([outer_walls, *self._piece_positions()]), depth.dtype)
         depth = jnp.concatenate([jnp.zeros((*depth.shape[:-1], 4), depth.dtype), depth], axis=-1)

@@ -1,8 +1,8 @@
 """Base of layouts of obstacles that differ between worlds and episodes.
 
 A layout is not stored: the pose of every obstacle follows from two random words of the world by
-``random.uniform_at``. So the record of a world has three numbers, whatever the number of obstacles, and the obstacles
-around a drone can be found without the poses of all others.
+``random.uniform_at``. So a world has three numbers, whatever the number of obstacles, and the obstacles around a drone
+can be found without the poses of all others.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
-from crazysim.core.plugin import Plugin, Simulation, parameter
+from crazysim.core.plugin import Param, Plugin, Simulation, derived, param, state
 from crazysim.core.random import uniform_at, world_key
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.geometry.distance import point_distance
-from crazysim.pytree import PyTree, device_array, leaf
+from crazysim.pytree import device_array
 
 HIDDEN_DEPTH = 100.0
 """Depth by which obstacles that a layout leaves out are moved down, m."""
@@ -36,21 +36,6 @@ MAX_OBSTACLES = 10_000
 """Largest number of obstacles of a layout."""
 DIFFICULTY_INDEX = np.uint32(2**32 - 1)
 """Index of the random number of a world from which its difficulty is drawn."""
-
-
-class SceneryData(PyTree):
-    """Random words and difficulty of the layout of each world."""
-
-    words: Array = leaf("world", 1, (2,))
-    """Words from which the layout follows, uint32. (n_worlds, 1, 2)"""
-    difficulty: Array = leaf("world", 0)
-    """Difficulty, 0 to 1. (n_worlds, 1)"""
-    difficulty_range: Array = leaf("shared", 1)
-    """Lowest and highest difficulty that is drawn. (2,)"""
-
-    def uniform(self, index: Array | np.ndarray) -> Array:
-        """Return random numbers of the layout, from 0 to below 1, by their indices. (...)"""
-        return uniform_at(self.words, index, self.difficulty.dtype)
 
 
 class Model(NamedTuple):
@@ -74,14 +59,18 @@ class Scenery(Plugin):
     a layout leaves out is 100 m below its position.
     """
 
-    difficulty: ArrayLike = parameter(default=1.0, low=0.0, high=1.0, shapes=((), (2,)))
-    """Difficulty, 0 to 1, or a range, lowest and highest, from which it is drawn at every reset of a world. () or
-    (2,)"""
+    difficulty: Param = param(default=1.0, core=(), scope="world", low=0.0, high=1.0, shapes=((), (2,)))
+    """Difficulty, 0 to 1, or a range, lowest and highest, from which it is drawn at every reset of a world.
+    (n_worlds, 1)"""
     speed: float = setting(default=0.0, low=0.0)
     """Largest component of the velocities of obstacles that move to and fro in their regions, m/s; 0 for obstacles that
     stand still."""
     free: ArrayLike = setting(default=((0.0, 0.0, 1.0),), shapes=(("any", 3),))
     """Discs that stay free of obstacles, x, y and radius, m. (n, 3)"""
+    words: Array = state((2,), scope="world", dtype=np.uint32)
+    """Random words from which the layout follows. (n_worlds, 1, 2)"""
+    difficulty_range: Array = derived((2,), scope="shared")
+    """Lowest and highest difficulty that is drawn. (2,)"""
     name: str = "scenery"
 
     @property
@@ -91,6 +80,10 @@ class Scenery(Plugin):
     @property
     def moved_kinds(self) -> tuple[str, ...]:
         return tuple(f"{self.name}_{k}" for k in range(len(self.models())))
+
+    def uniform(self, index: Array | np.ndarray) -> Array:
+        """Return random numbers of the layout, from 0 to below 1, by their indices. (...)"""
+        return uniform_at(self.words, index, self.difficulty.dtype)
 
     def models(self) -> Sequence[Model]:
         """Return the obstacles, one entry for each kind."""
@@ -138,14 +131,13 @@ class Scenery(Plugin):
             key: Random key. ()
             difficulty: Difficulty, 0 to 1; None to draw it from the range of the setting. ()
         """
-        record = self.read(data)
-        record = record.replace(words=jax.random.key_data(key)[:2].astype(jnp.uint32))
+        layout = self.read(data).replace(words=jax.random.key_data(key)[:2].astype(jnp.uint32))
         if difficulty is None:
-            low, high = record.difficulty_range
-            difficulty = low + (high - low) * record.uniform(DIFFICULTY_INDEX)
-        return self.write(data, record.replace(difficulty=jnp.asarray(difficulty, record.difficulty.dtype)))
+            low, high = layout.difficulty_range
+            difficulty = low + (high - low) * layout.uniform(DIFFICULTY_INDEX)
+        return self.write(data, layout.replace(difficulty=jnp.asarray(difficulty, layout.difficulty.dtype)))
 
-    def record(self, sim: Simulation) -> SceneryData:
+    def bind(self, sim: Simulation) -> Self:
         models = self.models()
         self.check_count(sum(len(model.pos) for model in models))
         for other in sim.scene.plugins():
@@ -159,11 +151,8 @@ class Scenery(Plugin):
         difficulty_range = np.broadcast_to(np.asarray(self.difficulty, np.float64), 2)
         if difficulty_range[0] > difficulty_range[1]:
             raise ConfigError(f"expected a range of difficulty, lowest first, got {self.difficulty!r}")
-        return SceneryData(
-            words=device_array(np.zeros((sim.n_worlds, 1, 2)), np.uint32),
-            difficulty=device_array(np.full((sim.n_worlds, 1), difficulty_range[1])),
-            difficulty_range=device_array(difficulty_range),
-        )
+        difficulty = device_array(np.full((sim.n_worlds, 1), difficulty_range[1]))
+        return self.with_arrays(sim, difficulty=difficulty, difficulty_range=device_array(difficulty_range))
 
     def reset_episode(self, data: SimData) -> SimData:
         return self.sample_layout(data, world_key(data, self.name))
