@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
-from crazysim.core.plugin import Simulation, StagePlacement, parameter
+from crazysim.core.plugin import Simulation, StagePlacement, param
 from crazysim.core.population import Population, RatesFn
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.core.stage import Stage
@@ -80,18 +80,18 @@ class FreeBodies(Population):
     """Number of bodies in each world, or their names."""
     size: Any = (0.2, 0.2, 0.2)
     """Full lengths of a box, m (3,), or radius of a ball, m, for all bodies; or a list with an entry for each body."""
-    mass: ArrayLike = parameter(default=0.1, low=MASS.low, high=MASS.high)
+    mass: ArrayLike = param(default=0.1, low=MASS.low, high=MASS.high, keep=False)
     """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
-    pos: ArrayLike | None = parameter(default=None)
+    pos: ArrayLike | None = param(default=None, keep=False)
     """Positions at the start, world frame, m; None for a row along x on the floor. (3,), (n_members, 3) or (n_worlds,
     n_members, 3)"""
-    quat: ArrayLike = parameter(default=(0.0, 0.0, 0.0, 1.0))
+    quat: ArrayLike = param(default=(0.0, 0.0, 0.0, 1.0), keep=False)
     """Attitudes at the start, xyzw, normalised here. (4,), (n_members, 4) or (n_worlds, n_members, 4)"""
-    vel: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    vel: ArrayLike = param(default=(0.0, 0.0, 0.0), keep=False)
     """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
-    friction: ArrayLike = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
+    friction: ArrayLike = param(default=0.6, low=0.0, high=MAX_FRICTION, keep=False)
     """Coulomb's coefficient; the larger one of two bodies is used. (), (n_members,) or (n_worlds, n_members)"""
-    restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
+    restitution: ArrayLike = param(default=0.0, low=0.0, high=1.0, keep=False)
     """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None

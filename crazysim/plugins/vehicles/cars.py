@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
-from crazysim.core.plugin import Simulation, StagePlacement, parameter
+from crazysim.core.plugin import Simulation, StagePlacement, param
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
 from crazysim.core.stage import Stage, is_tick
@@ -54,10 +54,10 @@ class Cars(Population):
     """Number of cars in each world, or their names."""
     vehicle: VehicleSource = "f1tenth_ros"
     """Vehicle model, as for ``load_vehicle``."""
-    pos: ArrayLike | None = parameter(default=None)
+    pos: ArrayLike | None = param(default=None, keep=False)
     """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
     (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
-    yaw: ArrayLike | None = parameter(default=None)
+    yaw: ArrayLike | None = param(default=None, keep=False)
     """Headings at the start, rad; None for the path's heading, or zero. (), (n_members,) or (n_worlds, n_members)"""
     level: Literal["drive", "speed"] = "drive"
     """Command level of cars without a path."""
@@ -67,10 +67,10 @@ class Cars(Population):
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
     """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the path where the car is."""
-    index: ArrayLike | None = parameter(default=None)
+    index: ArrayLike | None = param(default=None, keep=False)
     """Index of each car's path; with None, car i follows path i modulo the number of paths. (), (n_members,) or
     (n_worlds, n_members)"""
-    start: ArrayLike | None = parameter(default=None)
+    start: ArrayLike | None = param(default=None, keep=False)
     """Time at which a car is at the start of its path, s; None for zero, or equal intervals for the cars of one closed
     path. (), (n_members,) or (n_worlds, n_members)"""
     trailer: bool = False
