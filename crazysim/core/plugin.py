@@ -336,10 +336,10 @@ def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any
     return device_array(np.broadcast_to(array, (*batch, *core)), dtype) if scope == "drone" else array
 
 
-def _as_tuples(value: Any) -> Any:
-    """Return arrays and lists as tuples, which are hashable."""
-    value = getattr(value, "tolist", lambda: value)()
-    return tuple(map(_as_tuples, value)) if type(value) in (list, tuple) else value
+def _as_tuples(value: Any, arrays: bool) -> Any:
+    """Return lists, and arrays where they are allowed, as tuples, which are hashable."""
+    value = value.tolist() if arrays and hasattr(value, "tolist") else value
+    return tuple([_as_tuples(x, arrays) for x in value]) if type(value) in (list, tuple) else value
 
 
 Requirement = type | Callable[[Simulation, Any], None]
@@ -427,23 +427,22 @@ class Plugin(PyTree):
             sim: The simulation.
             values: Values of fields. If a value is None, the user's number is still checked.
         """
-        for name in [
-            f.name for f in dataclasses.fields(self) if f.metadata.get("static") and f.metadata.get("keep", True)
-        ]:
-            values[name] = value = _as_tuples(values.get(name, getattr(self, name)))
-            try:
-                hash(value)
-            except TypeError:
-                raise ConfigError(
-                    f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "
-                    f"numbers with param(...), or use a tuple."
-                ) from None
         bound: dict[str, Any] = {**values, "is_bound": True}
         for field in dataclasses.fields(self):
-            if "scope" in field.metadata and values.get(field.name) is None:
-                bound.setdefault(field.name, bind_leaf(sim, field.name, getattr(self, field.name), field.metadata))
-            elif not field.metadata.get("keep", True):
-                bound.setdefault(field.name, None)
+            name, value, metadata = field.name, getattr(self, field.name), field.metadata
+            if "scope" in metadata and values.get(name) is None:
+                bound.setdefault(name, bind_leaf(sim, name, value, metadata))
+            elif not metadata.get("keep", True):
+                bound.setdefault(name, None)
+            elif metadata.get("static"):
+                bound[name] = value = _as_tuples(bound.get(name, value), arrays="setting" in metadata)
+                try:
+                    hash(value)
+                except TypeError:
+                    raise ConfigError(
+                        f"expected {name} of {type(self).__name__} to be hashable, got {short_repr(value)}. Declare "
+                        f"numbers with param(...), or use a tuple."
+                    ) from None
         return self.replace(**bound)
 
     def bound(self, data: SimData) -> Self:

@@ -1,7 +1,7 @@
 """Plugins: added, replaced and removed without a trace, integrated with the drone, and observed and drawn."""
 
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cases import hover_command, make_hovering_sim, repeat_command, trees_equal, with_states
 from jax import Array
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from crazysim import (
@@ -34,7 +35,8 @@ from crazysim import (
 )
 from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
-from crazysim.core.plugin import FunctionPlugin
+from crazysim.core.plugin import FunctionPlugin, Param, param
+from crazysim.core.settings import setting
 from crazysim.core.stage import is_first_step
 from crazysim.core.stages import first_principles_derivative
 from crazysim.errors import UnknownNameError
@@ -572,3 +574,22 @@ class ArrayPlugin(Plugin):
 def test_arrays_of_both_libraries_are_settings(xp, values):
     np.testing.assert_array_equal(ArrayPlugin(xp.asarray(values)).which, values)
     np.testing.assert_array_equal(ArrayPlugin(mask=xp.asarray(values)).mask, values)
+
+
+class Discs(Plugin):
+    """A plugin with a number, a declared setting and another one."""
+
+    level: Param = param(default=1.0)
+    discs: ArrayLike = setting(default=((0.0, 1.0),))
+    table: Any = ()
+    name: str = "discs"
+
+
+def test_arrays_of_declared_settings_become_tuples_and_other_arrays_are_refused():
+    sim = Sim()
+    sim.add(Discs(discs=np.ones((1, 2)), table=[[1, 2]]))
+    record = sim.data.plugins["discs"]
+    assert record.discs == ((1.0, 1.0),)
+    assert record.table == ((1, 2),)
+    with pytest.raises(ConfigError, match=r"table of Discs to be hashable.*param\("):
+        sim.add(Discs(table=np.ones(2), name="others"))

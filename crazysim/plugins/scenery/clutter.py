@@ -41,7 +41,7 @@ class Clutter(Scenery):
     """Middle of the area, m. (3,)"""
     sizes: ArrayLike = setting(default=(0.2, 0.6), positive=True, shapes=((2,),))
     """Smallest and largest edge of a box and diameter of a ball, m. (2,)"""
-    meshes: Sequence[Any] = ()
+    meshes: Sequence[Any] = setting(default=())
     """Corners of each convex mesh, in its own frame, m. (n, 3) each"""
     gap: float = setting(default=0.6, low=0.0)
     """Smallest distance between two obstacles, m."""
