@@ -328,7 +328,7 @@ def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any
     if value is None and (metadata.get("optional") or "setting" in metadata):
         return None
     if scope == "shared":
-        return device_array(np.array(value, ndmin=1), dtype)
+        return device_array(np.array(value, ndmin=len(core)), dtype)
     batch = (sim.n_worlds, 1) if scope == "world" else sim.data.states.pos.shape[:2]
     if value is None or scope == "world":
         return device_array(np.broadcast_to(value or 0, (*batch, *core)), dtype)
