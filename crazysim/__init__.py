@@ -10,7 +10,7 @@ from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.pair_reductions import reduce_over_others
-from crazysim.core.plugin import Param, Plugin, StagePlacement, param, parameter, state
+from crazysim.core.plugin import Param, Plugin, StagePlacement, param, state
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -117,7 +117,6 @@ __all__ = [
     "load_airframe",
     "make",
     "param",
-    "parameter",
     "reduce_over_others",
     "stage",
     "state",

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim as cs
-from crazysim.core.plugin import StagePlacement, parameter
+from crazysim.core.plugin import StagePlacement, param
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.pytree import Members, leaf
@@ -38,7 +38,7 @@ class Springs(Population):
     members: int | Sequence[str] = 1
     name: str = "springs"
     rate: int | None = 100
-    stiffness: float | tuple = parameter(default=STIFFNESS)
+    stiffness: float | tuple = param(default=STIFFNESS, keep=False)
     prefix: ClassVar[str] = "Mass"
     command_field: ClassVar[str] = "cmd"
 

@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1179,
     "control": 1987,
-    "core": 1899,
+    "core": 1880,
     "crazysim": 1404,
     "drones": 514,
     "dynamics": 576,

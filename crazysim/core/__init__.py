@@ -13,7 +13,6 @@ from crazysim.core.plugin import (
     check_parameter,
     derived,
     param,
-    parameter,
     state,
 )
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
@@ -36,7 +35,6 @@ __all__ = [
     "insert_fn_before",
     "map_batched",
     "param",
-    "parameter",
     "prepend_fn",
     "remove_fn",
     "replace_fn",

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.settings import Setting, check_settings, collect_settings, setting
+from crazysim.core.settings import Setting, check_settings, setting
 from crazysim.core.stage import Stage
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
@@ -28,7 +28,6 @@ from crazysim.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
 from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
-R = TypeVar("R", bound=PyTree)
 
 Param = Any
 """A number of a plugin: what a user writes, such as 0.1, a list or an array, and an array in ``data.plugins``."""
@@ -89,26 +88,6 @@ class StagePlacement:
     restores the replaced stage."""
     name: str | None = None
     """Name of the stage; None for the name of the plugin."""
-
-
-def parameter(
-    *,
-    default: Any = dataclasses.MISSING,
-    low: float = -np.inf,
-    high: float = np.inf,
-    positive: bool = False,
-    per_axis: bool = False,
-    dtype: DTypeLike | None = None,
-    shapes: Shapes | None = None,
-) -> Any:
-    """Declare a field of a plugin that only provides numbers of the plugin's record.
-
-    ``sim.replace`` changes such numbers without compiling the step again. The plugin's stages, ``influence`` and
-    ``derivative`` must read the number from the record, never from the field. ``low``, ``high`` and ``positive`` limit
-    the number as in ``setting``. Its shape is checked by ``Plugin.fill_record``, or here if ``shapes`` are given.
-    """
-    declaration = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
-    return dataclasses.field(default=default, metadata={"setting": declaration})
 
 
 def param(
@@ -349,7 +328,7 @@ Requirement = type | Callable[[Simulation, Any], None]
 @dataclass_transform(
     frozen_default=True,
     eq_default=False,
-    field_specifiers=(param, state, derived, nested, parameter, setting, dataclasses.field),
+    field_specifiers=(param, state, derived, nested, setting, dataclasses.field),
 )
 class Plugin(PyTree):
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
@@ -508,36 +487,6 @@ class Plugin(PyTree):
         Override it for states whose shape has changed. All other states are in ``record`` already.
         """
         return record
-
-    def fill_record(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds, with values for the fields that are not passed.
-
-        A parameter has the checked value of the plugin's setting with the same name; without a fixed core shape it has
-        one number for each rotor. A state of drones with a fixed core shape is zero. A setting of None gives None.
-
-        Args:
-            sim: The simulation.
-            kind: Class of the record.
-            fields: Values of fields. If a value is None, the setting with the same name is still checked.
-        """
-        settings = {
-            name: declaration for name, declaration in collect_settings(type(self)).items() if declaration.is_parameter
-        }
-        values = dict(fields)
-        for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-            name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")
-            if values.get(name) is not None:
-                continue
-            if scope == "drone" and core is not None:
-                values.setdefault(name, drone_array(sim, 0.0, *core))
-            elif scope == "parameter" and name in settings:
-                value, core = getattr(self, name), core or sim.data.states.rotor_vel.shape[-1:]
-                dtype, per_axis = settings[name].dtype, settings[name].per_axis
-                checked_value = value is not None and check_parameter(
-                    sim, name, value, core, dtype=dtype, per_axis=per_axis
-                )
-                values.setdefault(name, None if value is None else checked_value)
-        return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:
         """Check the simulation with all of its plugins, before its first step; plugins may be added in any order.

@@ -118,7 +118,7 @@ def color(per_item: bool = False) -> Any:
 
 @functools.cache
 def collect_settings(kind: type) -> dict[str, Setting]:
-    """Return the declarations of a class's fields by ``setting`` or ``parameter``.
+    """Return the declarations of a class's fields by ``setting`` or ``param``.
 
     A field without a declaration inherits the declaration of the field of the same name in a base class.
     """
@@ -133,7 +133,7 @@ def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` must have values of that kind,
-    with finite numbers in the range of ``setting`` or ``parameter``. Fields annotated with a class must have instances
+    with finite numbers in the range of ``setting`` or ``param``. Fields annotated with a class must have instances
     of the class, and fields of ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted if the
     annotation or the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked
     later. Single numbers of NumPy and JAX are replaced by Python's.

@@ -406,7 +406,7 @@ class Sim:
     def replace(self, plugin: P) -> P:
         """Replace the settings of the plugin of the same name, and return the new plugin; its states are unchanged.
 
-        If only numbers change (fields declared with ``parameter``), nothing is compiled.
+        If only numbers change (fields declared with ``param``), nothing is compiled.
         """
         return self.plugins.replace(plugin)
 

@@ -30,12 +30,11 @@ from crazysim import (
     Wind,
     WindField,
     leaf,
-    parameter,
     stage,
 )
 from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
-from crazysim.core.plugin import FunctionPlugin, Param, param
+from crazysim.core.plugin import FunctionPlugin, Param, param, state
 from crazysim.core.settings import setting
 from crazysim.core.stage import is_first_step
 from crazysim.core.stages import first_principles_derivative
@@ -62,7 +61,7 @@ class WakeData(PyTree):
 class Wake(Plugin):
     """A state that the drone drives, and the force of this state on the drone: z' = vel - rate z, F = -strength z."""
 
-    rate: float = parameter(default=6.0)
+    rate: float = param(default=6.0, keep=False)
     strength: float = 0.8
     name: str = "wake"
 
@@ -319,23 +318,15 @@ def test_a_reset_restores_states_of_plugins_in_its_worlds_only():
     np.testing.assert_array_equal(after[1], flown[1])
 
 
-class StartData(PyTree):
-    """Positions at which episodes began."""
-
-    pos: Array = leaf("drone", 1, (3,))
-    """Position, world frame, m. (n_worlds, n_drones, 3)"""
-
-
 class StartRecorder(Plugin):
     """A plugin that stores where an episode begins."""
 
+    pos: Array = state((3,))
+    """Position at which the episode began, world frame, m. (n_worlds, n_drones, 3)"""
     name: str = "start"
 
-    def record(self, sim):
-        return self.fill_record(sim, StartData)
-
     def reset_episode(self, data):
-        return self.write(data, StartData(data.states.pos + 0.0))
+        return self.write(data, self.replace(pos=data.states.pos + 0.0))
 
 
 class LateStartRecorder(StartRecorder):
