@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -16,20 +17,12 @@ from crazysim.core.plugin import Simulation, drone_array, state
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state, inertial_path, updates
-from crazysim.plugins.estimators.error_state import Estimate
+from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.inertial_path import InertialPath
 from crazysim.plugins.estimators.kalman import UPDATE_FNS as KALMAN_UPDATE_FNS
-from crazysim.plugins.sensors.barometer import (
-    LAPSE_RATE,
-    PRESSURE_EXPONENT,
-    SEA_LEVEL_TEMPERATURE,
-    Barometer,
-    pressure_at,
-)
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
-from crazysim.plugins.sensors.gps import GPS
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.magnetometer import Magnetometer
 from crazysim.plugins.sensors.motion_capture import MotionCapture
@@ -44,8 +37,12 @@ RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 square root of ``error_state.MAX_COVARIANCE``."""
 MIN_STD = 1e-3
 """Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and for a magnetometer as a fraction
-of the field. For pressures the limit is 100 times as large, 0.1 Pa, and for sweeps of a ``Lighthouse`` a tenth, 1e-4
-rad. This is an assumption, for sensors without noise and for float32."""
+of the field. For sweeps of a ``Lighthouse`` the limit is a tenth, 1e-4 rad; for sensors that are used by the derivatives
+of their ``ideal`` it is the state's error in m, m/s or rad that changes the measurement as much. This is an assumption, for sensors without noise and for float32."""
+
+
+NO_SLOPE = 1e-6
+"""Change of a measurement per unit of a state below which it says nothing about the state, in their units."""
 
 
 class ESKF(ErrorStateFilter):
@@ -56,9 +53,11 @@ class ESKF(ErrorStateFilter):
     the noise densities of the ``IMU``, and the random walk, wander and spread of its biases. Wandering and constant
     errors of the other sensors are treated as white noise.
 
-    The filter takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``,
-    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``. It assumes that these sensors are at the centre of mass, except for
-    the diodes of ``Lighthouse``, and that the body that ``MotionCapture`` tracks has the attitude of the drone.
+    It fuses ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB``,
+    ``Lighthouse``, and any other sensor whose measurement is a smooth function of its drone's state with errors in
+    ``chains``, by the derivatives of the sensor's own ``ideal``: your sensors, too, anywhere on the drone. It assumes
+    that ``MotionCapture``, ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight`` and ``UWB`` are at the centre of mass,
+    and that the body that ``MotionCapture`` tracks has the attitude of the drone.
     """
 
     _: dataclasses.KW_ONLY
@@ -80,6 +79,10 @@ class ESKF(ErrorStateFilter):
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
         return tuple(UPDATE_FNS)
+
+    def can_fuse(self, sensor: Sensor) -> bool:
+        """Return True if the filter has an update for the sensor, or can derive one from its ``ideal``."""
+        return super().can_fuse(sensor) or (sensor.measures_motion and bool(sensor.chains))
 
     def bind(self, sim: Simulation) -> ESKF:
         quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
@@ -199,7 +202,7 @@ class ESKF(ErrorStateFilter):
         since_prediction = (taken_step - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq
         if not sensor.is_late:
             past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
-            past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, past_estimate))
+            past_estimate = _finalize(_update(sensor, self.imu(data), data, past_estimate))
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
         interval, (first, end) = data.core.freq // sensor.rate(data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
@@ -209,7 +212,7 @@ class ESKF(ErrorStateFilter):
         path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
         path_back = path.without_biases(estimate).reverse()
         past_estimate = inertial_path.propagate_along(estimate, path_back, gravity)
-        past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, past_estimate))
+        past_estimate = _finalize(_update(sensor, self.imu(data), data, past_estimate))
         return inertial_path.propagate_along(past_estimate, path.without_biases(past_estimate), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
@@ -250,20 +253,38 @@ def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, es
     return updates.update_quat(estimate, sensor.part(data, "quat"), angle_std)
 
 
-def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    pos_std, vel_std = (_std(sensor.read(data).variance(name)) for name in ("pos", "vel"))
-    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std))
-    return updates.update_vel(estimate, sensor.part(data, "vel"), vel_std)
+def _update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    """Return the estimate after the latest measurement of a sensor."""
+    return UPDATE_FNS.get(type(sensor), _update_by_ideal)(sensor, imu, data, estimate)
 
 
-def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record = sensor.read(data)
-    altitude = estimate.pos[2:] + record.altitude
-    predicted_pressure = pressure_at(altitude)
-    slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted_pressure / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
-    error = sensor.part(data, "pressure") - predicted_pressure
-    std = _std(record.variance("pressure"), 100 * MIN_STD)
-    return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
+def _update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    """Use a measurement by the derivatives of the sensor's measurement without errors with respect to the states."""
+    record, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
+
+    def predict(errors: Array) -> Array:
+        turn = jnp.concatenate([0.5 * errors[6:9], jnp.ones_like(gyro[:1])])
+        quat = rotation.multiply(first.quat, turn / jnp.sqrt(rotation.dot(turn, turn)))
+        states = data.states.replace(
+            pos=first.pos + errors[:3],
+            vel=rotation.rotate(quat, first.vel + errors[3:6]),
+            quat=quat,
+            ang_vel=gyro - first.gyro_bias - errors[9:],  # type: ignore[operator]
+        )
+        return record.ideal(data.replace(states=states))
+
+    no_errors = jnp.zeros_like(first.pos, shape=12)
+    innovations, slopes = sensor.split(sensor.latest(data) - predict(no_errors)), jax.jacfwd(predict)(no_errors)
+    rows = sensor.split(jnp.arange(len(slopes)))
+    for name in sensor.chains:
+        for k, innovation, variance in zip(rows[name], innovations[name], record.variance(name) + 0 * innovations[name]):
+            slope, fields = slopes[k], ("pos", "vel", "att_error", "gyro_bias")
+            correction = jnp.concatenate([getattr(estimate, x) - getattr(first, x) for x in fields])
+            # A deviation of at least MIN_STD in the units of the states.
+            std = jnp.sqrt(variance + MIN_STD**2 * (jnp.dot(slope, slope) + NO_SLOPE**2))
+            error = innovation - jnp.dot(slope, correction)
+            estimate = error_state.update(estimate, [*POS, *VEL, *ATT, *GYRO], slope, error, std)
+    return estimate
 
 
 def _update_by_magnetometer(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -308,12 +329,10 @@ def _update_by_lighthouse(sensor: Lighthouse, imu: IMU, data: SimData, estimate:
 
 UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
     MotionCapture: _update_by_motion_capture,
-    GPS: _update_by_gps,
-    Barometer: _update_by_barometer,
     Magnetometer: _update_by_magnetometer,
     OpticalFlow: _update_by_optical_flow,
     TimeOfFlight: _update_by_time_of_flight,
     UWB: _update_by_uwb,
     Lighthouse: _update_by_lighthouse,
 }
-"""Functions that update an estimate with a measurement, by the class of the sensor."""
+"""Functions that update an estimate with a measurement, by the class of the sensor; ``_update_by_ideal`` for others."""

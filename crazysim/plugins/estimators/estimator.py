@@ -63,6 +63,10 @@ class Estimator(Plugin):
         """Classes of the sensors that the filter can use in addition to the ``IMU``."""
         raise NotImplementedError
 
+    def can_fuse(self, sensor: Sensor) -> bool:
+        """Return True if the filter can use a sensor, beside its ``IMU``."""
+        return type(sensor) in self.kinds
+
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the names and stages of the filter, in their order.
 
@@ -129,7 +133,7 @@ class Estimator(Plugin):
             classes = [type(sensor).__name__ for sensor in self.sensors]
             raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {classes}")
         for sensor in self.aiding_sensors:
-            if type(sensor) not in self.kinds:
+            if not self.can_fuse(sensor):
                 raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
         for sensor in self.sensors:
             if sensor.name not in sim.data.plugins:

@@ -62,6 +62,9 @@ class Sensor(Plugin):
     """Names and lengths of the parts of a measurement, in their order."""
     chains: ClassVar[Mapping[str, Sequence[Link]]] = {}
     """Errors by channel, for channels that have any; see ``crazysim.plugins.sensors.errors``."""
+    measures_motion: ClassVar[bool] = True
+    """True if ``ideal`` is a smooth function of position, velocity, attitude and angular velocity, so that ``ESKF`` can
+    use the channels that have ``chains``."""
     reset_before: ClassVar[str | None] = "increment_steps"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
     state of the first measurement."""
