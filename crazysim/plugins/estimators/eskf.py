@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
@@ -21,8 +22,16 @@ from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimat
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.inertial_path import InertialPath
 from crazysim.plugins.estimators.kalman import UPDATE_FNS as KALMAN_UPDATE_FNS
+from crazysim.plugins.sensors.barometer import (
+    LAPSE_RATE,
+    PRESSURE_EXPONENT,
+    SEA_LEVEL_TEMPERATURE,
+    Barometer,
+    pressure_at,
+)
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
+from crazysim.plugins.sensors.gps import GPS
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.magnetometer import Magnetometer
 from crazysim.plugins.sensors.motion_capture import MotionCapture
@@ -37,10 +46,9 @@ RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 square root of ``error_state.MAX_COVARIANCE``."""
 MIN_STD = 1e-3
 """Smallest standard deviation assumed for a measurement: in m, m/s, rad or pixels, and for a magnetometer as a fraction
-of the field. For sweeps of a ``Lighthouse`` the limit is a tenth, 1e-4 rad; for sensors that are used by the derivatives
-of their ``ideal`` it is the state's error in m, m/s or rad that changes the measurement as much. This is an assumption, for sensors without noise and for float32."""
-
-
+of the field. For pressures it is 100 times as large, 0.1 Pa, and for sweeps of a ``Lighthouse`` a tenth, 1e-4 rad. For
+sensors that are used by derivatives it is what an error of a state by 1e-3 m, m/s or rad makes of the measurement. This
+is an assumption, for sensors without noise and for float32."""
 NO_SLOPE = 1e-6
 """Change of a measurement per unit of a state below which it says nothing about the state, in their units."""
 
@@ -56,8 +64,8 @@ class ESKF(ErrorStateFilter):
     It fuses ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB``,
     ``Lighthouse``, and any other sensor whose measurement is a smooth function of its drone's state with errors in
     ``chains``, by the derivatives of the sensor's own ``ideal``: your sensors, too, anywhere on the drone. It assumes
-    that ``MotionCapture``, ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight`` and ``UWB`` are at the centre of mass,
-    and that the body that ``MotionCapture`` tracks has the attitude of the drone.
+    that ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight`` and ``UWB`` are at the centre of mass, and that the body
+    that ``MotionCapture`` tracks has the attitude of the drone.
     """
 
     _: dataclasses.KW_ONLY
@@ -255,10 +263,10 @@ def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, es
 
 def _update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     """Return the estimate after the latest measurement of a sensor."""
-    return UPDATE_FNS.get(type(sensor), _update_by_ideal)(sensor, imu, data, estimate)
+    return UPDATE_FNS.get(type(sensor), update_by_ideal)(sensor, imu, data, estimate)
 
 
-def _update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     """Use a measurement by the derivatives of the sensor's measurement without errors with respect to the states."""
     record, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
 
@@ -275,9 +283,10 @@ def _update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate
 
     no_errors = jnp.zeros_like(first.pos, shape=12)
     innovations, slopes = sensor.split(sensor.latest(data) - predict(no_errors)), jax.jacfwd(predict)(no_errors)
-    rows = sensor.split(jnp.arange(len(slopes)))
+    rows = sensor.split(np.arange(len(slopes)))
     for name in sensor.chains:
-        for k, innovation, variance in zip(rows[name], innovations[name], record.variance(name) + 0 * innovations[name]):
+        variances = jnp.broadcast_to(record.variance(name), innovations[name].shape)
+        for k, innovation, variance in zip(rows[name], innovations[name], variances, strict=True):
             slope, fields = slopes[k], ("pos", "vel", "att_error", "gyro_bias")
             correction = jnp.concatenate([getattr(estimate, x) - getattr(first, x) for x in fields])
             # A deviation of at least MIN_STD in the units of the states.
@@ -285,6 +294,23 @@ def _update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate
             error = innovation - jnp.dot(slope, correction)
             estimate = error_state.update(estimate, [*POS, *VEL, *ATT, *GYRO], slope, error, std)
     return estimate
+
+
+def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
+    pos_std, vel_std = (_std(record.variance(name)) for name in ("pos", "vel"))
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std, record.pos))
+    return updates.update_vel(estimate, sensor.part(data, "vel"), vel_std, record.pos, gyro)
+
+
+def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record = sensor.read(data)
+    altitude = estimate.pos[2:] + record.altitude
+    predicted_pressure = pressure_at(altitude)
+    slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted_pressure / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
+    error = sensor.part(data, "pressure") - predicted_pressure
+    std = _std(record.variance("pressure"), 100 * MIN_STD)
+    return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 
 def _update_by_magnetometer(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -329,10 +355,12 @@ def _update_by_lighthouse(sensor: Lighthouse, imu: IMU, data: SimData, estimate:
 
 UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
     MotionCapture: _update_by_motion_capture,
+    GPS: _update_by_gps,
+    Barometer: _update_by_barometer,
     Magnetometer: _update_by_magnetometer,
     OpticalFlow: _update_by_optical_flow,
     TimeOfFlight: _update_by_time_of_flight,
     UWB: _update_by_uwb,
     Lighthouse: _update_by_lighthouse,
 }
-"""Functions that update an estimate with a measurement, by the class of the sensor; ``_update_by_ideal`` for others."""
+"""Functions that update an estimate with a measurement, by the class of the sensor; ``update_by_ideal`` for others."""

@@ -23,23 +23,48 @@ HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
 """Half the opening angle of the time-of-flight sensor's cone, rad (mm_tof.c)."""
 
 
-def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured position, world frame, m (3,), with its standard deviation, m. () or (3,)"""
-    for k, std in enumerate(_std_per_axis(deviation)):
-        estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
-    return estimate
+def update_pos(estimate: Estimate, pos: Array, deviation: Array | float, point: Array | None = None) -> Estimate:
+    """Return the estimate after a measured position, world frame, m (3,), with its standard deviation, m. () or (3,)
 
-
-def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured velocity, world frame, m/s, (3,).
-
-    Its standard deviation along each axis is in m/s. () or (3,)
+    Args:
+        estimate: The estimate.
+        pos: The position, world frame, m. (3,)
+        deviation: Its standard deviation, m. () or (3,)
+        point: Point of the drone whose position is measured, body frame, m; None for the centre of mass. (3,)
     """
     rot = rotation.matrix(estimate.quat)
     for k, std in enumerate(_std_per_axis(deviation)):
-        attitude_slope = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
-        predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(attitude_slope, estimate.att_error)[0]
-        estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], attitude_slope]), vel[k] - predicted, std)
+        rows, h, predicted = [k], jnp.ones_like(pos[:1]), estimate.pos[k]
+        if point is not None:
+            slope = rotation.cross(point, rot[k])  # the derivative with respect to the attitude
+            rows, h = [k, *ATT], jnp.concatenate([h, slope])
+            predicted = predicted + rotation.dot(rot[k], point)[0] + rotation.dot(slope, estimate.att_error)[0]
+        estimate = update(estimate, rows, h, pos[k] - predicted, std)
+    return estimate
+
+
+def update_vel(
+    estimate: Estimate, vel: Array, deviation: Array | float, point: Array | None = None, gyro: Array | None = None
+) -> Estimate:
+    """Return the estimate after a measured velocity.
+
+    Args:
+        estimate: The estimate.
+        vel: The velocity, world frame, m/s. (3,)
+        deviation: Its standard deviation along each axis, m/s. () or (3,)
+        point: Point of the drone whose velocity is measured, body frame, m; None for the centre of mass. (3,)
+        gyro: Angular velocity as measured, body frame, rad/s; for a point only. (3,)
+    """
+    rot = rotation.matrix(estimate.quat)
+    for k, std in enumerate(_std_per_axis(deviation)):
+        body_vel, rows, slopes = estimate.vel, [*VEL, *ATT], []
+        if point is not None:
+            body_vel = body_vel + rotation.cross(gyro - estimate.gyro_bias, point)  # type: ignore[operator]
+            rows, slopes = [*rows, *GYRO], [rotation.cross(rot[k], point)]
+        attitude_slope = rotation.cross(body_vel, rot[k])  # the derivative with respect to the attitude
+        predicted = rotation.dot(rot[k], body_vel)[0] + rotation.dot(attitude_slope, estimate.att_error)[0]
+        h = jnp.concatenate([rot[k], attitude_slope, *slopes])
+        estimate = update(estimate, rows, h, vel[k] - predicted, std)
     return estimate
 
 

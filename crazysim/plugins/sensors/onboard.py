@@ -50,6 +50,7 @@ class RotorSpeeds(NoisySensor):
     """Number of rotors."""
     _: dataclasses.KW_ONLY
     name: str = "rotor_speeds"
+    measures_motion: ClassVar[bool] = False
 
     @classmethod
     def telemetry(cls, pole_pairs: int, **settings: Any) -> RotorSpeeds:
@@ -87,6 +88,7 @@ class BatteryVoltage(NoisySensor):
     freq: int | None = 100
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     name: str = "battery_voltage"
+    measures_motion: ClassVar[bool] = False
 
     channels: ClassVar = {"voltage": 1}
 
@@ -117,6 +119,7 @@ class MultiRanger(NoisySensor):
     freq: int | None = 10
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     name: str = "multi_ranger"
+    measures_motion: ClassVar[bool] = False
 
     @property
     def channels(self) -> Mapping[str, int]:

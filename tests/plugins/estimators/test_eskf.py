@@ -1,13 +1,18 @@
 """The error-state filter with biases: its linearisation, the distribution of its errors, and flight on it."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from consistency import assert_chi_squared, errors, normalised_square
 
-from crazysim import ConfigError, Sim, rotation
+from crazysim import ConfigError, Sim, param, rotation
+from crazysim.core.plugin import Param
+from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.plugins.estimators import ESKF, error_state, updates
+from crazysim.plugins.estimators.eskf import update_by_ideal
 from crazysim.plugins.estimators.inertial_path import EMPTY_PATH_ROW, InertialPath, propagate_along
 from crazysim.plugins.sensors import (
     GPS,
@@ -22,6 +27,8 @@ from crazysim.plugins.sensors import (
     TimeOfFlight,
     Triad,
 )
+from crazysim.plugins.sensors.errors import White
+from crazysim.plugins.sensors.sensor import Sensor
 
 GYRO = Triad(noise=2.4e-4, bias_spread=0.0175, random_walk=1e-4)
 ACCEL = Triad(noise=2e-3, bias_spread=0.2, random_walk=1e-3)
@@ -324,3 +331,65 @@ def test_one_argument_adds_the_filter_and_wrong_sensors_are_errors():
     assert list(Sim(estimator="eskf").plugins) == ["imu", "motion_capture", "eskf"]
     with pytest.raises(ConfigError, match="got RotorSpeeds"):
         Sim(estimator=ESKF([IMU(), RotorSpeeds()]))
+
+
+class BodyVelocity(Sensor):
+    """Velocity of a point of the drone, in the frame of the drone, m/s, as a Doppler radar measures it."""
+
+    noise: Param = param(default=0.02)
+    """Standard deviation, m/s. (1,)"""
+    pos: Param = param(default=(0.1, 0.2, 0.0), core=(3,))
+    """The point, body frame, m. (3,)"""
+    name: str = "body_velocity"
+    channels: ClassVar = {"vel": 3}
+    chains: ClassVar = {"vel": [White("noise")]}
+
+    def ideal(self, data):
+        s = data.states
+        return rotation.rotate_inverse(s.quat, s.vel) + rotation.cross(s.ang_vel, self.pos)
+
+
+def test_a_sensor_of_ones_own_is_fused_by_the_derivatives_of_its_ideal(estimate):
+    """Gain and covariance are those of a Kalman filter with the derivatives of the measurement."""
+    sim = Sim(plugins=[IMU(gyro=GYRO, accel=ACCEL), BodyVelocity()], engine="plain")
+    gyro, measured = jnp.array([0.3, -0.2, 0.1]), jnp.array([1.0, -2.0, 0.5])
+    sim.step()
+    updated = jax.jit(drone_update)(sim.data, estimate, gyro, measured)
+
+    def measure(error):
+        state, pos = add_error(estimate, error), jnp.array([0.1, 0.2, 0.0])
+        return state.vel + jnp.cross(gyro - state.gyro_bias, pos)
+
+    h, p = jax.jacfwd(measure)(jnp.zeros(15)), error_state.covariance(estimate.cov)
+    gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + jnp.diag(0.02**2 + 1e-6 * jnp.sum(h**2, axis=1)))
+    correction = gain @ (measured - measure(jnp.zeros(15)))
+    np.testing.assert_allclose(updated.vel - estimate.vel, correction[3:6], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(updated.gyro_bias - estimate.gyro_bias, correction[12:], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(error_state.covariance(updated.cov), p - gain @ h @ p, rtol=1e-4, atol=1e-7)
+
+
+def drone_update(data, estimate, gyro, measured):
+    """Return the estimate of the first drone after a measured velocity."""
+
+    def update(drone):
+        imu, sensor = drone.plugins["imu"], drone.plugins["body_velocity"]
+        samples = sensor.samples.replace(value=measured, taken_step=jnp.zeros(1, jnp.int32))
+        plugins = drone.plugins | {
+            "imu": imu.replace(samples=imu.samples.replace(value=jnp.concatenate([gyro, jnp.zeros(3)]))),
+            "body_velocity": sensor.replace(samples=samples),
+        }
+        return update_by_ideal(sensor, imu, drone.replace(plugins=plugins), estimate)
+
+    return jax.tree.map(lambda x: x[0, 0], vmap_worlds(vmap_drones(update))(data))
+
+
+def test_an_antenna_off_the_centre_of_mass_gives_the_position_of_the_centre():
+    """A drone that turns by 1.5 rad: the antenna is 0.3 m beside it, and the noise of a position is 0.02 m."""
+    gps = GPS(noise=0.02, vel_noise=0.02, pos=(0.3, 0.0, 0.0), freq=100)
+    sim = Sim(n_worlds=8, control="state", estimator=ESKF([IMU(gyro=GYRO, accel=ACCEL), gps]))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.array([0, 0, 1.0])))
+    sim.state_control(pos=(0.0, 0.0, 1.0), yaw=1.5)
+    sim.step(1000)
+    s = sim.data.states
+    assert np.asarray(rotation.to_rpy(s.quat))[..., 2].min() > 1.3
+    np.testing.assert_allclose(sim.data.plugins["eskf"].estimate.pos, s.pos, atol=0.04)  # twice the noise
