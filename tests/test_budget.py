@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 9752,
     "media": 986,
-    "plugins": 7214,
+    "plugins": 7258,
     "scene": 3099,
     "sim": 1215,
     "train": 2455,

@@ -261,11 +261,6 @@ def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, es
     return updates.update_quat(estimate, sensor.part(data, "quat"), angle_std)
 
 
-def _update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    """Return the estimate after the latest measurement of a sensor."""
-    return UPDATE_FNS.get(type(sensor), update_by_ideal)(sensor, imu, data, estimate)
-
-
 def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     """Use a measurement by the derivatives of the sensor's measurement without errors with respect to the states."""
     record, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
@@ -283,7 +278,7 @@ def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate)
 
     no_errors = jnp.zeros_like(first.pos, shape=12)
     innovations, slopes = sensor.split(sensor.latest(data) - predict(no_errors)), jax.jacfwd(predict)(no_errors)
-    rows = sensor.split(np.arange(len(slopes)))
+    rows = sensor.split(np.arange(len(slopes)))  # type: ignore[arg-type]
     for name in sensor.chains:
         variances = jnp.broadcast_to(record.variance(name), innovations[name].shape)
         for k, innovation, variance in zip(rows[name], innovations[name], variances, strict=True):
@@ -363,4 +358,10 @@ UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
     UWB: _update_by_uwb,
     Lighthouse: _update_by_lighthouse,
 }
-"""Functions that update an estimate with a measurement, by the class of the sensor; ``update_by_ideal`` for others."""
+"""Functions that update an estimate with a measurement, by the class of the sensor; ``update_by_ideal`` for others.
+Derivatives in closed form need half of its operations."""
+
+
+def _update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    """Return the estimate after the latest measurement of a sensor."""
+    return UPDATE_FNS.get(type(sensor), update_by_ideal)(sensor, imu, data, estimate)
