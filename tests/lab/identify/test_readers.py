@@ -58,8 +58,8 @@ TABLE = b"t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n"
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv.gz", gzip.compress(TABLE), "gzipped file. Unpack it with gunzip"),
-        ("a.csv", gzip.compress(TABLE), "gzipped file. Unpack it with gunzip"),
+        ("a.csv.gz", gzip.compress(TABLE, mtime=0), "gzipped file. Unpack it with gunzip"),
+        ("a.csv", gzip.compress(TABLE, mtime=0), "gzipped file. Unpack it with gunzip"),
         ("a.csv", bz2.compress(TABLE), "Unpack it with bunzip2"),
         ("a.csv", lzma.compress(TABLE), "Unpack it with unxz"),
         ("a.csv", TABLE.decode().encode("utf-16"), "text in UTF-16. Save it as UTF-8"),
