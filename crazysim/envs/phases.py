@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import keystr, tree_leaves_with_path
+from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
@@ -28,7 +28,7 @@ from crazysim.envs.random import episode_key
 from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, EnvState, Obs
 from crazysim.envs.task import Task, sum_terms
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.pytree import map_batched, select_worlds
 
 Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
@@ -239,10 +239,14 @@ class Phases:
         task, shape = self.task, (self.n_drones, self.actions.size)
         reset_data = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
         key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(reset_data)
-        data = vectorize(task.spawn, task.batched)(reset_data, key)
+        # Checked and broadcast before worlds are joined: a leaf without the axis of drones is of its own world.
+        data = vectorize(lambda data, key: _check_spawn(task, task.batched, data, task.spawn(data, key)), task.batched)(
+            reset_data, key
+        )
         for wrapper in self.wrappers:
-            data = vectorize(wrapper.after_spawn, wrapper.batched)(data)
-        data = _check_spawn(task, reset_data, data)
+            data = vectorize(
+                lambda data, x=wrapper: _check_spawn(task, x.batched, data, x.after_spawn(data)), wrapper.batched
+            )(data)
 
         def fill_state(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
@@ -314,8 +318,11 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
     return {"error": task.error(data)} | task.info(data)
 
 
-def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
-    """Return the data from ``spawn`` with the shapes and dtypes before it, so that no step is compiled again."""
+def _check_spawn(task: Task, batched: bool, reset_data: SimData, spawned: Any) -> SimData:
+    """Return the data from ``spawn`` or ``after_spawn`` with the shapes and dtypes before it.
+
+    No step is compiled again then. Arrays of fewer axes are those of all drones, unless ``batched`` is True.
+    """
     if jax.tree.structure(spawned) != jax.tree.structure(reset_data):
         old_paths, new_paths = (
             {keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (reset_data, spawned)
@@ -329,6 +336,16 @@ def _check_spawn(task: Task, reset_data: SimData, spawned: Any) -> SimData:
             f"{type(spawned).__name__} {changes or 'of another structure'}. The task's record is data.plugins['task']; "
             f"docs/guides/tasks.md has an example."
         )
-    return jax.tree.map(
-        lambda x, y: y if y is x else jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape), reset_data, spawned
-    )
+
+    def fit(path: Any, x: Array, y: Any) -> Array:
+        y = y if y is x else jnp.asarray(y, x.dtype)
+        ends = zip(reversed(jnp.shape(y)), reversed(x.shape), strict=False)
+        require(
+            (jnp.ndim(y) in (0, x.ndim) if batched else jnp.ndim(y) <= x.ndim) and all(m in (1, n) for m, n in ends),
+            f"task {task.name!r}: expected spawn or after_spawn to return {keystr(path)} of shape {x.shape}, got shape "
+            f"{jnp.shape(y)}. A number that all drones share cannot differ between them there: add its plugin with one "
+            f"value for each drone.",
+        )
+        return y if y is x else jnp.broadcast_to(y, x.shape)
+
+    return tree_map_with_path(fit, reset_data, spawned)

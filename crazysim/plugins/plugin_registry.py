@@ -100,6 +100,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             if removed_plugin.moves_objects:
                 self._leave_objects(name)
             self._put_records(name, None, None)
+            self._stages.require_unedited(name)
             self._stages.set_plugin(name, None)
             self._record_readers = self._record_readers - {name}
             for other in others:
@@ -221,9 +222,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_unique_terms(plugin, [other for other in self.values() if other is not old_plugin])
         old_record, (record, default) = sim.data.plugins.get(name), self._make_records(plugin)
         self._put_records(name, _carry_over(plugin, record, old_record), default)
+        is_new = not _have_same_code(old_plugin, plugin) or jax.tree.structure(old_record) != jax.tree.structure(record)
+        if is_new:
+            self._stages.require_unedited(name)
         self._stages.set_plugin(name, plugin)
         self._is_checked = False
-        if not _have_same_code(old_plugin, plugin) or jax.tree.structure(old_record) != jax.tree.structure(record):
+        if is_new:
             self._build(plugin)
         return plugin
 

@@ -64,6 +64,18 @@ class PluginStages:
             self._history.append(name)
         self.plugins[name] = plugin
 
+    def require_unedited(self, name: str) -> None:
+        """Check that the user has not replaced a stage of a plugin, which may call it."""
+        stages = [x.stage for x in self._made[name].placements]
+        edits = [pipelines for x in self._history if isinstance(x, Edit) for pipelines in zip(*x, strict=True)]
+        for before, after in edits:
+            for stage, fn in before.items():
+                if after.get(stage, fn) is not fn and any(fn is x for x in stages):
+                    raise ConfigError(
+                        f"expected the stages of plugin {name!r} as they were added, got another function as "
+                        f"{stage!r}. Undo that edit first."
+                    )
+
     def build(self, remake: Collection[str] = (), changed: Plugin | None = None) -> None:
         """Set the simulation's pipelines, after ``begin_change``; the dicts stay, because a user may hold them to edit.
 

@@ -406,7 +406,8 @@ class Sim:
     def replace(self, plugin: P) -> P:
         """Replace the settings of the plugin of the same name, and return the new plugin; its states are unchanged.
 
-        If only numbers change (fields declared with ``param``), nothing is compiled.
+        If only numbers change (fields declared with ``param``), nothing is compiled, unless a number that was None, or
+        was left out because it was zero, gets another value.
         """
         return self.plugins.replace(plugin)
 

@@ -161,7 +161,7 @@ class Stepper:
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 flat_after = self.step.advance(flat, self._as_array(n_steps))
-                _require_values(flat_after.leaves)
+                _require_values(flat_after.leaves[:1])  # all are traced, or none
             else:
                 flat_after = self.step.advance_on_host(flat, n_steps)
         self._data = flat_after

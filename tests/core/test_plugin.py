@@ -528,8 +528,12 @@ def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
     (lambda sim: sim.remove("wake"), UnknownNameError, "got 'wake'. Added are: wind, latency"),
     (lambda sim: sim.replace(Wake()), UnknownNameError, "got 'wake'"),
     (lambda sim: sim.replace(Wake(name="wind")), ConfigError, "expected a Wind to replace 'wind', got a Wake"),
-    (lambda sim: replace_fn(sim.step_pipeline, lambda d: d, "latency") or sim.remove("latency"),
-     ConfigError, "expected a pipeline with stage 'latency', which you have replaced"),
+    *[
+        (lambda sim, stage=stage, act=act: replace_fn(sim.step_pipeline, lambda d: d, stage) or act(sim),
+         ConfigError, f"expected the stages of plugin 'latency' as they were added, got another function as '{stage}'")
+        for stage in ("latency", "attitude_controller")
+        for act in (lambda sim: sim.remove("latency"), lambda sim: sim.replace(Latency(3, max_delay=4)))
+    ],
 ])  # fmt: skip
 def test_law_09_impossible_additions_replacements_and_removals_are_refused(act, error, words):
     sim = Sim()

@@ -14,6 +14,7 @@ from crazysim.envs.random import episode_key, scale_symmetric, scale_to
 from crazysim.envs.task import sum_terms
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
+from crazysim.envs.wrappers import Wrapper
 
 
 def test_making_a_task_changes_no_simulation_and_installing_it_does():
@@ -218,6 +219,37 @@ def test_law_09_an_episode_without_a_step_is_refused(two_drones):
         ConfigError, match=r"at least one environment step, got seconds=0\.009 at 50 Hz. Use seconds=0\.02"
     ):
         DroneEnv(two_drones, Still(seconds=0.009))
+
+
+@pytest.mark.parametrize("in_wrapper", [False, True])
+def test_law_01_a_start_without_the_axis_of_drones_is_of_its_own_world(in_wrapper):
+    """With as many worlds as drones, too: the start of a world is the same for its drones and no other world's."""
+
+    def place(data):
+        pos = jax.random.uniform(episode_key(data, "place"), (3,))
+        return data.replace(states=data.states.replace(pos=pos))
+
+    class Placed(Still):
+        def spawn(self, data, key):
+            return data if in_wrapper else place(data)
+
+    class Place(Wrapper):
+        def after_spawn(self, data):
+            return place(data)
+
+    env = DroneEnv(Sim(n_worlds=2, n_drones=2, control="attitude"), Placed())
+    pos = np.asarray((Place(env) if in_wrapper else env).reset(jax.random.key(0)).data.states.pos)
+    np.testing.assert_array_equal(pos[:, 0], pos[:, 1])
+    assert np.all(pos[0] != pos[1])
+
+
+def test_law_09_a_start_of_another_shape_is_named(two_drones):
+    class Wide(Still):
+        def spawn(self, data, key):
+            return data.replace(params=data.params.replace(gravity_vec=jnp.zeros((2, 3))))
+
+    with pytest.raises(ConfigError, match=r"task 'still': .*params.gravity_vec of shape \(3,\), got shape \(2, 3\)"):
+        jax.eval_shape(DroneEnv(two_drones, Wide()).reset, jax.random.key(0))
 
 
 def test_law_09_a_start_with_other_leaves_is_refused(two_drones):

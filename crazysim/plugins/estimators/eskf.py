@@ -30,6 +30,7 @@ from crazysim.plugins.sensors.barometer import (
     pressure_at,
 )
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
+from crazysim.plugins.sensors.errors import Link, Turned
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
 from crazysim.plugins.sensors.gps import GPS
 from crazysim.plugins.sensors.imu import IMU
@@ -62,10 +63,10 @@ class ESKF(ErrorStateFilter):
     errors of the other sensors are treated as white noise.
 
     It fuses ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB``,
-    ``Lighthouse``, and any other sensor whose measurement is a smooth function of its drone's state with errors in
-    ``chains``, by the derivatives of the sensor's own ``ideal``: your sensors, too, anywhere on the drone. It assumes
-    that ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight`` and ``UWB`` are at the centre of mass, and that the body
-    that ``MotionCapture`` tracks has the attitude of the drone.
+    ``Lighthouse``, and any other sensor whose measurement is a smooth function of its drone's state, with errors in
+    ``chains`` that have a variance, by the derivatives of the sensor's own ``ideal``: your sensors, too, anywhere on
+    the drone. It assumes that ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight`` and ``UWB`` are at the centre of
+    mass, and that the body that ``MotionCapture`` tracks has the attitude of the drone.
     """
 
     _: dataclasses.KW_ONLY
@@ -90,7 +91,9 @@ class ESKF(ErrorStateFilter):
 
     def can_fuse(self, sensor: Sensor) -> bool:
         """Return True if the filter has an update for the sensor, or can derive one from its ``ideal``."""
-        return super().can_fuse(sensor) or (sensor.measures_motion and bool(sensor.chains))
+        links = [link for chain in sensor.chains.values() for link in chain]
+        has_variance = all(type(x).variance is not Link.variance and not isinstance(x, Turned) for x in links)
+        return super().can_fuse(sensor) or (sensor.measures_motion and bool(links) and has_variance)
 
     def bind(self, sim: Simulation) -> ESKF:
         quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
@@ -263,7 +266,7 @@ def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, es
 
 def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     """Use a measurement by the derivatives of the sensor's measurement without errors with respect to the states."""
-    record, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
+    sensor, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
 
     def predict(errors: Array) -> Array:
         turn = jnp.concatenate([0.5 * errors[6:9], jnp.ones_like(gyro[:1])])
@@ -274,13 +277,13 @@ def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate)
             quat=quat,
             ang_vel=gyro - first.gyro_bias - errors[9:],  # type: ignore[operator]
         )
-        return record.ideal(data.replace(states=states))
+        return sensor.ideal(data.replace(states=states))
 
     no_errors = jnp.zeros_like(first.pos, shape=12)
     innovations, slopes = sensor.split(sensor.latest(data) - predict(no_errors)), jax.jacfwd(predict)(no_errors)
     rows = sensor.split(np.arange(len(slopes)))  # type: ignore[arg-type]
     for name in sensor.chains:
-        variances = jnp.broadcast_to(record.variance(name), innovations[name].shape)
+        variances = jnp.broadcast_to(sensor.variance(name), innovations[name].shape)
         for k, innovation, variance in zip(rows[name], innovations[name], variances, strict=True):
             slope, fields = slopes[k], ("pos", "vel", "att_error", "gyro_bias")
             correction = jnp.concatenate([getattr(estimate, x) - getattr(first, x) for x in fields])

@@ -180,7 +180,6 @@ def move_loads(
 
     Args:
         data: Data of one world.
-        name: Name of the plugin.
         load: Plugin of the loads.
         tip: Ends of the links, world frame, m. (n_drones, 3)
         is_held: True for links with a load or hook at their end; other links point down the body's z axis. (n_drones,)

@@ -37,8 +37,8 @@ class Link:
         return x, {}
 
     def variance(self, sensor: Any) -> Array | float:
-        """Return the variance of the error."""
-        return 0.0
+        """Return the variance of the error, for filters."""
+        raise NotImplementedError(f"{type(self).__name__} needs a method variance(sensor)")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,13 +58,15 @@ class MotionCapture(Sensor):
 
     def reset_episode(self, data: SimData) -> SimData:
         pos, vel = jnp.split(self.ideal(data), (7,))
-        return self.write(data, self.replace(last_pos=pos[:3] - self.interval(data) * vel, vel=vel))
+        data = super().reset_episode(data)
+        return self.write(data, self.read(data).replace(last_pos=pos[:3] - self.interval(data) * vel, vel=vel))
 
     def measure(self, data: SimData, key: Array) -> tuple[Array, MotionCapture]:
-        pose, dt = super().measure(data, key)[0][:7], self.interval(data)
+        (value, sensor), dt = super().measure(data, key), self.interval(data)
+        pose = value[:7]
         vel = (pose[:3] - self.last_pos) / dt
         vel = self.vel + (1 - jnp.exp(-2 * math.pi * dt * self.bandwidth)) * (vel - self.vel)
-        return jnp.concatenate([pose, vel]), self.replace(last_pos=pose[:3], vel=vel)
+        return jnp.concatenate([pose, vel]), sensor.replace(last_pos=pose[:3], vel=vel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return position, attitude and velocity, as if the tracked body were the drone's frame."""

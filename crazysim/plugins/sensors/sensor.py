@@ -19,7 +19,7 @@ from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, chec
 from crazysim.core.random import drone_key, normal, uniform
 from crazysim.core.settings import default_rates, dividing_rate, setting
 from crazysim.core.stage import is_tick
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.plugins.sensors.errors import Link
 from crazysim.pytree import PyTree, device_array, leaf
 
@@ -101,6 +101,11 @@ class Sensor(Plugin):
             key: Random key of the drone at this step.
             dt: Time since the last measurement, s.
         """
+        n = sum(self.channels.values())
+        require(
+            truth.shape == (n,),
+            f"expected ideal of {self.name!r} to return {n} numbers, {dict(self.channels)}, got shape {truth.shape}",
+        )
         parts, changes = self.split(truth), {}
         for name, link, noise in self._draw("n_step", key, truth.dtype):
             parts[name], new = link.step(self, parts[name], noise, dt)
@@ -138,6 +143,10 @@ class Sensor(Plugin):
         """Return ``samples`` before the first measurement; check the common settings."""
         if not self.channels:
             raise NotImplementedError(f"{type(self).__name__} needs channels, such as channels = {{'pos': 3}}")
+        require(
+            self.chains.keys() <= self.channels.keys(),
+            f"expected chains of {self.name!r} for channels {', '.join(self.channels)}, got {', '.join(self.chains)}",
+        )
         freq = self.rate(sim.data.core.freq)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * freq + 0.5) + 2 if max_delay > 0 else 0

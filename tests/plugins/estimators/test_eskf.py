@@ -27,7 +27,7 @@ from crazysim.plugins.sensors import (
     TimeOfFlight,
     Triad,
 )
-from crazysim.plugins.sensors.errors import White
+from crazysim.plugins.sensors.errors import Link, Turned, White
 from crazysim.plugins.sensors.sensor import Sensor
 
 GYRO = Triad(noise=2.4e-4, bias_spread=0.0175, random_walk=1e-4)
@@ -393,3 +393,27 @@ def test_an_antenna_off_the_centre_of_mass_gives_the_position_of_the_centre():
     s = sim.data.states
     assert np.asarray(rotation.to_rpy(s.quat))[..., 2].min() > 1.3
     np.testing.assert_allclose(sim.data.plugins["eskf"].estimate.pos, s.pos, atol=0.04)  # twice the noise
+
+
+class TurnedProbe(BodyVelocity):
+    """A probe whose error is a rotation, which has no variance in the components of its measurement."""
+
+    name: str = "turned_probe"
+    chains: ClassVar = {"vel": [Turned("noise")]}
+
+
+class OwnError(Link):
+    """An error without a variance."""
+
+
+class UnknownProbe(BodyVelocity):
+    """A probe with an error of its own."""
+
+    name: str = "unknown_probe"
+    chains: ClassVar = {"vel": [OwnError()]}
+
+
+@pytest.mark.parametrize("kind", [TurnedProbe, UnknownProbe])
+def test_law_09_sensors_without_a_variance_are_refused(kind):
+    with pytest.raises(ConfigError, match=f"expected sensors of the kinds .* got {kind.__name__}"):
+        Sim(estimator=ESKF([IMU(), kind()]))

@@ -128,3 +128,29 @@ def test_a_sensor_without_channels_is_an_error_that_names_it():
 
     with pytest.raises(NotImplementedError, match="Incomplete needs channels"):
         Sim().add(Incomplete())
+
+
+class Short(Sensor):
+    """A sensor whose truth has fewer numbers than its channel."""
+
+    name: str = "short"
+    channels: ClassVar = {"vel": 3}
+    chains: ClassVar = {"vel": []}
+
+    def ideal(self, data):
+        return data.states.vel[2:]
+
+
+class Misspelt(Short):
+    """A sensor with errors of a channel that it lacks."""
+
+    chains: ClassVar = {"velocity": []}
+
+
+@pytest.mark.parametrize("kind, words", [
+    (Short, r"expected ideal of 'short' to return 3 numbers, {'vel': 3}, got shape \(1,\)"),
+    (Misspelt, "expected chains of 'short' for channels vel, got velocity"),
+])  # fmt: skip
+def test_law_09_truth_and_errors_fit_the_channels(kind, words):
+    with pytest.raises(ConfigError, match=words):
+        Sim(plugins=[kind()]).step()
