@@ -13,7 +13,7 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import leaf
 
 
-def thrust_scale(airframe: Airframe) -> ArrayLike:
+def _thrust_scale(airframe: Airframe) -> ArrayLike:
     """Return the thrust of the firmware's PWM for a desired thrust over that thrust, 1."""
     pwm_per_newton = airframe.value("controller.mass_thrust", ())
     max_thrust = airframe.n_rotors * airframe.value("rotors.thrust_max", ())
@@ -35,7 +35,7 @@ class StateParams(
     """Gain on the integral of the position error, N/(m s). (3,)"""
     gravity_vec: Array = leaf("parameter", 1, (3,), airframe=lambda _: GRAVITY)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    thrust_scale: Array = leaf("parameter", 1, (1,), airframe=thrust_scale)
+    thrust_scale: Array = leaf("parameter", 1, (1,), airframe=_thrust_scale)
     """Actual over desired thrust, 1. It is not 1, because the firmware's mass_thrust does not match its mass. (1,)"""
     int_err_max: Array = leaf("parameter", 1, (3,), airframe="controller.state.int_err_max")
     """Limit of the integral of the position error, m s. (3,)"""

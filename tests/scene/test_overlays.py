@@ -273,7 +273,7 @@ def test_the_lower_led_is_visible_from_below(opengl):
         (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
         (lambda sim: draw_text(sim, "x", "middle"), "expected corner 'top left' or .*, got 'middle'"),
         (lambda sim: draw_text(sim, ""), "expected a string that is not empty as text, got ''"),
-        (lambda sim: draw_text(sim, 3), "expected a string .*, got 3"),
+        (lambda sim: draw_text(sim, 3), "expected text as str, got 3"),
         (lambda sim: draw_text(sim, "5 µm"), "expected ASCII text, got '5 µm' with 'µ'"),
         (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "at most 99 characters, got 100"),
         (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label of one line"),
