@@ -45,7 +45,7 @@ ABSTRACT = {
     FunctionPlugin, Population, Sensor, NoisySensor, ImageSensor, Estimator, ErrorStateFilter, Scenery,
     StandingObstacles, GoalTask, TouchDown, BringLoad,
 }  # fmt: skip
-"""Base classes, which are not added."""
+"""Base classes, which are not added, as are plugins without a name."""
 TABLES = {"heights"}
 """Fields of two axes of any lengths."""
 LISTS = {"elevation", "azimuth"}
@@ -99,7 +99,8 @@ def concrete_classes(base, package=crazysim.plugins):
         return {kind, *[x for sub in kind.__subclasses__() for x in subclasses_of(sub)]}
 
     classes = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
-    return sorted(classes, key=lambda kind: kind.__name__)
+    named = [kind for kind in classes if not issubclass(kind, Plugin) or hasattr(kind, "name")]
+    return sorted(named, key=lambda kind: kind.__name__)
 
 
 PLUGINS, TASKS = concrete_classes(Plugin), concrete_classes(Task, crazysim.envs.tasks)

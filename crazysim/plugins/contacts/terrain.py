@@ -40,6 +40,8 @@ class Terrain(HeightField):
     and for a ``ContactResponse``, which must be added after it.
     """
 
+    name: str = "terrain"
+
     def bind(self, sim: Simulation) -> Terrain:
         heights, size, pos = self._check_heights(sim)
         dtype = sim.data.states.pos.dtype

@@ -15,7 +15,7 @@ from crazysim.eager import jit_eager_calls
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE, surface_at
 
 
-class HeightField(Plugin):
+class HeightField(Plugin, abstract=True):
     """Ground with heights on a grid: what ``Terrain``, which adds it to the scene, knows about its surface."""
 
     heights: ArrayLike | str | Path = param(core=("rows", "columns"), scope="shared")
@@ -34,7 +34,6 @@ class HeightField(Plugin):
     """Half extents along x and y, m. (2,)"""
     height_below: Array = state()
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
-    name: str = "terrain"
 
     @jit_eager_calls()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
