@@ -35,7 +35,7 @@ from measure import medians, report, round_digits, start_hovering
 import crazysim.envs as envs
 from crazysim import Sim, __version__
 from crazysim.core import functional, world_mesh
-from crazysim.core.sharding import distribute
+from crazysim.engine.sharding import distribute
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train import apg, ppo

@@ -40,7 +40,7 @@ MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "dat
 
 # Sources that several figures measure, as Git's path specifications.
 ENGINE = ("crazysim/engine", ":(exclude)crazysim/engine/tools")
-BASE = ("crazysim/rotation.py", "crazysim/pytree.py", "crazysim/jaxcompat.py", "crazysim/drones")
+BASE = ("crazysim/rotation.py", "crazysim/drones")
 STEP = (*BASE, *ENGINE, "crazysim/core", "crazysim/dynamics", "crazysim/control", "crazysim/sim/sim.py")
 """Sources of a step."""
 SCENE = ("crazysim/geometry", "crazysim/scene")
@@ -571,7 +571,7 @@ FIGURES: dict[str, Figure] = {
     "mocap": Figure(PAGE, ("crazysim/lab/live/mocap",), cpu="mocap.py", table=tables.mocap),
     "first-results": Figure(
         "docs/install.md",
-        ("crazysim/cache.py", "crazysim/startup.py", "crazysim/sim", *ENGINE, "crazysim/envs"),
+        ("crazysim/engine/cache.py", "crazysim/startup.py", "crazysim/sim", *ENGINE, "crazysim/envs"),
         cpu="first_results.py --repeat 1",
         table=tables.first_results,
     ),

@@ -20,7 +20,7 @@ import time
 from measure import describe_machine
 
 from crazysim import __version__
-from crazysim.cache import CACHE_VARIABLE
+from crazysim.engine.cache import CACHE_VARIABLE
 
 CASES = {
     "step": """

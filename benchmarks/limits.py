@@ -23,11 +23,11 @@ from jax import Array
 from measure import Flight, engine_name, medians, report, round_digits, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
-from crazysim.core.stage import stage
 from crazysim.engine import ENGINES
 from crazysim.engine.backends import fused
 from crazysim.engine.ir.blocks import Block, Operation, Value
 from crazysim.engine.ir.ops import TABLE
+from crazysim.engine.stage import stage
 
 COPY_SIZES = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""

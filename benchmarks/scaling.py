@@ -22,7 +22,7 @@ from measure import Flight, describe_machine, engine_name, medians, round_digits
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
-from crazysim.pytree import scopes
+from crazysim.engine.pytree import scopes
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from measure import Flight, engine_name, medians, report, round_digits
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
-from crazysim.pytree import scopes
+from crazysim.engine.pytree import scopes
 
 
 def main() -> None:

@@ -41,10 +41,10 @@ from jax import Array
 from measure import describe_machine, round_digits, run_in_process
 
 import crazysim
+from crazysim.engine.pytree import PyTree, static
 from crazysim.envs import AutoReset, BraxEnv, make
 from crazysim.envs.env import Env
 from crazysim.envs.state import Obs, flatten
-from crazysim.pytree import PyTree, static
 from crazysim.train import evaluate, ppo
 from crazysim.train.config import find_recipe
 from crazysim.train.networks import Layers, mlp

@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING
 import crazysim.startup  # noqa: F401 - before JAX and MuJoCo
 
 # isort: split
-from crazysim.cache import enable_cache
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
-from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.plugin import Param, Plugin, StagePlacement, param, state
 from crazysim.core.population import Population
-from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
+from crazysim.engine.cache import enable_cache
+from crazysim.engine.jaxcompat import set_xla_log_level
+from crazysim.engine.pair_reductions import reduce_over_others
+from crazysim.engine.pytree import Members, PyTree, leaf, static
+from crazysim.engine.stage import stage
 from crazysim.errors import ConfigError
-from crazysim.jaxcompat import set_xla_log_level
-from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.startup import __version__, lazy_getattr
 

@@ -8,8 +8,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from crazysim import cache
 from crazysim.commands import airframe, demo, identify, info, live, replay, show, training, validate
+from crazysim.engine import cache
 from crazysim.errors import DivergedError, RenderError, not_installed
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",

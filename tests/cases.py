@@ -19,11 +19,11 @@ from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
 from crazysim.core.plugin import Plugin
-from crazysim.core.record import nonfinite_worlds
-from crazysim.core.stage import as_stages
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import native
-from crazysim.pytree import PyTree
+from crazysim.engine.pytree import PyTree
+from crazysim.engine.record import nonfinite_worlds
+from crazysim.engine.stage import as_stages
 
 FITTED_DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
 LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")

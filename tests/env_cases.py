@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from cases import leaf_on_host
 
+from crazysim.engine.pytree import map_batched
 from crazysim.envs import TASKS, AutoReset, make
-from crazysim.pytree import map_batched
 
 
 class CompiledEnv:

@@ -10,8 +10,8 @@ import numpy as np
 import crazysim as cs
 from crazysim.core.plugin import StagePlacement, param
 from crazysim.core.population import Population
-from crazysim.core.stage import stage
-from crazysim.pytree import Members, leaf
+from crazysim.engine.pytree import Members, leaf
+from crazysim.engine.stage import stage
 
 STIFFNESS = 40.0
 """Stiffness of the springs, N/m."""

@@ -135,7 +135,7 @@ def test_randomised_leaves_no_parameter_shared(benchmarks):
     import step
 
     from crazysim import Sim
-    from crazysim.pytree import scopes
+    from crazysim.engine.pytree import scopes
 
     sim = Sim(n_worlds=2, n_drones=3, engine="lanes")
     step.randomise_parameters(sim)

@@ -11,8 +11,8 @@ import pytest
 
 import crazysim
 from crazysim.__main__ import main
-from crazysim.cache import default_folder
 from crazysim.commands.info import OPTIONAL_PACKAGES, REQUIRED_PACKAGES, VARIABLES
+from crazysim.engine.cache import default_folder
 
 
 def lines(text):

@@ -17,11 +17,11 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import device_array
 from crazysim.errors import RenderError, not_installed, require
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
 from crazysim.progress import progress_bar
-from crazysim.pytree import device_array
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material

@@ -162,7 +162,7 @@ def _check_coordinator(text: str) -> None:
 
 def _host_from_scheduler(options: argparse.Namespace) -> Host:
     """Return the host that the variables of SLURM or Open MPI describe."""
-    from crazysim.jaxcompat import detect_hosts
+    from crazysim.engine.jaxcompat import detect_hosts
 
     coordinator, n_hosts, host_id, devices = detect_hosts(options.connect_timeout)
     if coordinator is None or n_hosts is None or host_id is None:
@@ -191,7 +191,7 @@ _end_lock = threading.Lock()
 
 def _end_process(host: Host, line: str, reason: str | None) -> None:
     """Print a line, send a reason to the other hosts unless it is None, wait until they end, and end the process."""
-    from crazysim.jaxcompat import connected_hosts
+    from crazysim.engine.jaxcompat import connected_hosts
 
     if not _end_lock.acquire(blocking=False):
         time.sleep(2 * STOP_SECONDS)
@@ -211,7 +211,7 @@ def _end_process(host: Host, line: str, reason: str | None) -> None:
 
 def _stop_with_others(host: Host) -> None:
     """End this process as soon as another host stops with an error."""
-    from crazysim.jaxcompat import connected_hosts
+    from crazysim.engine.jaxcompat import connected_hosts
 
     while True:
         time.sleep(POLL_SECONDS)

@@ -114,8 +114,8 @@ def _nvrtc() -> str:
 
 
 def _cache() -> str:
-    from crazysim import jaxcompat
-    from crazysim.cache import default_folder
+    from crazysim.engine import jaxcompat
+    from crazysim.engine.cache import default_folder
     from crazysim.storage import untrusted_reason
 
     configured = jaxcompat.cache_folder()

@@ -11,7 +11,7 @@ from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import clip, matvec
 
 

@@ -9,7 +9,7 @@ from crazysim import rotation
 from crazysim.control.allocation import torque_arms
 from crazysim.control.gains import Gains
 from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import matvec
 
 

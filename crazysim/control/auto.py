@@ -63,7 +63,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.rotor import quadratic_curve, thrust_slope
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip, cross, dot, matvec
 
 ROTOR_RATE = 50.0

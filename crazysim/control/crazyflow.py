@@ -14,7 +14,7 @@ from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.drones import Airframe
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 
 
 class StateMemory(PyTree):

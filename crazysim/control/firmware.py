@@ -22,8 +22,8 @@ from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import PyTree, leaf
 from crazysim.storage import open_replacement, read_bytes
 
 INTERFACE_VERSION = 1

@@ -17,7 +17,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.fitted import Params
 from crazysim.dynamics.models import AirframeParams
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import dot, matvec
 
 

@@ -10,7 +10,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.control.setpoint import Setpoint
 from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 MIN_HEADING_SINE = 0.05

@@ -21,8 +21,8 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.errors import expect
-from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 ROTOR_LEAD = 2.0

@@ -21,8 +21,8 @@ from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.errors import expect, require
-from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 SetpointBody = Literal["load", "drone"]

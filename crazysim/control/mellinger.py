@@ -20,7 +20,7 @@ from crazysim.control.power_distribution import (
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.dynamics.models import GRAVITY, part
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.rotation import clip, dot
 
 

@@ -10,7 +10,7 @@ from crazysim.control.gains import Gains
 from crazysim.control.pid_loop import PIDLoop, PIDLoopMemory, pid_step
 from crazysim.control.power_distribution import PowerDistributionParams
 from crazysim.dynamics.models import part
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.rotation import clip
 
 THRUST_SCALE = 1000.0

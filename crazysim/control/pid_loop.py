@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.control.low_pass import butterworth
 from crazysim.drones import Airframe
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip
 
 DEFAULT_INTEGRAL_MAX = 5000.0

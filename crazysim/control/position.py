@@ -10,7 +10,7 @@ from crazysim.control.allocation import max_thrust_without_torque
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY, AirframeParams
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.rotation import clip, dot, safe_norm
 
 POSITION_RATE_RATIO = 0.4

@@ -12,7 +12,7 @@ from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import clip, matvec
 
 

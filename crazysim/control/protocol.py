@@ -13,8 +13,8 @@ from crazysim.control.levels import Control
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
+from crazysim.engine.pytree import PyTree, float_dtype
 from crazysim.errors import require
-from crazysim.pytree import PyTree, float_dtype
 
 R = TypeVar("R", bound=PyTree)
 

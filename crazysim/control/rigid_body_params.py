@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.control.allocation import AllocationParams
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY, BodyParams, part
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 
 
 def limited_allocation(airframe: Airframe, **values: Any) -> AllocationParams:

@@ -7,7 +7,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.eager import jit_eager_calls
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 
 
 class Setpoint(PyTree):

@@ -10,7 +10,7 @@ from crazysim import rotation
 from crazysim.control.gains import Gains
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 
 
 def _thrust_scale(airframe: Airframe) -> ArrayLike:

@@ -15,8 +15,8 @@ from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.errors import expect, require
-from crazysim.pytree import PyTree, leaf
 
 
 class SwitchParams(PyTree):

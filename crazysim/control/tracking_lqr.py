@@ -28,8 +28,8 @@ from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
+from crazysim.engine.pytree import leaf
 from crazysim.errors import require
-from crazysim.pytree import leaf
 from crazysim.rotation import cross, matvec
 
 MAX_KNOTS = 60

@@ -17,8 +17,8 @@ from crazysim.core.plugin import (
 )
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
 from crazysim.core.settings import dividing_rate, setting
-from crazysim.core.sharding import shard, world_mesh
-from crazysim.pytree import map_batched, scopes, select_worlds
+from crazysim.engine.pytree import map_batched, scopes, select_worlds
+from crazysim.engine.sharding import shard, world_mesh
 
 __all__ = [
     "FunctionPlugin",

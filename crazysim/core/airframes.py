@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.drones import Airframe, AirframeSource, load_airframe
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree
 
 T = TypeVar("T")
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.jaxcompat import simple_primitive
+from crazysim.engine.jaxcompat import simple_primitive
 
 Carry = TypeVar("Carry")
 

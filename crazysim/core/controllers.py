@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.control import Control, Controller, Setpoint
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.stage import Stage, is_tick
+from crazysim.engine.stage import Stage, is_tick
 
 
 def controller_stages(controller: Controller, control: Control) -> Pipeline:

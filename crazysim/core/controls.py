@@ -13,8 +13,8 @@ from crazysim.control import AllocationParams, Control, Controller
 from crazysim.control.protocol import controller_chain
 from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.dynamics import Dynamics
+from crazysim.engine.pytree import PyTree, float_dtype, host_array, leaf, scopes, static
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, float_dtype, host_array, leaf, scopes, static
 
 
 class ControllerData(PyTree):

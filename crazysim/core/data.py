@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control, Controller, command_size
 from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.core.controls import SimControls
-from crazysim.core.record import Record, Roles, require_arrays
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import (
+from crazysim.engine.pytree import (
     Members,
     PyTree,
     check_axes,
@@ -33,6 +31,8 @@ from crazysim.pytree import (
     static,
     watched_flags,
 )
+from crazysim.engine.record import Record, Roles, require_arrays
+from crazysim.errors import ConfigError, short_repr
 
 SimParams = first_principles.Params | fitted.Params
 """Parameters of a dynamics model."""

@@ -12,12 +12,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from crazysim import jaxcompat
 from crazysim.arguments import check_flag
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape, require_data, require_states
 from crazysim.core.settings import is_real
-from crazysim.core.stage import is_tick
+from crazysim.engine import jaxcompat
+from crazysim.engine.stage import is_tick
 from crazysim.errors import ConfigError, short_repr
 
 FEEDFORWARD_FIELDS = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"

@@ -12,8 +12,8 @@ from jax import Array
 
 from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.plugin import Plugin
+from crazysim.engine.pytree import scopes
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
 
 T = TypeVar("T")
 

@@ -15,8 +15,8 @@ from crazysim import rotation
 from crazysim.core.data import SimData, SimState, SimStateDeriv
 from crazysim.core.influence import apply_constraint, apply_influence, plugin_rates
 from crazysim.core.plugin import Plugin
-from crazysim.core.stage import Stage, vmap_drones
-from crazysim.pytree import PyTree
+from crazysim.engine.pytree import PyTree
+from crazysim.engine.stage import Stage, vmap_drones
 
 R = TypeVar("R", bound=PyTree)
 

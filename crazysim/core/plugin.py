@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, DTypeLike
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, setting
-from crazysim.core.stage import Stage
 from crazysim.drones import Airframe
+from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
-from crazysim.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
 from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
@@ -121,7 +121,7 @@ def param(
         dtype: Type; None for the type of the states.
         whole: True for a whole number, of the type of the states unless ``dtype`` is another.
         shapes: Shapes of a shared number, ``"any"`` for an axis of any length.
-        sparse: As in ``crazysim.pytree.leaf``.
+        sparse: As in ``crazysim.engine.pytree.leaf``.
         keep: False for a number that only ``bind`` reads, to calculate others; it is None in ``data.plugins``.
     """
     declaration = Setting(
@@ -150,8 +150,8 @@ def state(
         scope: ``"drone"`` or ``"world"``.
         dtype: Type; None for the type of the states.
         optional: True for a state that is None unless ``bind`` gives it a value.
-        sparse: As in ``crazysim.pytree.leaf``.
-        scratch: As in ``crazysim.pytree.leaf``.
+        sparse: As in ``crazysim.engine.pytree.leaf``.
+        scratch: As in ``crazysim.engine.pytree.leaf``.
         init: For type checkers: users do not set states.
     """
     return dataclasses.field(

@@ -21,9 +21,9 @@ from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import RESERVED_SCOPES, Stage, is_tick
+from crazysim.engine.pytree import Members, PyTree, float_dtype
+from crazysim.engine.stage import RESERVED_SCOPES, Stage, is_tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import Members, PyTree, float_dtype
 
 MAX_MEMBERS = 100_000
 """Largest number of members of a population in a world."""

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData, as_key
-from crazysim.jaxcompat import bits_generator, threefry2x32_p, threefry_prng_impl
+from crazysim.engine.jaxcompat import bits_generator, threefry2x32_p, threefry_prng_impl
 
 GOLDEN_STRIDE = np.uint32(0x9E3779B9)
 """2^32 divided by the golden ratio: its multiples modulo 2^32 are evenly distributed."""

@@ -17,9 +17,9 @@ from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import FLOOR_HEIGHT, INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import Stage, StageScope, is_tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import n_batch_axes, scopes, select_worlds
+from crazysim.engine.pytree import n_batch_axes, scopes, select_worlds
+from crazysim.engine.stage import Stage, StageScope, is_tick
 
 
 def _built_in_stage(

@@ -22,7 +22,7 @@ from crazysim.dynamics.rotor import (
     rotor_vel_of_thrust,
 )
 from crazysim.eager import jit_eager_calls
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import along_z
 
 

@@ -23,7 +23,7 @@ from crazysim.drones import Airframe
 from crazysim.drones.keys import TABLES
 from crazysim.dynamics.drag import body_drag_force
 from crazysim.dynamics.models import BodyParams, Dynamics, require_support
-from crazysim.pytree import leaf
+from crazysim.engine.pytree import leaf
 from crazysim.rotation import along_z, matvec
 
 MIN_FITTED_COSINE = math.cos(math.radians(80))

@@ -13,8 +13,8 @@ from jax import Array
 
 from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.engine.pytree import PyTree, as_parameter, leaf, static
 from crazysim.errors import ConfigError, UnknownNameError, require
-from crazysim.pytree import PyTree, as_parameter, leaf, static
 
 MAX_LAG_STEP = 1.5
 """Largest ratio of the time step to the time constant of a lag. Euler steps diverge at a ratio of 2; at 1.5, a lag

@@ -1,7 +1,56 @@
-"""Execution of a step: one description of the physics, several ways to run it."""
+"""The compiler: records with scopes and stages in, kernels out. It knows no drones.
 
-from crazysim.engine.plan import ENGINES
-from crazysim.engine.step import Step
-from crazysim.engine.tools.explain import explain
+A `PyTree` declares for each leaf which axes it has, a `stage` for whom it is written; a `Record` names the clock and
+the population in lanes. `Step` runs stages on a record, and `explain` says how.
+"""
 
-__all__ = ["ENGINES", "Step", "explain"]
+from typing import TYPE_CHECKING
+
+from crazysim.startup import lazy_getattr
+
+if TYPE_CHECKING:
+    from crazysim.engine.pair_reductions import reduce_over_others
+    from crazysim.engine.plan import ENGINES
+    from crazysim.engine.pytree import Members, PyTree, leaf, scopes, static
+    from crazysim.engine.record import Record
+    from crazysim.engine.sharding import shard, world_mesh
+    from crazysim.engine.stage import Stage, stage
+    from crazysim.engine.step import Step
+    from crazysim.engine.tools.explain import explain
+
+__all__ = [
+    "ENGINES",
+    "Members",
+    "PyTree",
+    "Record",
+    "Stage",
+    "Step",
+    "explain",
+    "leaf",
+    "reduce_over_others",
+    "scopes",
+    "shard",
+    "stage",
+    "static",
+    "world_mesh",
+]
+
+__getattr__ = lazy_getattr(
+    __name__,
+    {
+        "ENGINES": "crazysim.engine.plan",
+        "Members": "crazysim.engine.pytree",
+        "PyTree": "crazysim.engine.pytree",
+        "Record": "crazysim.engine.record",
+        "Stage": "crazysim.engine.stage",
+        "Step": "crazysim.engine.step",
+        "explain": "crazysim.engine.tools.explain",
+        "leaf": "crazysim.engine.pytree",
+        "reduce_over_others": "crazysim.engine.pair_reductions",
+        "scopes": "crazysim.engine.pytree",
+        "shard": "crazysim.engine.sharding",
+        "stage": "crazysim.engine.stage",
+        "static": "crazysim.engine.pytree",
+        "world_mesh": "crazysim.engine.sharding",
+    },
+)

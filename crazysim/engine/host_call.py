@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends.fused import Kernels
 
 ALIGNMENT_BYTES = 64

@@ -11,8 +11,7 @@ import numpy as np
 from jax import Array
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
-from crazysim import jaxcompat
-from crazysim.core.sharding import Location
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.kernel import write_results
 from crazysim.engine.backends.native import Launch
@@ -20,6 +19,7 @@ from crazysim.engine.backends.platforms import TARGETS, compile_kernel, launch_p
 from crazysim.engine.backends.source import Writer, require_block_source, type_name
 from crazysim.engine.ir.blocks import Block, prune
 from crazysim.engine.lowering.jaxprs import Lowering, TableRows, as_elements
+from crazysim.engine.sharding import Location
 
 Function = Callable[..., Sequence[Array]]
 """``fn(index, *tables)`` returns single numbers for an index, int32 (). It may read tables only by ``table_row``."""

@@ -27,9 +27,6 @@ import jax
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from crazysim.core.record import Record, Roles
-from crazysim.core.sharding import Location
-from crazysim.core.stage import Stage
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.host_call import HostCall, is_host_call_possible
@@ -40,8 +37,11 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
 from crazysim.engine.passes.layout import PackedRows, packed_rows
+from crazysim.engine.pytree import leaf_indices, n_batch_axes, replace_leaves, scopes
+from crazysim.engine.record import Record, Roles
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.pytree import leaf_indices, n_batch_axes, replace_leaves, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
 """Values of ``engine=``. ``interpret`` runs programs in NumPy: it is slow, has no derivatives, and serves debugging."""

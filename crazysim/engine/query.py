@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.core.record import Record, Roles
-from crazysim.core.sharding import Location
-from crazysim.core.stage import Axes, Stage
 from crazysim.engine.backends import fused
 from crazysim.engine.lowering.relative import adapt_to_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.pytree import leaf, replace_leaves
+from crazysim.engine.pytree import leaf, replace_leaves
+from crazysim.engine.record import Record, Roles
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import Axes, Stage
 
 Query = tuple[Literal["drone", "world"], Callable[[Any], Any]]
 """Scope of a function, and the function. A function of one drone returns any tree of arrays. A function of one world

@@ -13,19 +13,19 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim import jaxcompat
-from crazysim.cache import keep_programs
-from crazysim.core.record import MAX_STEPS, Record, Roles
-from crazysim.core.sharding import WORLD_AXIS, Location, find_location
-from crazysim.core.stage import Axes, Stage, as_stages
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import fused
+from crazysim.engine.cache import keep_programs
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.lowering.relative import view_leaves
 from crazysim.engine.plan import ENGINES, Plan, Planner, SeparateLeaves
+from crazysim.engine.pytree import lazy_record, leaf_flags, replace_leaves
+from crazysim.engine.record import MAX_STEPS, Record, Roles
+from crazysim.engine.sharding import WORLD_AXIS, Location, find_location
+from crazysim.engine.stage import Axes, Stage, as_stages
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import lazy_record, leaf_flags, replace_leaves
 
 T = TypeVar("T", bound=Record)
 

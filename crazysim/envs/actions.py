@@ -14,8 +14,8 @@ from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.eager import fetch_rows
+from crazysim.engine.pytree import scopes
 from crazysim.errors import ConfigError, require
-from crazysim.pytree import scopes
 from crazysim.rotation import clip
 
 MAX_TILT = np.pi / 4

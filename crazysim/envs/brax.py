@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from crazysim.arguments import check_arguments, check_array
+from crazysim.engine.pytree import PyTree
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import expect, require
-from crazysim.pytree import PyTree
 
 
 class State(PyTree):

@@ -17,9 +17,11 @@ from crazysim.arguments import check_flag
 from crazysim.core.data import SimCore, SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive_integer
-from crazysim.core.sharding import put_on_device, shard, use_device_of
-from crazysim.core.stage import vmap_worlds
 from crazysim.eager import is_traced
+from crazysim.engine.jaxcompat import require_unforked_process
+from crazysim.engine.pytree import leaf_indices
+from crazysim.engine.sharding import put_on_device, shard, use_device_of
+from crazysim.engine.stage import vmap_worlds
 from crazysim.engine.step import FlatData, Step
 from crazysim.engine.tools.explain import explain
 from crazysim.envs.actions import Actions, actions_of
@@ -32,8 +34,6 @@ from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState, state_
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError, expect, require
-from crazysim.jaxcompat import require_unforked_process
-from crazysim.pytree import leaf_indices
 from crazysim.sim.configuration import describe_data
 from crazysim.sim.sim import Sim
 

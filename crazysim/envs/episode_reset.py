@@ -12,10 +12,10 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.population import populations
-from crazysim.core.sharding import fetch_arrays
-from crazysim.core.stage import Axes, Stage, world_function
 from crazysim.core.stages import reset
-from crazysim.pytree import has_members, leaf_indices, map_batched, n_batch_axes, n_world_axes, scopes
+from crazysim.engine.pytree import has_members, leaf_indices, map_batched, n_batch_axes, n_world_axes, scopes
+from crazysim.engine.sharding import fetch_arrays
+from crazysim.engine.stage import Axes, Stage, world_function
 from crazysim.scene.object_poses import moving_plugins
 from crazysim.sim.sim import Sim
 

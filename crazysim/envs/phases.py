@@ -19,8 +19,9 @@ from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
-from crazysim.core.record import nonfinite_worlds
-from crazysim.core.stage import Phase, Stage, vmap_worlds
+from crazysim.engine.pytree import map_batched, select_worlds
+from crazysim.engine.record import nonfinite_worlds
+from crazysim.engine.stage import Phase, Stage, vmap_worlds
 from crazysim.envs.actions import Actions
 from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
@@ -29,7 +30,6 @@ from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, EnvState, Obs
 from crazysim.envs.task import Task, sum_terms
 from crazysim.errors import ConfigError, require
-from crazysim.pytree import map_batched, select_worlds
 
 Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
 """``vectorize(fn, batched)``: the function that a phase calls. This is ``fn`` itself if the phase runs in one world or

@@ -17,7 +17,7 @@ from collections.abc import Container
 from pathlib import Path
 from types import ModuleType
 
-from crazysim.cache import caches_folder
+from crazysim.engine.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, require
 from crazysim.storage import MAX_TEXT_BYTES, make_private_folder, open_file, untrusted_reason

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.arguments import check_arguments
-from crazysim.core.record import MAX_STEPS
 from crazysim.core.settings import positive_integer
+from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.pytree import PyTree, select_worlds
+from crazysim.engine.record import MAX_STEPS
 from crazysim.engine.step import FlatData, scan
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import ConfigError, expect, require
-from crazysim.jaxcompat import is_key
-from crazysim.pytree import PyTree, select_worlds
 
 Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
 """``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once. ``memory`` is the state that the

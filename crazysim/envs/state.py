@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.settings import is_real
 from crazysim.eager import is_traced
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.envs.actions import Actions
 from crazysim.errors import ConfigError, require, short_repr
-from crazysim.pytree import PyTree, leaf
 from crazysim.tables import read_numbers
 
 ENV_RECORD_NAME = "environment"

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.engine.pytree import PyTree, leaf, static
 
 CLIP, EPSILON = 10.0, 1e-6
 """Largest magnitude of a normalised observation, and the number that is added to a variance before its square root."""

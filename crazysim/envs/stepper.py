@@ -12,15 +12,15 @@ from jax import Array
 from jax.sharding import NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
-from crazysim import jaxcompat
-from crazysim.cache import keep_programs
-from crazysim.core.sharding import WORLD_AXIS
+from crazysim.engine import jaxcompat
+from crazysim.engine.cache import keep_programs
+from crazysim.engine.pytree import replace_leaves
+from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
 from crazysim.envs.state import ENV_RECORD_NAME, RESULT_FIELDS, EnvState
 from crazysim.envs.task_check import require_finite_start
 from crazysim.errors import require
-from crazysim.pytree import replace_leaves
 
 Output = Callable[[EnvState], Any]
 """``output(state)``: the tree of arrays that a call returns, from the state after a step."""

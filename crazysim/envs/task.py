@@ -11,10 +11,10 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.settings import check_settings, setting
+from crazysim.engine.pytree import PyTree
 from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.image_sensor import ImageSensor
-from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
 MAX_SECONDS = 1e5

@@ -13,12 +13,12 @@ from jax.tree_util import GetAttrKey, keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
-from crazysim.core.sharding import fetch_arrays
 from crazysim.eager import explain_traced_values
+from crazysim.engine.pytree import n_world_axes, scopes, watched_flags
+from crazysim.engine.sharding import fetch_arrays
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import n_world_axes, scopes, watched_flags
 from crazysim.sim.sim import Sim
 
 GUIDE = "docs/guides/tasks.md"

@@ -13,8 +13,9 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.arguments import check_arguments, check_flag
-from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_mask, enum_member, positive_integer
+from crazysim.engine.cache import announce_if_slow
+from crazysim.engine.jaxcompat import require_unforked_process
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
@@ -23,7 +24,6 @@ from crazysim.envs.state import NO_EPISODE, EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError, require, short_repr
-from crazysim.jaxcompat import require_unforked_process
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):

@@ -20,12 +20,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.engine.jaxcompat import fori_loop
 from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.support import segment_support_point
 from crazysim.geometry.triangle import closest_point, closest_point_off_bc, from_barycentric
 from crazysim.geometry.vector import Vector, axis_vector, normalize, rounding_margin, select_vector, stack_vectors
-from crazysim.jaxcompat import fori_loop
 
 BestDirection = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""

@@ -14,12 +14,12 @@ import math
 import jax.numpy as jnp
 from jax import Array, lax
 
+from crazysim.engine.jaxcompat import fori_loop
 from crazysim.geometry.convex import BestDirection, ShapePair, find_separation, larger_gap
 from crazysim.geometry.points import ellipsoid_normal
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import MIN_SQUARED_SINE
 from crazysim.geometry.vector import Vector, axis_vector, normalize, select_vector, stack_vectors, to_vector
-from crazysim.jaxcompat import fori_loop
 
 SEPARATION_STEPS = 16
 """Number of steps towards the nearest points of separated shapes; curved shapes need more than polytopes."""

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from crazysim.engine.jaxcompat import fori_loop
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import closest_point, from_barycentric
 from crazysim.geometry.vector import Vector, to_vector
-from crazysim.jaxcompat import fori_loop
 from crazysim.rotation import clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12

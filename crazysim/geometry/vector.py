@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.pytree import PyTree
+from crazysim.engine.pytree import PyTree
 
 
 class Vector(PyTree):

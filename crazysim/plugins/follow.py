@@ -18,8 +18,8 @@ from crazysim.core.functional import stage_command
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, derived, param
 from crazysim.core.settings import setting
 from crazysim.core.stages import is_tick
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import device_array
 from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 MIN_SLOT_DEGREE = 7

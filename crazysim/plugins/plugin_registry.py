@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.cache import keep_programs
 from crazysim.core.data import Objects, SimData, object_names
 from crazysim.core.plugin import Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import collect_settings
-from crazysim.core.stage import Axes, vmap_drones, vmap_worlds
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.cache import keep_programs
+from crazysim.engine.pytree import PyTree, n_batch_axes, watched_flags
+from crazysim.engine.stage import Axes, vmap_drones, vmap_worlds
 from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.plugin_stages import PluginStages
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import PyTree, n_batch_axes, watched_flags
 
 P = TypeVar("P", bound=Plugin)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
-from crazysim.core.stage import Stage, is_first_step
+from crazysim.engine.stage import Stage, is_first_step
 from crazysim.errors import ConfigError
 
 

@@ -22,13 +22,13 @@ from crazysim import rotation
 from crazysim.arguments import check_flag
 from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData, require_states
-from crazysim.core.pair_reductions import reduce_over_others
+from crazysim.engine.pair_reductions import reduce_over_others
+from crazysim.engine.pytree import PyTree, static
 from crazysim.errors import ConfigError, expect, require
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import SizedShapes
 from crazysim.geometry.shapes import bounding_box
-from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.nearest_geom import nearest_geom

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_rgba, positive_integer
+from crazysim.engine.cache import announce_if_slow
 from crazysim.errors import ConfigError, require, short_repr
 from crazysim.scene.map_files import MapFile, read_map
 from crazysim.scene.primitives import DRONE_TOUCH_BITS

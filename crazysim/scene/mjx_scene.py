@@ -12,9 +12,9 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
-from crazysim.cache import announce_if_slow
-from crazysim.core.sharding import put_on_device, shard_scene
 from crazysim.eager import fetch_rows
+from crazysim.engine.cache import announce_if_slow
+from crazysim.engine.sharding import put_on_device, shard_scene
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.sync import Poses, sync_poses
 

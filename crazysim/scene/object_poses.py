@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.core.data import SimData, require_data
 from crazysim.core.plugin import BoundMethod, Plugin
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import ConfigError
 
 ListPlugins = Callable[[], Iterable[Plugin]]

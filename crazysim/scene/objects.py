@@ -18,8 +18,8 @@ from crazysim.arguments import check_flag
 from crazysim.core.data import Objects, SimData, require_data
 from crazysim.core.settings import as_mask, positive_integer
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
-from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000

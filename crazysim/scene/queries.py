@@ -12,8 +12,8 @@ import mujoco
 from jax import Array
 
 from crazysim.arguments import check_flag
-from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
+from crazysim.engine.cache import keep_programs
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.query import Query, query
 from crazysim.scene import contact_report

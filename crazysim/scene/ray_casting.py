@@ -15,16 +15,16 @@ from jax.sharding import Mesh
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.sharding import map_devices
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
 from crazysim.engine.index_map import map_indices
+from crazysim.engine.pytree import PyTree, static
+from crazysim.engine.sharding import map_devices
 from crazysim.errors import UnsupportedError
 from crazysim.geometry import Shape, ray_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
-from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 from crazysim.scene.first_hit import (
     IGNORES_NONE,

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError, not_installed, require
-from crazysim.pytree import PyTree
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import CarriedCamera, camera_pose
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies

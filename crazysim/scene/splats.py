@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim import rotation
 from crazysim.arguments import check_arguments
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError, require
-from crazysim.pytree import PyTree
 from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
 from crazysim.scene.maps import read_frame
 from crazysim.scene.objects import IDENTITY_QUAT

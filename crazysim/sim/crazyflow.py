@@ -11,8 +11,8 @@ from jax import Array
 
 from crazysim.core.controls import AttitudeControlData, BodyRateControlData, ForceTorqueControlData, StateControlData
 from crazysim.core.settings import as_mask
+from crazysim.engine.pytree import PyTree, n_batch_axes, scopes, select_worlds
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, n_batch_axes, scopes, select_worlds
 from crazysim.sim.sim import Sim
 
 Record = TypeVar("Record", bound=PyTree)

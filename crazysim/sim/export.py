@@ -13,14 +13,14 @@ from crazysim.arguments import check_arguments
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command, staged_leaves
-from crazysim.core.stage import Axes, as_stages, stage
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program, Slot, UnfusedStage
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
+from crazysim.engine.stage import Axes, as_stages, stage
 from crazysim.engine.tools import symbolic
 from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
-from crazysim.jaxcompat import is_key
 from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim import jaxcompat
 from crazysim.arguments import check_arguments, check_array
 from crazysim.control import Control
 from crazysim.core import functional as F
@@ -21,10 +20,11 @@ from crazysim.core.data import command_shape
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import is_on_host, jit_eager_calls
+from crazysim.engine import jaxcompat
+from crazysim.engine.jaxcompat import require_unforked_process
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError, UnknownNameError, require
-from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import PluginRegistry
-from crazysim.pytree import PyTree
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 StageCommand = Callable[[Array | NDArray, Array | NDArray | None], None]

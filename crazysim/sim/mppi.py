@@ -16,13 +16,13 @@ from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState, as_key
 from crazysim.core.functional import stage_command
 from crazysim.core.settings import largest_divisor, positive_integer
-from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
+from crazysim.engine.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 from crazysim.tables import read_floats
 

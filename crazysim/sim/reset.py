@@ -7,12 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from crazysim import jaxcompat
-from crazysim.cache import keep_programs
 from crazysim.core.data import SimData, require_data
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import Stage
+from crazysim.engine import jaxcompat
+from crazysim.engine.cache import keep_programs
+from crazysim.engine.stage import Stage
 from crazysim.errors import require
 
 

@@ -14,10 +14,10 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
 from crazysim.engine.host_call import HostLeaves
+from crazysim.engine.pytree import leaf_indices
 from crazysim.engine.step import FlatData, Step, scan
 from crazysim.errors import require
 from crazysim.progress import progress_bar
-from crazysim.pytree import leaf_indices
 
 Policy = Callable[[Any, SimData], Any]
 """Function from parameters and data to a command for every drone, (n_worlds, n_drones, k)."""

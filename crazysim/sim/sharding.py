@@ -1,5 +1,5 @@
 """Functions that distribute worlds over devices, under Crazyflow's import path."""
 
-from crazysim.core.sharding import shard, shardings_of, world_mesh
+from crazysim.engine.sharding import shard, shardings_of, world_mesh
 
 __all__ = ["shard", "shardings_of", "world_mesh"]

@@ -15,7 +15,6 @@ from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_arguments, check_flag
-from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
@@ -26,16 +25,17 @@ from crazysim.core.pipeline import BuiltPipeline, Pipeline
 from crazysim.core.plugin import Plugin, check_plugin_list
 from crazysim.core.random import seed_sim
 from crazysim.core.settings import positive_integer
-from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Step, explain
+from crazysim.engine.cache import keep_programs
+from crazysim.engine.jaxcompat import require_unforked_process
+from crazysim.engine.pytree import device_array
+from crazysim.engine.sharding import shard
 from crazysim.errors import ConfigError
-from crazysim.jaxcompat import require_unforked_process
 from crazysim.plugins.plugin_registry import P, PluginRegistry
-from crazysim.pytree import device_array
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contact_report import ContactReport, ObjectSelection
@@ -131,7 +131,7 @@ class Sim:
             device: Device of the data: a platform such as ``"cpu"`` or ``"gpu"``, or a device.
             xml_path: MJCF scene; None for floor, light and sky.
             rng_key: Seed, or a key.
-            mesh: Devices over which the worlds are distributed, from ``crazysim.core.sharding.world_mesh``.
+            mesh: Devices over which the worlds are distributed, from ``crazysim.engine.sharding.world_mesh``.
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` selects the fastest that
                 can run the step pipeline here, which ``explain`` names.
             strict: True to raise an error instead of using a slower engine with a warning.
@@ -528,7 +528,7 @@ class Sim:
         """Advance every world by a number of physics steps; any number uses the same compilation.
 
         Raises:
-            ConfigError: If a world would have taken more than ``crazysim.core.record.MAX_STEPS`` since its last reset.
+            ConfigError: If a world would have taken more than ``engine.record.MAX_STEPS`` since its last reset.
         """
         n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()

@@ -12,15 +12,15 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.cache import announce_if_slow
 from crazysim.core.data import SimData
 from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.record import MAX_STEPS
-from crazysim.core.sharding import put_on_device, shard
 from crazysim.eager import is_traced
+from crazysim.engine.cache import announce_if_slow
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.plan import Plan
+from crazysim.engine.record import MAX_STEPS
+from crazysim.engine.sharding import put_on_device, shard
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError, require
 from crazysim.sim.rollout import stage_flat

@@ -13,11 +13,11 @@ import optax
 from jax import Array
 from jax.sharding import NamedSharding, PartitionSpec
 
-from crazysim.core.sharding import WORLD_AXIS
+from crazysim.engine.pytree import PyTree
+from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policy, init_mlp
 from crazysim.train.optimizer import all_finite, build_optimizer

@@ -21,13 +21,13 @@ import optax
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.registry import entry_of
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, DivergedError, require, require_callable
-from crazysim.pytree import PyTree, static
 from crazysim.train.convolution import images_of
 from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters, check_seed

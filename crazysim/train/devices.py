@@ -12,7 +12,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.core.settings import find_device
-from crazysim.core.sharding import WORLD_AXIS, shardings_of, world_mesh
+from crazysim.engine.sharding import WORLD_AXIS, shardings_of, world_mesh
 from crazysim.errors import ConfigError, require
 from crazysim.sim.sim import Sim
 from crazysim.train.seeds import are_seeds_divided

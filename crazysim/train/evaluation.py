@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
-from crazysim.pytree import PyTree, static
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policies, Policy
 

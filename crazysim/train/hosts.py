@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 import crazysim
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.errors import ConfigError
 
 SETTINGS_TIMEOUT = 300

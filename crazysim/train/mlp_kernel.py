@@ -25,9 +25,9 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-from crazysim import jaxcompat
-from crazysim.core.sharding import WORLD_AXIS
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import cuda
+from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.train.networks import MEMORYLESS_NETWORK, ApplyLayers, Layers, Network, mlp
 from crazysim.train.seeds import are_seeds_divided
 

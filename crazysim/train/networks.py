@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.engine.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError, require, short_repr
-from crazysim.pytree import PyTree, float_dtype, select_worlds, static
 from crazysim.train.convolution import KERNEL_SIZE, Image, convolve, scale_depth
 from crazysim.train.interface import Interface, sizes_of, sizes_text
 from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.pytree import PyTree, static
 from crazysim.train.convolution import images_of
 from crazysim.train.critic import critic_input, critic_obs, policy_obs, rescale_value, return_std
 from crazysim.train.hyperparameters import check_hyperparameters

@@ -12,11 +12,11 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-from crazysim.core.sharding import WORLD_AXIS
+from crazysim.engine.pytree import PyTree, float_dtype, static
+from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs
-from crazysim.pytree import PyTree, float_dtype, static
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")

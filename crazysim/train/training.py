@@ -22,10 +22,10 @@ import numpy as np
 from jax import Array
 
 import crazysim
-from crazysim.cache import announce_if_slow, keep_programs
 from crazysim.core.settings import positive_integer
-from crazysim.core.sharding import distribute, fetch_arrays
 from crazysim.engine.backends.native import compiling_threads
+from crazysim.engine.cache import announce_if_slow, keep_programs
+from crazysim.engine.sharding import distribute, fetch_arrays
 from crazysim.envs.env import Env
 from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats

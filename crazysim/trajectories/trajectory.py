@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from crazysim.arguments import check_arguments, check_flag
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import PyTree, float_dtype, leaf
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.tables import read_floats
 from crazysim.trajectories.interpolation import unit_coefficients
 

@@ -14,7 +14,7 @@ from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, CFirmware, Control, Controller, firmware
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.engine.backends import native
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 WORLDS, DRONES = 3, 2

@@ -12,9 +12,9 @@ from crazysim import ConfigError, Latency, Sim, load_airframe, make
 from crazysim.control import INDI, PID, AirframeParams, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.control.mellinger import MellingerParams
 from crazysim.core import functional as F
-from crazysim.core.sharding import world_mesh
-from crazysim.core.stage import as_stages
-from crazysim.pytree import PyTree, leaf, replace_leaves
+from crazysim.engine.pytree import PyTree, leaf, replace_leaves
+from crazysim.engine.sharding import world_mesh
+from crazysim.engine.stage import as_stages
 
 WORLDS, DRONES = 3, 2
 

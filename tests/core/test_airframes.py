@@ -11,8 +11,8 @@ import crazysim as cs
 from crazysim import ConfigError, Sim, load_airframe
 from crazysim.core.airframes import create_per_drone
 from crazysim.dynamics import first_principles
+from crazysim.engine.pytree import check_axes
 from crazysim.errors import UnknownNameError
-from crazysim.pytree import check_axes
 
 FIRMWARE_PAIR = (HEXAROTOR, "cf2x_L250")
 MIXED_PAIR = ("bumblebee", HEXAROTOR)

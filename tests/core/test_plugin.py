@@ -36,8 +36,8 @@ from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin, Param, param, state
 from crazysim.core.settings import setting
-from crazysim.core.stage import is_first_step
 from crazysim.core.stages import first_principles_derivative
+from crazysim.engine.stage import is_first_step
 from crazysim.errors import UnknownNameError
 from crazysim.plugins.effects.grid import Grid
 from crazysim.plugins.estimators import Complementary

@@ -15,10 +15,10 @@ from crazysim import ConfigError, Sim, stage
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
-from crazysim.core.sharding import world_mesh
 from crazysim.engine import Step
+from crazysim.engine.pytree import PyTree, check_axes, leaf, scopes
+from crazysim.engine.sharding import world_mesh
 from crazysim.errors import EngineWarning, UnknownNameError
-from crazysim.pytree import PyTree, check_axes, leaf, scopes
 
 COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
 """Numbers of worlds, drones and members."""

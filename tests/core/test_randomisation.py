@@ -7,7 +7,7 @@ from cases import hover_command, hover_rotor_state, repeat_command, with_states
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
 from crazysim.core.random import drone_keys
-from crazysim.pytree import select_worlds
+from crazysim.engine.pytree import select_worlds
 
 N_WORLDS, N_DRONES, N_STEPS = 3, 2, 100
 DURATION = N_STEPS / 500

@@ -9,8 +9,8 @@ import pytest
 
 from crazysim import PyTree, Sim, leaf
 from crazysim.core.pipeline import insert_fn_before
+from crazysim.engine.pytree import scopes
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
 from crazysim.utils import CORE_NDIM_KEY
 
 N_WORLDS, N_DRONES = 3, 2

@@ -12,8 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim.core.sharding import Location
-from crazysim.core.stage import Axes, as_stages
 from crazysim.engine import Step
 from crazysim.engine.backends import Build, fused, interpret, lanes
 from crazysim.engine.ir import listing
@@ -21,6 +19,8 @@ from crazysim.engine.ir.blocks import Block, Operation, Value
 from crazysim.engine.ir.program import Leaf, Program
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import Axes, as_stages
 
 TOLERANCE = 1e-5
 """Largest difference that may be due to rounding, relative to the largest component of a drone's vector."""

@@ -41,13 +41,13 @@ from programs import Program, draw_program, evaluate, prune_program
 from rounding import allow_gpu_results, are_within_rounding, is_close, keeps_sign_of_zero
 
 from crazysim import Sim
-from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.engine import Step
 from crazysim.engine.backends import fused
 from crazysim.engine.backends.source import require_block_source
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lowering.stages import lower_stages
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.stage import Stage, as_stages, stage
 
 N_WORLDS, N_DRONES = 36, 2
 COMPARED_ENGINES = ("lanes", "interpret", "fused")

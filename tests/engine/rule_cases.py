@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim.core.branches import any_lane, compute_where
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
 N_LANES = N_WORLDS * N_DRONES

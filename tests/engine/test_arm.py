@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cases import needs_compiler
 
-from crazysim import Sim, jaxcompat
-from crazysim.engine import Step
+from crazysim import Sim
+from crazysim.engine import Step, jaxcompat
 from crazysim.engine.backends import kernel, native
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"

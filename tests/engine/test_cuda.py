@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim import ConfigError, Downwash, FreeBodies, Kalman, Sim, jaxcompat
-from crazysim.engine import Step, explain
+from crazysim import ConfigError, Downwash, FreeBodies, Kalman, Sim
+from crazysim.engine import Step, explain, jaxcompat
 from crazysim.engine.backends import cuda, kernel, native
 from crazysim.engine.backends.exchange import make_exchange
 from crazysim.engine.backends.source import Writer

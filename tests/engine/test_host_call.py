@@ -11,7 +11,7 @@ import pytest
 from cases import leaf_on_host, needs_compiler, trees_equal, with_states
 
 from crazysim import Cars, Downwash, Sim
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 
 pytestmark = needs_compiler
 

@@ -8,8 +8,8 @@ from fuzz import Case, Fuzzer
 from programs import Program
 
 from crazysim import PyTree, Sim, leaf
-from crazysim.core.stage import stage
 from crazysim.engine import Step
+from crazysim.engine.stage import stage
 from crazysim.errors import EngineWarning
 
 

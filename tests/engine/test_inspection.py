@@ -8,13 +8,13 @@ from blocks import make_program
 from cases import shared_sim, with_states
 from differences import first_difference
 
-from crazysim.core.stage import stage
 from crazysim.engine.backends import source
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import dump, listing, ops
 from crazysim.engine.ir.blocks import Builder
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
+from crazysim.engine.stage import stage
 
 F = np.float32
 
@@ -63,7 +63,7 @@ def test_a_packed_number_keeps_the_name_of_its_field(data):
 
 
 def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data):
-    from crazysim.core.stage import as_stages
+    from crazysim.engine.stage import as_stages
 
     text = listing.list_program(optimise(lower_stages(as_stages({"follow": follow, "mine": undeclared_stage}), data)))
     assert "states.force[0] of drone 1 = " in text

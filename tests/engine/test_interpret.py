@@ -7,14 +7,14 @@ import pytest
 from cases import shared_sim
 
 from crazysim import Sim
-from crazysim.core.sharding import Location
-from crazysim.core.stage import as_stages, stage
 from crazysim.engine.backends import fused, interpret, lanes, native
 from crazysim.engine.ir.program import Segment
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import as_stages, stage
 
 SCALAR = jax.ShapeDtypeStruct((), np.float32)
 

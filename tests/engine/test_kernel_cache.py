@@ -23,7 +23,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """Return an empty folder as JAX's compilation cache; no folder has been refused or swept before."""
-    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path))
     kernel_cache._warn_once.cache_clear()
     kernel_cache._remove_abandoned_files_once.cache_clear()
     return tmp_path

@@ -16,9 +16,9 @@ import pytest
 from cases import shared_sim
 from waiting import wait_for
 
-from crazysim.cache import default_folder
 from crazysim.engine import Step
 from crazysim.engine.backends import fused, kernel, kernel_cache, native
+from crazysim.engine.cache import default_folder
 from crazysim.engine.errors import KernelError
 from crazysim.errors import ConfigError
 from crazysim.sim import Sim
@@ -40,7 +40,7 @@ def cache_folder(tmp_path, monkeypatch):
     """Return an empty folder of kernels, with no kernel loaded."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(native, "_LIBRARIES", {})
-    monkeypatch.setattr("crazysim.jaxcompat.register_target", lambda name, function, platform: None)
+    monkeypatch.setattr("crazysim.engine.jaxcompat.register_target", lambda name, function, platform: None)
     native.toolchain.cache_clear()
     yield tmp_path
     native.toolchain.cache_clear()
@@ -97,7 +97,7 @@ def test_the_key_holds_machine_compiler_and_versions(source, cache_folder, compi
     install_fake_compiler(folder, monkeypatch)
     info = folder / "cpuinfo"
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx512f\n")
-    monkeypatch.setattr("crazysim.cache.CPU_INFO", info)
+    monkeypatch.setattr("crazysim.engine.cache.CPU_INFO", info)
     assert_new_name("another CPU")
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2\n")
     assert_new_name("a CPU with fewer features")
@@ -107,7 +107,7 @@ def test_the_key_holds_machine_compiler_and_versions(source, cache_folder, compi
     assert_new_name("other options")
     monkeypatch.setattr(native, "__version__", "99.0")
     assert_new_name("another version of this package")
-    monkeypatch.setattr("crazysim.jaxcompat.versions", lambda: "99.0")
+    monkeypatch.setattr("crazysim.engine.jaxcompat.versions", lambda: "99.0")
     assert_new_name("another JAX")
     monkeypatch.setattr(native.platform, "libc_ver", lambda: ("glibc", "9.9"))
     assert_new_name("another C library")
@@ -120,7 +120,7 @@ def test_kernels_in_an_image_that_was_built_on_another_machine_are_not_used(
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "cpuinfo").write_text("flags : fpu sse2 avx2 avx512f amx_tile\n")
     with monkeypatch.context() as elsewhere:
-        elsewhere.setattr("crazysim.cache.CPU_INFO", folder / "cpuinfo")
+        elsewhere.setattr("crazysim.engine.cache.CPU_INFO", folder / "cpuinfo")
         key = register_anew(source).removeprefix("crazysim_advance_")
     (library,) = cache_folder.iterdir()
     library.unlink()
@@ -221,11 +221,11 @@ def test_nothing_partial_is_ever_seen(source, cache_folder, monkeypatch, tmp_pat
 
 def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
     assert kernel_cache.folder() == kernel_cache.temporary_folder()
-    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path))
     assert kernel_cache.folder() == tmp_path / "crazysim"
-    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: None)
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: None)
     monkeypatch.setenv("CRAZYSIM_CACHE", "off")
     assert kernel_cache.folder() == kernel_cache.temporary_folder()
     monkeypatch.setenv("CRAZYSIM_CACHE", str(tmp_path / "kept"))
@@ -435,7 +435,7 @@ def test_machines_that_share_a_home_never_call_kernels_of_each_other(tmp_path):
     """
     other = tmp_path / "cpuinfo"
     other.write_text("flags : none of the first machine's\n")
-    swap = f"import pathlib, crazysim.cache as c; c.CPU_INFO = pathlib.Path({str(other)!r})\n"
+    swap = f"import pathlib, crazysim.engine.cache as c; c.CPU_INFO = pathlib.Path({str(other)!r})\n"
     speeds, files = [], []
     for prefix in ("", swap, ""):
         done = subprocess.run(

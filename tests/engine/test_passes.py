@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim.core.stage import as_stages, stage
 from crazysim.engine.backends import interpret
 from crazysim.engine.ir.blocks import Builder, Operation, Value
 from crazysim.engine.ir.program import Leaf, Program, Segment
 from crazysim.engine.ir.verify import VerificationError, verify
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import apply_passes
 from crazysim.engine.passes import schedule
-from crazysim.jaxcompat import is_key
+from crazysim.engine.stage import as_stages, stage
 
 N_WORLDS = 5
 F32 = np.float32

@@ -13,13 +13,13 @@ from waiting import wait_for
 
 from crazysim import ConfigError, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
-from crazysim.core.stage import Stage, stage
 from crazysim.engine import Step, explain
 from crazysim.engine.backends import lanes, native
 from crazysim.engine.lowering import tracing
 from crazysim.engine.lowering.jaxprs import RULES
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.stage import Stage, stage
 from crazysim.errors import EngineWarning
-from crazysim.pytree import PyTree, leaf
 
 
 @stage("drone")

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.core.record import Record, Roles, nonfinite_worlds
-from crazysim.core.stage import stage
 from crazysim.engine import Step, explain
+from crazysim.engine.pytree import Members, check_axes, leaf, leaf_indices
+from crazysim.engine.record import Record, Roles, nonfinite_worlds
+from crazysim.engine.stage import stage
 from crazysim.errors import ConfigError
-from crazysim.pytree import Members, check_axes, leaf, leaf_indices
 
 DT, GRAVITY = 0.01, 9.81
 ENGINES = ("plain", "lanes", "fused", "interpret")

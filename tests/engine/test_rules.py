@@ -19,14 +19,14 @@ from rule_cases import (
 )
 
 from crazysim import Sim
-from crazysim.core.sharding import Location
-from crazysim.core.stage import as_stages, stage
 from crazysim.engine import Step
 from crazysim.engine.backends import interpret, native
 from crazysim.engine.backends.fused import build
 from crazysim.engine.ir.verify import verify_block
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import as_stages, stage
 from crazysim.errors import EngineWarning
 
 

@@ -22,13 +22,13 @@ from crazysim.control import Control, command_size
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.random import drone_key
-from crazysim.core.sharding import put_on_device
-from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, explain
 from crazysim.engine.backends import cuda, kernel, lanes, native
 from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.sharding import put_on_device
+from crazysim.engine.stage import stage
 from crazysim.sim import rollout
 
 SLOW_CONTROL_SETTINGS = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}

@@ -9,7 +9,6 @@ import pytest
 from cases import COMPILED_ENGINES
 
 from crazysim import PyTree, Sim, leaf, stage
-from crazysim.core.stage import as_stages
 from crazysim.engine import Step
 from crazysim.engine.backends import cuda, interpret, kernel
 from crazysim.engine.ir.blocks import Builder, Operation, TableEntries, Value
@@ -17,6 +16,7 @@ from crazysim.engine.ir.listing import list_program
 from crazysim.engine.ir.verify import VerificationError, verify, verify_block
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
+from crazysim.engine.stage import as_stages
 from crazysim.errors import EngineWarning
 
 ENGINES = ("interpret", *COMPILED_ENGINES)

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.core.sharding import Location
 from crazysim.engine.backends import cuda, fused, interpret, kernel, lanes, native, source
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Builder
 from crazysim.engine.ir.program import Leaf, Program, Segment
+from crazysim.engine.sharding import Location
 from crazysim.engine.tools import symbolic
 
 FLOATS = [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 0.49999997, 1.5, 2.5, -2.5, 1e-3, 3.7, -7.2, 88.0, 1e4, 2.0**31, -(2.0**31),

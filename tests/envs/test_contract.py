@@ -26,12 +26,12 @@ from gymnasium.vector.utils import batch_space
 from crazysim import ConfigError
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import cuda
+from crazysim.engine.pytree import map_batched
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, Task, make
 from crazysim.envs.phases import vectorize_over_worlds
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState
 from crazysim.envs.tasks.hover import Hover
-from crazysim.pytree import map_batched
 
 N_WORLDS = 4
 N_FLYING, N_STEPS = 32, 1250

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 from crazysim.envs import ActionDelay, AutoReset, EpisodeStatistics, ObservationNoise, make
 from crazysim.train.devices import exchanged_bytes
 

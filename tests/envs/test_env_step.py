@@ -10,13 +10,13 @@ import pytest
 import crazysim.envs as envs
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
-from crazysim.core.sharding import world_mesh
-from crazysim.core.stage import vmap_worlds
 from crazysim.engine.backends import fused
+from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, leaf
+from crazysim.engine.sharding import world_mesh
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, EngineWarning
-from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
 from crazysim.sim import rollout
 
 pytestmark = pytest.mark.skipif(fused.unavailable_reason("cpu") is not None, reason="there is no C++ compiler")

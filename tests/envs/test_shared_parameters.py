@@ -11,8 +11,8 @@ from cases import build_stagewise_step, with_params
 import crazysim.envs as envs
 from crazysim import ConfigError, SlungLoad
 from crazysim.core.functional import stage_command
+from crazysim.engine.pytree import scopes
 from crazysim.envs.tasks.hover import Hover
-from crazysim.pytree import scopes
 
 N_WORLDS, N_DRAWS = 3, 4
 TILTED = np.array([3.0, 0.0, -9.81], np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, Wind
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import AutoReset, DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import episode_key, scale_symmetric, scale_to
 from crazysim.envs.task import sum_terms

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.avoid import CELL_JITTER, CELL_WIDTH, HEIGHT, Avoid
 

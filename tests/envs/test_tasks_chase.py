@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import make
 
 CONTACT_HEIGHT = 0.066

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import make
 from crazysim.envs.tasks.deliver import MIN_HEIGHT, ring_motion, ring_positions
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, PrivilegedObservation, make
 from crazysim.envs.tasks.follow_car import FOLLOW_DISTANCE, FOLLOW_HEIGHT, MAX_DISTANCE, MIN_HEIGHT, FollowCar
 from crazysim.train.evaluation import evaluate

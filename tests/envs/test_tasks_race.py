@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, Sim
 from crazysim.core.random import world_keys
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks import race as task
 from crazysim.envs.tasks import race_rules as rules

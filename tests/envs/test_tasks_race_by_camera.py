@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, rotation
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import PrivilegedObservation, make
 from crazysim.envs.tasks.race_by_camera import AWAY_COST, RaceByCamera
 from crazysim.envs.tracks import Track

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.pytree import PyTree
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.transport import Transport, gate_axis, is_behind
-from crazysim.pytree import PyTree
 from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, LENGTH = 512, 0.3

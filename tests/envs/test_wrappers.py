@@ -8,7 +8,7 @@ from cases import leaf_on_host, trees_equal
 from env_cases import random_action, select_state, set_last_step
 
 from crazysim import ConfigError
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import (
     ActionDelay,
     AutoReset,

@@ -12,7 +12,7 @@ from cases import PAIRS, with_airframes
 from crazysim import Sim, load_airframe
 from crazysim.core.integration import apply_derivative
 from crazysim.core.pipeline import replace_fn
-from crazysim.core.stage import stage
+from crazysim.engine.stage import stage
 
 FOLDER = Path(__file__).parent
 FILES = sorted(path.stem for path in FOLDER.glob("*.npz"))

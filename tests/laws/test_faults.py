@@ -25,7 +25,7 @@ from cases import (
 
 from crazysim import ConfigError, PyTree, Sim, leaf
 from crazysim.core.integration import FLOOR_HEIGHT
-from crazysim.pytree import n_batch_axes, scopes
+from crazysim.engine.pytree import n_batch_axes, scopes
 
 
 @functools.cache

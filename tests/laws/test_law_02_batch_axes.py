@@ -11,7 +11,7 @@ from cases import LEVELS, PAIRS, count_documented_arrays, shared_sim, with_param
 from crazysim import ConfigError, Control, Sim
 from crazysim.core.data import SimData
 from crazysim.engine import Step
-from crazysim.pytree import scopes
+from crazysim.engine.pytree import scopes
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
 EQUAL_SIZES, UNEQUAL_SIZES = ([size for size in SIZES if (size[0] == size[1]) == same] for same in (True, False))

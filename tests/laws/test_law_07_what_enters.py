@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from crazysim import IMU, Battery, Cars, ConfigError, MotionCapture, RangeFinder, Sim, SlungLoad, Wind
 from crazysim.core.plugin import Plugin
+from crazysim.engine.pytree import PyTree, host_array, leaf, scopes
 from crazysim.envs import ActionDelay, AutoReset, EpisodeStatistics, FrameStack, ObservationNoise, make
-from crazysim.pytree import PyTree, host_array, leaf, scopes
 
 WORLDS = np.array([0, 2])
 """Worlds that stay as they are; world 1 is the bad one."""

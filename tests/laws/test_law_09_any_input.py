@@ -144,7 +144,7 @@ CALLS = {
     "sim.add": (lambda plugin, name: Sim().add(plugin, name), {"plugin": Wind(), "name": "breeze"}),
     "sim.remove": (lambda plugin: Sim(plugins=[Wind()]).remove(plugin), {"plugin": "wind"}),
     "sim.replace": (lambda plugin: Sim(plugins=[Wind()]).replace(plugin), {"plugin": Wind((1, 0, 0))}),
-    "sim.shard": (lambda mesh: Sim(2).shard(mesh), {"mesh": crazysim.core.sharding.world_mesh(jax.devices()[:2])}),
+    "sim.shard": (lambda mesh: Sim(2).shard(mesh), {"mesh": crazysim.engine.sharding.world_mesh(jax.devices()[:2])}),
     "sim.data": (lambda value: setattr(sim(), "data", value), {"value": Lazy(lambda: sim().data)}),
     "sim.default_data": (lambda value: setattr(sim(), "default_data", value), {"value": Lazy(lambda: sim().data)}),
     "sim[name]": (lambda name: sim()[name], {"name": "Crazyflie_0"}),

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from crazysim import ConfigError
 from crazysim.core import functional as F
 from crazysim.core.data import STATE_SIZES
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 from crazysim.envs import AutoReset, DroneVectorEnv, make, rollout
 from crazysim.envs.state import EnvState
 

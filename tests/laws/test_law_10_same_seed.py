@@ -9,8 +9,8 @@ from cases import leaf_on_host
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
 from crazysim.core.random import drone_keys, world_keys
-from crazysim.core.sharding import world_mesh
-from crazysim.pytree import select_worlds
+from crazysim.engine.pytree import select_worlds
+from crazysim.engine.sharding import world_mesh
 
 
 def randomise_mass(data, default_data, mask=None):

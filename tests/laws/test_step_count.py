@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.record import MAX_STEPS
+from crazysim.engine.record import MAX_STEPS
 from crazysim.envs import AutoReset, DroneEnv, rollout
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.vector import make_vector

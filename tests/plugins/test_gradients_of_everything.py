@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import Battery, Downwash, GroundEffect, Latency, RangeFinder, Sim, Wind
-from crazysim.core.stage import as_stages
+from crazysim.engine.stage import as_stages
 from crazysim.plugins import sensors
 from crazysim.plugins.estimators import ESKF, Kalman
 from crazysim.plugins.sensors import IMU, UWB, MotionCapture, OpticalFlow, TimeOfFlight, Triad

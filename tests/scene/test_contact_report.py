@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, ContactLog, Sim
-from crazysim.core.stage import stage
 from crazysim.engine import Step
+from crazysim.engine.stage import stage
 from crazysim.scene.contact_report import DRONES_PER_CHUNK
 from crazysim.sim.sim import use_box_collision
 

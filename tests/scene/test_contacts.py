@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
 

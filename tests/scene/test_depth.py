@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
-from crazysim.core.stage import vmap_worlds
 from crazysim.engine.backends import native
+from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import EngineWarning
 from crazysim.scene.depth import pixel_directions
 
@@ -369,7 +369,7 @@ def mixed_scene():
 
 def cast_functions(sim, own):
     """Return functions from data and rays to hits: by a kernel, by XLA, and for each world as in a stage."""
-    from crazysim.core.stage import Axes
+    from crazysim.engine.stage import Axes
     from crazysim.scene.ray_casting import RayKernels, cast_rays
 
     model = sim.scene.collision_model

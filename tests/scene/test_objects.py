@@ -8,7 +8,7 @@ import pytest
 from pictures import encode_png
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import stage
+from crazysim.engine.stage import stage
 from crazysim.scene import build
 from crazysim.scene.objects import PRIMITIVES
 

@@ -9,7 +9,7 @@ from cases import INTEGRATORS, PAIRS, build_stagewise_step, hover_command, hover
 from crazysim import Battery, ConfigError, Downwash, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
-from crazysim.core.stage import Axes, stage
+from crazysim.engine.stage import Axes, stage
 from crazysim.sim.export import STATES, to_casadi
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")

@@ -10,7 +10,7 @@ from cases import shared_sim, trees_equal
 
 from crazysim import Sim
 from crazysim.core import functional as F
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 from crazysim.sim import stepper as stepper_module
 from crazysim.sim.stepper import Stepper
 

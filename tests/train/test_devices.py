@@ -11,7 +11,7 @@ from policies import steer
 
 from crazysim import ConfigError
 from crazysim.__main__ import main
-from crazysim.core.sharding import world_mesh
+from crazysim.engine.sharding import world_mesh
 from crazysim.envs import AutoReset, make
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train import config as configs

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.core.sharding import world_mesh
 from crazysim.engine.backends import cuda
+from crazysim.engine.sharding import world_mesh
 from crazysim.train import mlp_kernel
 from crazysim.train.mlp_kernel import CAPABILITY, INTRINSICS, DistributedMlp, apply_mlp, choose_mlp, cuda_source
 from crazysim.train.networks import MEMORYLESS_NETWORK, gru_network, init_mlp, mlp

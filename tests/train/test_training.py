@@ -21,11 +21,11 @@ from waiting import wait_for
 import crazysim
 from crazysim import ConfigError, Randomize
 from crazysim.__main__ import main
+from crazysim.engine.pytree import PyTree
 from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import DamagedFileError, DivergedError, UnknownNameError
-from crazysim.pytree import PyTree
 from crazysim.storage import write_figure
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 from jax import Array
 
-from crazysim.core.sharding import Location
 from crazysim.engine.ir.program import Program
+from crazysim.engine.sharding import Location
 
 Run = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
 """Function that takes the leaves of all worlds and a number of steps. It returns the written leaves after these steps,

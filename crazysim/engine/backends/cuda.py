@@ -23,7 +23,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import ffi_handlers, kernel_cache
 from crazysim.engine.backends.exchange import WARP_THREADS
 from crazysim.engine.backends.ffi_handlers import check_driver

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.cache import announce, announce_if_slow
-from crazysim.core.sharding import Location
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import Run, kernel, lanes, reverse
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
 from crazysim.engine.backends.reverse import ReverseProgram
+from crazysim.engine.cache import announce, announce_if_slow
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.lowering.tangents import add_tangents
+from crazysim.engine.sharding import Location
 from crazysim.errors import EngineWarning, warn
 
 Leaves = dict[int, Any]

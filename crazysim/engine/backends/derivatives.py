@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.cache import announce
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import Run, lanes
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
-from crazysim.pytree import replace_leaves
+from crazysim.engine.cache import announce
+from crazysim.engine.pytree import replace_leaves
 
 CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """A ``Run`` whose number of steps is an array."""

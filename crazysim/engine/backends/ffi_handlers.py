@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from ctypes import POINTER, c_char, c_char_p, c_int, c_int32, c_int64, c_size_t, c_uint32, c_void_p, cast
 from typing import Any
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.errors import KernelError
 
 API_VERSION = (0, 1)

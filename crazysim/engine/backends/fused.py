@@ -17,9 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.core.sharding import Location
-from crazysim.core.stage import PHASES, Phase
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 from crazysim.engine.backends.derivatives import CountedRun, make_differentiable
@@ -28,8 +26,10 @@ from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.passes.layout import packed_rows
+from crazysim.engine.pytree import replace_leaves
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import PHASES, Phase
 from crazysim.errors import ConfigError
-from crazysim.pytree import replace_leaves
 
 
 class Kernels:

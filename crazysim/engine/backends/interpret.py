@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.core.sharding import Location
 from crazysim.engine.backends import Run, lanes
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Operation, Value
 from crazysim.engine.ir.program import Program
-from crazysim.jaxcompat import is_key
-from crazysim.pytree import replace_leaves
+from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.pytree import replace_leaves
+from crazysim.engine.sharding import Location
 
 Observer = Callable[[Operation, Sequence[np.ndarray]], None]
 """Function that is called with every operation and its results."""

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from crazysim.core.stage import Phase
 from crazysim.engine.backends.exchange import make_exchange
 from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.source import TYPE_NAMES, Writer, require_block_source, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
+from crazysim.engine.stage import Phase
 
 MAX_REGISTERS = 255
 """Maximum number of registers of a GPU thread."""

@@ -22,7 +22,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from crazysim import cache
+from crazysim.engine import cache
 from crazysim.errors import warn
 from crazysim.storage import (
     FOLDER_REMEDY,

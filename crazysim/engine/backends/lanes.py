@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.core.sharding import Location
-from crazysim.core.stage import Phase
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import Run, xla
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.passes.schedule import add_barriers
-from crazysim.jaxcompat import is_key
+from crazysim.engine.sharding import Location
+from crazysim.engine.stage import Phase
 
 BlockRunner = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 """Function that runs a block: it takes the block, its inputs and the shape of the lanes, and returns the outputs."""

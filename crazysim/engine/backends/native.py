@@ -24,10 +24,10 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.cache import cpu_features
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import kernel_cache
 from crazysim.engine.backends.frame import Kernel, steps_per_interval
+from crazysim.engine.cache import cpu_features
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError

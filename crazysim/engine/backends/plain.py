@@ -8,11 +8,11 @@ from typing import Any
 import jax
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.core.record import Record, nonfinite_worlds
-from crazysim.core.stage import PHASES, Axes, Phase, Stage
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import Run
-from crazysim.pytree import leaf_flags, replace_leaves
+from crazysim.engine.pytree import leaf_flags, replace_leaves
+from crazysim.engine.record import Record, nonfinite_worlds
+from crazysim.engine.stage import PHASES, Axes, Phase, Stage
 
 
 def build(stages: Sequence[Stage], data: Record) -> tuple[Run, list[int]]:

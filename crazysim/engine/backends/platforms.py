@@ -9,11 +9,11 @@ from typing import Any
 import jax
 from jax import Array
 
-from crazysim import jaxcompat
-from crazysim.core.sharding import Location
+from crazysim.engine import jaxcompat
 from crazysim.engine.backends import cuda, native
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
+from crazysim.engine.sharding import Location
 
 TARGETS = {"cpu": "host", "gpu": "cuda"}
 """Targets of kernels by platform."""

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from crazysim import jaxcompat
-from crazysim.core.pair_reductions import safe_max, safe_min
+from crazysim.engine import jaxcompat
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
+from crazysim.engine.pair_reductions import safe_max, safe_min
 
 Env = dict[Value, Any]
 """Array of each value."""

@@ -14,10 +14,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from crazysim.core.stage import Phase
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
-from crazysim.jaxcompat import is_key
+from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.stage import Phase
 
 Slot = tuple[int, int]
 """Place of a number: the index of its leaf, and the index of the element among the elements of one drone (or world)."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from crazysim.core.stage import PHASES
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
+from crazysim.engine.stage import PHASES
 
 
 class VerificationError(AssertionError):

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import jax
 
-from crazysim.core.record import Record
-from crazysim.core.stage import Axes, Stage
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
-from crazysim.pytree import has_members
+from crazysim.engine.pytree import has_members
+from crazysim.engine.record import Record
+from crazysim.engine.stage import Axes, Stage
 
 
 class Group(NamedTuple):

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
 from crazysim.engine.ir.blocks import Block, Builder, Element, Value, constant
-from crazysim.jaxcompat import ClosedJaxpr, Literal, is_key
+from crazysim.engine.jaxcompat import ClosedJaxpr, Literal, is_key
 
 ElementArray = np.ndarray
 """An array of elements, of type object. A random key is a pair of elements."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from crazysim.core.stage import Axes, Stage, world_function
-from crazysim.pytree import has_members
+from crazysim.engine.pytree import has_members
+from crazysim.engine.stage import Axes, Stage, world_function
 
 if TYPE_CHECKING:
     from crazysim.engine.ir.program import Program

@@ -1,7 +1,7 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
 The derivative is the derivative of the number of the first drone that has the smallest or largest number, as
-``crazysim.core.pair_reductions`` defines it. That drone is identified by its index, not by comparing numbers, since
+``crazysim.engine.pair_reductions`` defines it. That drone is identified by its index, not by comparing numbers, since
 numbers that are computed twice may be rounded differently.
 """
 

@@ -10,17 +10,17 @@ import jax
 import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
-from crazysim.core.pair_reductions import reduce_over_others_p
-from crazysim.core.record import Record
-from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
 from crazysim.engine.ir.program import TABLE_INDEX, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
+from crazysim.engine.jaxcompat import equations, is_key
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, TableEntry, as_elements, inputs, scalars
 from crazysim.engine.lowering.relative import RelativeAxes, view_leaves
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
-from crazysim.jaxcompat import equations, is_key
-from crazysim.pytree import leaf_flags
+from crazysim.engine.pair_reductions import reduce_over_others_p
+from crazysim.engine.pytree import leaf_flags
+from crazysim.engine.record import Record
+from crazysim.engine.stage import PHASES, Axes, Phase, Stage, is_first_step
 
 MAX_UNROLLED_DRONES = 8
 """Maximum number of drones per world for which a stage of scope ``world`` that uses leaves of drones is lowered. It is

@@ -22,7 +22,7 @@ from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
 from crazysim.engine.lowering.activity import apply_operation, changed_slots, prepare_derivative
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
-from crazysim.pytree import replace_leaves
+from crazysim.engine.pytree import replace_leaves
 
 Values = dict[Value, Element]
 """Elements of a builder by the values of the block that is differentiated."""

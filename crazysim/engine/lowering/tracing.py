@@ -7,10 +7,10 @@ from typing import Any
 
 import jax
 
-from crazysim import jaxcompat
-from crazysim.core.stage import Axes, Stage
 from crazysim.eager import explain_traced_values
+from crazysim.engine import jaxcompat
 from crazysim.engine.ir import dump
+from crazysim.engine.stage import Axes, Stage
 
 
 class TracedStage:

@@ -20,7 +20,7 @@ from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value,
 from crazysim.engine.lowering.activity import active_values, apply_operation
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
-from crazysim.pytree import replace_leaves
+from crazysim.engine.pytree import replace_leaves
 
 MAX_UNROLLED_OPERATIONS = 4096
 """Maximum number of operations, over all iterations, of a loop that is unrolled for its derivative."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.engine.ir.program import PACKED_LEAF_NAME, Leaf, Program, Segment, Slot
-from crazysim.jaxcompat import is_key
+from crazysim.engine.jaxcompat import is_key
 
 
 def pack_shared(program: Program) -> Program:

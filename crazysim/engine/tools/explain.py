@@ -7,9 +7,9 @@ import time
 import jax
 import jax.numpy as jnp
 
-from crazysim.core.record import Record
 from crazysim.engine.backends import fused
 from crazysim.engine.ir.program import UnfusedStage
+from crazysim.engine.record import Record
 from crazysim.engine.step import Step
 
 

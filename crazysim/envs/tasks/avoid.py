@@ -13,7 +13,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import PyTree, device_array, leaf, static
+from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -21,7 +22,6 @@ from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, nearest_entries, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import require
-from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 

@@ -11,10 +11,10 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import with_record
 from crazysim.plugins.payloads import load_pos, load_vel
-from crazysim.pytree import PyTree, device_array, leaf
 
 SETTLED_SPEED = 0.2
 """Speed below which a load at its goal is at rest, m/s."""

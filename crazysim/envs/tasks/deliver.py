@@ -14,7 +14,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import device_array, leaf
+from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
@@ -26,7 +27,6 @@ from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_state import to_world_frame
 from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.plugins.vehicles.trailer import trailer_axles, trailer_rates
-from crazysim.pytree import device_array, leaf
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"

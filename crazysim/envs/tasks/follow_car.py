@@ -13,6 +13,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
+from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
@@ -23,7 +24,6 @@ from crazysim.envs.tasks.target_camera import TargetCamera
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 SPACING = 6.0

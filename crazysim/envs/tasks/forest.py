@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -23,7 +24,6 @@ from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, motion_of, nearest_entries, on_floor, to_heading, with_record
 from crazysim.plugins.scenery.forest import Forest as Trees
 from crazysim.plugins.sensors.camera import Camera
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 HALF_WIDTH, CEILING = 8.0, 4.0

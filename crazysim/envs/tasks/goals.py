@@ -12,9 +12,9 @@ from jax.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, StagePlacement
-from crazysim.core.stage import Stage, stage
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import Stage, stage
 from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 FLOOR = 0.02

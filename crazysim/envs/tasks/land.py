@@ -14,13 +14,13 @@ from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import StagePlacement
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import device_array, leaf, static
+from crazysim.engine.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome, landing_of
-from crazysim.pytree import device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 

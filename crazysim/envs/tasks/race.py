@@ -15,7 +15,8 @@ from numpy.typing import DTypeLike
 from crazysim import rotation
 from crazysim.core.data import SimData, SimParams
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import device_array, host_array
+from crazysim.engine.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
@@ -25,7 +26,6 @@ from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
 from crazysim.errors import require
-from crazysim.pytree import device_array, host_array
 from crazysim.sim.sim import Sim
 
 SENSOR_RANGE = 0.7

@@ -11,10 +11,10 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.engine.pytree import PyTree, leaf, static
 from crazysim.envs import terms
 from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry
-from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.objects import Handle
 
 OPENING = 0.45

@@ -12,16 +12,16 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pair_reductions import reduce_over_others
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest_drones, on_floor, state_of, with_record
 from crazysim.errors import ConfigError, require
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 SEPARATION = (0.24, 0.24, 0.6)

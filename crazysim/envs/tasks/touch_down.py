@@ -11,11 +11,11 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.stage import Stage, stage
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import Stage, stage
 from crazysim.envs import terms
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import state_of, with_record
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ContactFn
 
 MAX_TOUCH_DOWN_SPEED = 0.5

@@ -15,12 +15,12 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
+from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.envs.tasks.goals import on_floor, state_of, with_record
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
 

@@ -13,7 +13,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import static
+from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
@@ -21,7 +22,6 @@ from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, ini
 from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
 from crazysim.errors import require
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
-from crazysim.pytree import static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.settings import positive_integer
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.pytree import PyTree, leaf
 
 
 class ActionQueue(PyTree):

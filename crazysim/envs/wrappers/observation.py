@@ -16,7 +16,8 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.random import normal, world_key
 from crazysim.core.settings import positive_integer
-from crazysim.core.stage import vmap_drones
+from crazysim.engine.pytree import PyTree, leaf, scopes
+from crazysim.engine.stage import vmap_drones
 from crazysim.envs.env import Env
 from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
@@ -24,7 +25,6 @@ from crazysim.envs.tasks.goals import state_of
 from crazysim.envs.wrappers.action import MAX_FRAMES
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import PyTree, leaf, scopes
 from crazysim.tables import NOT_NEGATIVE, read_number
 
 

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import Axes
+from crazysim.engine.pytree import scopes
+from crazysim.engine.stage import Axes
 from crazysim.envs.env import Env
 from crazysim.envs.random import episode_key
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, expect, require
-from crazysim.pytree import scopes
 
 
 class RandomizeWith(Wrapper):

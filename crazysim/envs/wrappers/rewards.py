@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.engine.pytree import PyTree, leaf
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.pytree import PyTree, leaf
 
 
 class EpisodeSums(PyTree):

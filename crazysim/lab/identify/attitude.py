@@ -17,12 +17,12 @@ from crazysim.dynamics import fitted
 from crazysim.dynamics.models import Dynamics
 from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing
 from crazysim.dynamics.utils.identification import fit_rotation, fit_translation
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import PADDING, State, Windows
 from crazysim.lab.identify.rotation import SAMPLING_ERROR, deviation_of_sum, sum_pieces
-from crazysim.pytree import PyTree
 
 PARAMETER_UNITS = {
     "acc_coef": "N", "cmd_f_coef": "1", "thrust_dyn_coef": "1/s", "drag_coefficients": "N s/m",

@@ -17,10 +17,10 @@ from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import not_installed, require
 from crazysim.lab.identify.logs import Log
 from crazysim.plugins.effects.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
-from crazysim.pytree import PyTree
 from crazysim.storage import write_figure
 
 HORIZONS = (0.1, 0.25, 0.5)

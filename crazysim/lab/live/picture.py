@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import vmap_drones, vmap_worlds
+from crazysim.engine.pytree import has_members, scopes
+from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
 from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
-from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
 
 LIGHT_RADIUS = 0.06

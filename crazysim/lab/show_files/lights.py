@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from crazysim.engine.pytree import PyTree, float_dtype, leaf
 from crazysim.errors import require
-from crazysim.pytree import PyTree, float_dtype, leaf
 
 
 class Lights(PyTree):

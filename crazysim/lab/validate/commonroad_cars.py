@@ -13,10 +13,10 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.engine.pytree import as_parameter
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.vehicles import CarState, CommonRoadParams, CommonRoadState, commonroad_single_track, single_track
 from crazysim.plugins.vehicles.car_params import SLIP_SPEED, CarParams
-from crazysim.pytree import as_parameter
 
 REFERENCE = "CommonRoad, BMW 320i"
 """Reference in the rows."""

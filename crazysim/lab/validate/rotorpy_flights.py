@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.plugin import Plugin
-from crazysim.core.stage import stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.engine.stage import stage
 from crazysim.lab.validate.closed_forms import angle_between, read_state, with_states
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.effects import RotorAerodynamics, Wind

@@ -16,15 +16,15 @@ from crazysim.core.integration import Integrator, limit_ang_vel
 from crazysim.core.plugin import Simulation, StagePlacement, param
 from crazysim.core.population import Population, RatesFn
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
-from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rigid_body import free_rotation
+from crazysim.engine.pytree import Members, host_array, leaf
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.plugins.contacts.rigid_bodies import BodyContacts, require_few_contacts
 from crazysim.plugins.effects.ground import HeightField
 from crazysim.plugins.payloads.colliders import load_shape
-from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
 from crazysim.tables import MASS
 

@@ -12,9 +12,9 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, param, state
-from crazysim.core.stage import Stage, StageScope
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage, StageScope
 from crazysim.errors import ConfigError
-from crazysim.pytree import device_array
 from crazysim.scene.contact_report import ContactReport, ObjectSelection, select_bodies
 from crazysim.scene.object_poses import moving_plugins
 

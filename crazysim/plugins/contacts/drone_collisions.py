@@ -13,7 +13,8 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, param, state
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
-from crazysim.core.stage import Stage, vmap_worlds
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.manifold import N_BOX_POINTS
 from crazysim.plugins.contacts.pairs import Solids, contacts_between, join_contacts
@@ -25,7 +26,6 @@ from crazysim.plugins.contacts.rigid_bodies import (
     states_after_contact,
 )
 from crazysim.plugins.contacts.solver import Impulses, solve_contacts
-from crazysim.pytree import device_array
 
 
 class DroneCollisions(Plugin):

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.engine.jaxcompat import fori_loop
 from crazysim.geometry.small_matrices import solve_symmetric
-from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.contacts.contact_points import ContactPoints
 
 BOUNCE_SPEED = 0.1

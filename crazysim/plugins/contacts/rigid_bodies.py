@@ -16,7 +16,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
-from crazysim.core.stage import vmap_worlds
+from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.manifold import N_BOX_POINTS
 from crazysim.geometry.small_matrices import matmul, matvec

@@ -14,11 +14,11 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, StagePlacement
 from crazysim.core.settings import as_rgba
 from crazysim.core.stages import stop_at_ground
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON
 from crazysim.plugins.effects.ground import HeightField, ground_below, ground_height
-from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

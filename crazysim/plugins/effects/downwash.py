@@ -12,18 +12,18 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, airframe_numbers, derived, param, state
 from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import quadratic_curve
+from crazysim.engine.pair_reductions import reduce_over_others
+from crazysim.engine.pytree import device_array
 from crazysim.plugins.effects.moving_air import (
     BodiesInAir,
     MovingAir,
     needs_drag,
     with_moving_air,
 )
-from crazysim.pytree import device_array
 
 JET_DECAY, JET_SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,

@@ -14,9 +14,9 @@ from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command, staged_leaves
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, param, state
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, as_stages
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage, as_stages
 from crazysim.errors import ConfigError
-from crazysim.pytree import device_array
 
 MAX_DELAY = 100_000
 """Upper limit of the delay, steps."""

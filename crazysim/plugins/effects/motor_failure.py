@@ -12,9 +12,9 @@ from crazysim.core.data import SimData, controls_of
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, param
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import as_mask
+from crazysim.engine.pytree import select_worlds
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import needs_rotors
-from crazysim.pytree import select_worlds
 
 
 class MotorFailure(Plugin, requires=needs_rotors):

@@ -12,8 +12,8 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, state
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import device_array
 
 
 class BodiesInAir(Plugin, abstract=True):

@@ -14,9 +14,9 @@ from crazysim.core.plugin import Param, Plugin, Simulation, airframe_numbers, ch
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import quadratic_curve, rotor_torque
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import needs_rotors
-from crazysim.pytree import device_array
 
 N_INPUTS = 14
 """Number of inputs: see ``residual_inputs``."""

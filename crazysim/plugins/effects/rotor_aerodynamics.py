@@ -17,6 +17,7 @@ from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_factor, thrust_in_flight
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import (
     air_velocity,
@@ -24,7 +25,6 @@ from crazysim.plugins.effects.moving_air import (
     needs_rotors,
     rotor_positions,
 )
-from crazysim.pytree import device_array
 
 
 class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):

@@ -11,10 +11,10 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, drone_array, param, state
 from crazysim.core.random import uniform, world_key
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, Grid, interpolate
 from crazysim.plugins.effects.moving_air import BodiesInAir, MovingAir, needs_drag, with_moving_air
-from crazysim.pytree import device_array
 
 
 class WindField(MovingAir, Plugin, requires=needs_drag):

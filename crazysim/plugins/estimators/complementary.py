@@ -14,8 +14,8 @@ from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Simulation, drone_array, param, state
 from crazysim.core.settings import default_rates
-from crazysim.core.stage import Stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.barometer import Barometer

@@ -23,7 +23,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
 
 POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
 """Rows of the errors of position, velocity, attitude and the bias of the gyroscope."""

@@ -12,14 +12,14 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, nested, state
-from crazysim.core.stage import Stage
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor, rate_in
-from crazysim.pytree import device_array
 
 
 class ErrorStateFilter(Estimator):

@@ -16,7 +16,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array, state
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage
+from crazysim.engine.stage import Stage
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter

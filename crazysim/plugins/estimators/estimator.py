@@ -12,7 +12,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
-from crazysim.core.stage import Stage, as_stages
+from crazysim.engine.stage import Stage, as_stages
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor

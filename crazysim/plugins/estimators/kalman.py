@@ -13,7 +13,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Simulation, drone_array, param, state
-from crazysim.core.stage import Stage
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import Estimate
@@ -23,7 +24,6 @@ from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFli
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import device_array
 
 FIRMWARE_RATE = 1000
 """Rate of the loop of the firmware's filter, Hz; every loop adds process noise (estimator_kalman.c)."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Param, Simulation, StagePlacement, check_parameter, param, state
 from crazysim.core.settings import as_mask, color, setting
+from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.plugins.effects.ground import ground_height
@@ -29,7 +30,6 @@ from crazysim.plugins.payloads.point_load import (
     rotation_from_z,
 )
 from crazysim.plugins.payloads.slung import bind_load, move_loads, shape_axis
-from crazysim.pytree import device_array, select_worlds
 from crazysim.rotation import dot
 
 

@@ -16,6 +16,7 @@ from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Simulation, derived, state
 from crazysim.core.settings import as_mask, as_rgba
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import select_worlds
 from crazysim.plugins.effects.ground import ground_height
 from crazysim.plugins.effects.moving_air import BodiesInAir
 from crazysim.plugins.effects.wind import wind_at
@@ -23,7 +24,6 @@ from crazysim.plugins.effects.wind_field import WindField
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.link import drag_rate, link_geometry
 from crazysim.plugins.payloads.rotor_jet import jet_force
-from crazysim.pytree import select_worlds
 
 CABLE_SEGMENTS = 8
 """Number of straight pieces with which a cable is drawn."""

@@ -13,9 +13,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, param, state
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage
 from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.downwash import collective_thrust, hover_jet_speed, mean_rotor_vel, stream_diameter
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, interpolate, is_inside
@@ -23,7 +24,6 @@ from crazysim.plugins.effects.moving_air import needs_rotors
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.jet_table import JetTable
 from crazysim.plugins.payloads.panels import shape_panels
-from crazysim.pytree import device_array
 
 PANELS_PER_LENGTH = 2
 """Default number of panels along the longest edge of a load."""

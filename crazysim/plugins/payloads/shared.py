@@ -17,9 +17,10 @@ from crazysim.core.integration import euler, rk4
 from crazysim.core.plugin import Param, Simulation, StagePlacement, derived, param, state
 from crazysim.core.settings import color, setting
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.jaxcompat import fori_loop
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.geometry.small_matrices import matvec, solve_symmetric
-from crazysim.jaxcompat import fori_loop
 from crazysim.plugins.payloads.colliders import LoadBody, rest_height
 from crazysim.plugins.payloads.link import TAUT_BAND, UnitPull, acceleration_at, correction_rate, link_geometry
 from crazysim.plugins.payloads.point_load import (
@@ -30,7 +31,6 @@ from crazysim.plugins.payloads.point_load import (
     link_pieces,
     rotation_from_z,
 )
-from crazysim.pytree import device_array
 
 TENSION_REGULARIZATION = 1e-6
 """Term added to the diagonal of the matrix of tensions, 1. The ratio of the masses of load and drone on the diagonal

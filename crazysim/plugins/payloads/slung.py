@@ -14,6 +14,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.integration import rk4
 from crazysim.core.plugin import Param, Simulation, StagePlacement, param
 from crazysim.core.settings import as_mask, color, setting
+from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.plugins.payloads.colliders import LoadBody, rest_height
 from crazysim.plugins.payloads.link import LinkParams, couple_bodies, end_relative_motion, link_geometry
 from crazysim.plugins.payloads.point_load import (
@@ -27,7 +28,6 @@ from crazysim.plugins.payloads.point_load import (
     link_pieces,
     rotation_from_z,
 )
-from crazysim.pytree import device_array, select_worlds
 
 ABSENT_LOAD_DEPTH = 1000.0
 """Depth by which loads that do not exist are moved out of sight, m."""

@@ -23,10 +23,10 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, derived, param, state
 from crazysim.core.random import uniform_at, world_key
 from crazysim.core.settings import setting
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.geometry.distance import point_distance
-from crazysim.pytree import device_array
 
 HIDDEN_DEPTH = 100.0
 """Depth by which obstacles that a layout leaves out are moved down, m."""

@@ -16,9 +16,9 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Simulation, derived, param
 from crazysim.core.random import normal, uniform
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import device_array
 
 SWEEP_TILTS = -math.pi / 6, math.pi / 6
 """Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.

@@ -22,10 +22,10 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
 

@@ -13,8 +13,8 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, drone_array, param, state
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import device_array
 from crazysim.rotation import clip, safe_norm
 
 CLEAR_COLOR, ALARM_COLOR = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)

@@ -14,10 +14,10 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, drone_array, param, state
-from crazysim.core.stage import Stage
+from crazysim.engine.pytree import device_array
+from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import age_at, rate_in
-from crazysim.pytree import device_array
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import MAX_UNROLLED_GEOMS, RayKernels, cast_rays, raise_to_floor

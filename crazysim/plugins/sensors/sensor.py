@@ -18,10 +18,10 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, check_parameter, drone_array, nested, param
 from crazysim.core.random import drone_key, normal, uniform
 from crazysim.core.settings import default_rates, dividing_rate, setting
-from crazysim.core.stage import is_tick
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import is_tick
 from crazysim.errors import ConfigError, require
 from crazysim.plugins.sensors.errors import Link
-from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_ROWS = 64
 """Largest number of measurements of one sensor in transit."""

@@ -13,8 +13,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.plugin import Param, Simulation, bind_leaf, check_parameter, derived, drone_array, param, state
 from crazysim.core.settings import check_settings
+from crazysim.engine.pytree import PyTree, static
 from crazysim.plugins.sensors.errors import Changes, Link, gauss_markov_step, quantise
-from crazysim.pytree import PyTree, static
 
 
 class Triad(PyTree):

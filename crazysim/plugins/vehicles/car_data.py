@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.eager import jit_eager_calls
+from crazysim.engine.pytree import Members, leaf
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
 from crazysim.plugins.vehicles.path import Path
-from crazysim.pytree import Members, leaf
 
 
 class CarData(Members):

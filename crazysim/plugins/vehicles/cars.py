@@ -17,8 +17,9 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Simulation, StagePlacement, param
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
-from crazysim.core.stage import Stage, is_tick
 from crazysim.dynamics.models import GRAVITY
+from crazysim.engine.pytree import PyTree, device_array
+from crazysim.engine.stage import Stage, is_tick
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import HeightField, ground_at
 from crazysim.plugins.vehicles import appearance, starts
@@ -30,7 +31,6 @@ from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel, VehicleSource, load_vehicle
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.single_track import single_track
-from crazysim.pytree import PyTree, device_array
 from crazysim.trajectories import Trajectory
 
 CONTROL_FREQ = 50

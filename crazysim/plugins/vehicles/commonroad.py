@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.dynamics.models import GRAVITY
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.engine.pytree import PyTree, as_parameter, leaf
 
 MAX_KINEMATIC_SPEED = 0.5
 """Speed below which the model is kinematic, m/s."""

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.settings import check_settings, setting
+from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.path import Path
-from crazysim.pytree import PyTree
 from crazysim.rotation import clip, safe_arctan2
 
 

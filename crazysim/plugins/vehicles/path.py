@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.engine.pytree import PyTree, float_dtype, leaf
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.rotation import clip
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.piece_table import PieceTable

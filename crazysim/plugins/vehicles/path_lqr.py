@@ -15,14 +15,14 @@ from numpy.typing import ArrayLike
 from crazysim.control.lqr import solve_on_host, weight_matrix
 from crazysim.control.riccati import gain_discrete
 from crazysim.core.settings import setting
-from crazysim.jaxcompat import fori_loop
+from crazysim.engine.jaxcompat import fori_loop
+from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.single_track import single_track
-from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.engine.pytree import float_dtype
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.path import Path
-from crazysim.pytree import float_dtype
 
 START_SPACING = 1.0
 """Distance between neighbours of the default row of cars, m."""

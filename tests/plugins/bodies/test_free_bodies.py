@@ -11,7 +11,7 @@ from cases import build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactResponse, FreeBodies, Sim, Terrain
-from crazysim.core.stage import stage
+from crazysim.engine.stage import stage
 
 FREQ = 500
 

@@ -8,7 +8,7 @@ import pytest
 from cases import with_states
 
 from crazysim import ContactResponse, FreeBodies, Sim
-from crazysim.core.stage import vmap_drones, vmap_worlds
+from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.plugins.contacts.contact_points import contact_points, find_surfaces
 from crazysim.plugins.vehicles import Cars
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, ContactResponse, Sim
-from crazysim.core.stage import as_stages, stage
 from crazysim.engine import Step
+from crazysim.engine.stage import as_stages, stage
 
 HALF_HEIGHT = 0.02
 """Half the height of the collision box of a cf21B_500, m."""

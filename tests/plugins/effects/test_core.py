@@ -26,9 +26,9 @@ from crazysim import (
     load_airframe,
 )
 from crazysim.core.pipeline import replace_fn
-from crazysim.core.stage import vmap_drones
+from crazysim.engine.pytree import scopes
+from crazysim.engine.stage import vmap_drones
 from crazysim.plugins import effects
-from crazysim.pytree import scopes
 
 IDLE = {Battery: {"capacity": 1e6, "resistance": 1e-6}, Latency: {"delay": 0}, MotorFailure: {}, Wind: {}}
 """Effects with settings that have no effect."""

@@ -9,7 +9,7 @@ from sweep import RANGES
 
 from crazysim import Battery, ConfigError, Latency, Randomize, RotorAerodynamics, Sim, Wind
 from crazysim.core.pipeline import append_fn
-from crazysim.core.stage import stage
+from crazysim.engine.stage import stage
 from crazysim.envs import AutoReset, make
 from crazysim.plugins.effects.battery import open_circuit_voltage
 

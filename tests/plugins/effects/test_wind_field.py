@@ -7,7 +7,7 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Sim, SlungLoad, Wind, WindField
-from crazysim.core.stage import as_stages
+from crazysim.engine.stage import as_stages
 from crazysim.plugins.effects import wind_field
 from crazysim.plugins.effects.grid import Grid
 

@@ -12,9 +12,9 @@ from scipy import ndimage
 
 from crazysim import ConfigError, Forest, Sim, StagePlacement, stage
 from crazysim.core.plugin import FunctionPlugin
-from crazysim.core.stage import vmap_drones, vmap_worlds
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.envs import AutoReset, Task, flying, make
-from crazysim.pytree import PyTree, leaf
 
 SMALL_FOREST = {"size": (20.0, 16.0), "center": (4.0, -2.0), "free": [[4.0, -2.0, 2.0]]}
 """Settings of a forest of 20 cells with a free disc in its middle."""

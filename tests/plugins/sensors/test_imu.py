@@ -88,8 +88,8 @@ def test_lever_arm_and_mounting_by_hand():
 
 def data_of_drone(sim):
     """Return the data of the only drone, as methods of plugins get it."""
-    from crazysim.core.stage import Axes
-    from crazysim.pytree import n_batch_axes
+    from crazysim.engine.pytree import n_batch_axes
+    from crazysim.engine.stage import Axes
 
     axes = Axes(sim.data)
     leaves = jax.tree.leaves(sim.data)

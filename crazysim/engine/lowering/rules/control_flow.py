@@ -10,6 +10,7 @@ import numpy as np
 
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Element, constant, is_constant
+from crazysim.engine.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, expand_primitive
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
     ElementArray,
@@ -20,7 +21,6 @@ from crazysim.engine.lowering.jaxprs import (
     rule,
     scalars,
 )
-from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, expand_primitive
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")

@@ -6,10 +6,10 @@ import numpy as np
 from jax.lax import RoundingMethod
 from numpy.typing import DTypeLike
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.ir import ops
+from crazysim.engine.jaxcompat import JaxprEqn
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, constants, rule
-from crazysim.jaxcompat import JaxprEqn
 
 PRIMITIVES_WITH_RULES = frozenset(
     "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()

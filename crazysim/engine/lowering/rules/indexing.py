@@ -11,6 +11,7 @@ from jax.lax import GatherScatterMode
 from numpy.typing import DTypeLike
 
 from crazysim.engine.ir.blocks import Element, constant, is_constant
+from crazysim.engine.jaxcompat import ClosedJaxpr, JaxprEqn
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
     ElementArray,
@@ -23,7 +24,6 @@ from crazysim.engine.lowering.jaxprs import (
 )
 from crazysim.engine.lowering.rules import tables
 from crazysim.engine.lowering.rules.movement import evaluate, move_by_indices
-from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn
 
 
 @rule("dynamic_slice")

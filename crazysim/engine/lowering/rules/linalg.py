@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 
 from crazysim.engine.ir.blocks import constant
+from crazysim.engine.jaxcompat import JaxprEqn
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule
-from crazysim.jaxcompat import JaxprEqn
 
 MAX_SYSTEM_SIZE = 6
 """Maximum number of rows of a matrix. The unrolled arithmetic of a larger matrix is longer than a whole step."""

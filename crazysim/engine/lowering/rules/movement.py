@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from crazysim.engine.jaxcompat import JaxprEqn, bind
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, as_elements, constants, rule
-from crazysim.jaxcompat import JaxprEqn, bind
 
 MOVING_PRIMITIVES = (
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",

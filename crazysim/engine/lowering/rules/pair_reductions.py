@@ -7,8 +7,8 @@ from typing import Any
 
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Value, constant, is_constant
+from crazysim.engine.jaxcompat import JaxprEqn
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule, scalars
-from crazysim.jaxcompat import JaxprEqn
 
 
 @rule("reduce_over_others")

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from crazysim.engine.ir.blocks import is_constant
+from crazysim.engine.jaxcompat import JaxprEqn, bits_generator, threefry_prng_impl
 from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedError, as_elements, rule
 from crazysim.engine.lowering.rules.movement import evaluate
-from crazysim.jaxcompat import JaxprEqn, bits_generator, threefry_prng_impl
 
 
 @rule("random_wrap")

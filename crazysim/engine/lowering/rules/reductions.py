@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from crazysim.engine.ir.blocks import Element, constant
+from crazysim.engine.jaxcompat import JaxprEqn
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
     ElementArray,
@@ -21,7 +22,6 @@ from crazysim.engine.lowering.jaxprs import (
     rule,
 )
 from crazysim.engine.lowering.rules.movement import evaluate
-from crazysim.jaxcompat import JaxprEqn
 
 OPERATION_OF_REDUCTION = {
     "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min",

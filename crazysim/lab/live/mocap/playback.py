@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import setting
-from crazysim.core.stage import stage
+from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.stage import stage
 from crazysim.errors import require
-from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.objects import Handle
 
 

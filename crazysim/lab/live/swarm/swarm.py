@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics
+from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.errors import UnknownNameError, require
 from crazysim.lab.live.attitude import from_yaw, rotate, to_rpy
 from crazysim.lab.live.loop import Live

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import jaxcompat
+from crazysim.engine import jaxcompat
 from crazysim.engine.errors import UnsupportedError
 
 
@@ -387,7 +387,7 @@ def test_the_engine_runs_without_functions_that_jax_may_remove():
 
     The step runs in one kernel, split by an unfused stage, with each engine, and with commands.
     """
-    tests = ["tests/test_jaxcompat.py", "tests/engine/test_step.py", "tests/sim/test_stepper.py"]
+    tests = ["tests/engine/test_jaxcompat.py", "tests/engine/test_step.py", "tests/sim/test_stepper.py"]
     chosen = ("inputs or dropped or closes_over or on_a_device or donat or parameter_of_each_drone or splits_a_large"
             " or commands_to_flattened")  # fmt: skip
     done = subprocess.run(

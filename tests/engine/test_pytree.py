@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import ConfigError, PyTree, leaf, static
-from crazysim.pytree import as_parameter, check_axes, map_batched, scopes, select_worlds
+from crazysim.engine.pytree import as_parameter, check_axes, map_batched, scopes, select_worlds
 
 
 class Rotor(PyTree):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import vmap_worlds
-from crazysim.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.stage import vmap_worlds
 
 
 class Numbers(PyTree):

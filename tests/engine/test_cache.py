@@ -18,8 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax._src import compilation_cache
 
-from crazysim import cache
-from crazysim.cache import (
+from crazysim.engine import cache
+from crazysim.engine.backends import kernel_cache
+from crazysim.engine.cache import (
     announce,
     announce_if_slow,
     default_folder,
@@ -28,7 +29,6 @@ from crazysim.cache import (
     keep_programs,
     trim,
 )
-from crazysim.engine.backends import kernel_cache
 
 PROGRAM = """
 import sys

@@ -10,8 +10,8 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from crazysim import ConfigError, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn
-from crazysim.core.sharding import WORLD_AXIS, shard, shardings_of, world_mesh
-from crazysim.pytree import scopes
+from crazysim.engine.pytree import scopes
+from crazysim.engine.sharding import WORLD_AXIS, shard, shardings_of, world_mesh
 
 SETTINGS = {"n_worlds": 4, "n_drones": 2, "control": "attitude"}
 COMMAND = np.broadcast_to([0.05, -0.02, 0.1, 0.45], (4, 2, 4)).astype(np.float32)
