@@ -1,8 +1,8 @@
 """All use of JAX beyond its documented, stable interface; new releases of JAX should require changes here only.
 
 Most names have a test in ``tests/engine/test_jaxcompat.py``, which continuous integration runs on the oldest and the
-newest JAX that are supported; the other names are tested with the code that uses them. This list states how each use would
-be replaced if a release removed it, and whether the replacement is implemented:
+newest JAX that are supported; the other names are tested with the code that uses them. This list states how each use
+would be replaced if a release removed it, and whether the replacement is implemented:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
   ``jax.make_jaxpr``. Implemented here.
