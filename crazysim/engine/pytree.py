@@ -14,10 +14,10 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-Scope = Literal["drone", "member", "world", "batched", "shared", "opaque", "parameter"]
+Scope = Literal["drone", "member", "world", "batch", "shared", "opaque", "parameter"]
 """Scope of a leaf as a field declares it; see ``leaf``."""
 
-WITHOUT_MEMBERS = ("world", "batched", "shared", "opaque")
+WITHOUT_MEMBERS = ("world", "batch", "shared", "opaque")
 """Results of ``scopes`` for leaves without an axis over members; other results are ``drone`` or a population's name."""
 CORE_NDIM_KEY = "core_ndim"
 """Key, in the metadata of a field, of the number of dimensions without batch axes; Crazyflow uses the same key."""
@@ -39,10 +39,10 @@ def leaf(
 
     Args:
         scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``member``, in a record of a population
-            (``Members``): (n_worlds, n_members, *core). ``world``: (n_worlds, 1, *core). ``batched``: (n_worlds, ...),
-            with any further axes. ``shared``: core. ``parameter``: either core, or core with the axes of ``drone`` (in
-            a population, of ``member``); the number of dimensions decides. ``opaque``: undeclared; masked resets and
-            sharding do not change it.
+            (``Members``): (n_worlds, n_members, *core). ``world``: (n_worlds, 1, *core), which broadcasts over drones.
+            ``batch``: (n_worlds, ...), with any further axes; stages receive it whole. ``shared``: core.
+            ``parameter``: either core, or core with the axes of ``drone`` (in a population, of ``member``); the number
+            of dimensions decides. ``opaque``: undeclared; masked resets and sharding do not change it.
         core_ndim: Number of dimensions of the core shape; None for any.
         core: The core shape, if it is fixed. It prevents, for example, masses of three worlds from being taken
             for masses along three axes.
@@ -168,7 +168,7 @@ def has_members(scope: str) -> bool:
 
 def n_batch_axes(scope: str) -> int:
     """Return the number of batch axes of a leaf, by its scope as ``scopes`` returns it."""
-    return {"batched": 1, "shared": 0, "opaque": 0}.get(scope, 2)
+    return {"batch": 1, "shared": 0, "opaque": 0}.get(scope, 2)
 
 
 def n_world_axes(scope: str) -> int:
@@ -184,8 +184,8 @@ def scopes(tree: Any) -> Any:
 
     A leaf of members has the name of their population as its scope, a parameter has ``shared``, ``drone`` or the name
     of a population, and a leaf without a declaration is ``opaque``. Fields of dataclasses of other libraries can
-    declare ``CORE_NDIM_KEY`` in their metadata. A leaf with more dimensions than that is ``batched``: its first axis is
-    over worlds, and stages receive it like an opaque leaf.
+    declare ``CORE_NDIM_KEY`` in their metadata. A leaf with more dimensions than that has the scope ``batch``:
+    its first axis is over worlds, and stages receive it whole.
     """
     return _map_leaves(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
 
@@ -232,7 +232,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         scope = _scope(x, metadata, members)
         if scope == "opaque":
             return
-        if scope == "batched":
+        if scope == "batch":
             if jnp.shape(x)[0] != n_worlds:
                 raise ConfigError(
                     f"expected {name} to have a first axis over {n_worlds} worlds, got shape {jnp.shape(x)}. Without "
@@ -320,7 +320,7 @@ def _is_foreign_record(node: Any) -> bool:
 def _scope(x: Any, metadata: Any, members: Members | None) -> str:
     if "scope" not in metadata:
         core_ndim = metadata.get(CORE_NDIM_KEY)
-        return "opaque" if core_ndim is None or jnp.ndim(x) <= core_ndim else "batched"
+        return "opaque" if core_ndim is None or jnp.ndim(x) <= core_ndim else "batch"
     scope = metadata["scope"]
     if scope == "member":
         return scope if members is None else members.population

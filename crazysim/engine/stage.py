@@ -1,7 +1,7 @@
 """Stages with a declared scope, such as one drone or one world, and transformations of functions to all worlds.
 
-Leaves have scopes too, which ``leaf`` in ``crazysim.engine.pytree`` defines. A batched leaf, (n_worlds, ...), has axes
-over worlds only. ``Stage.batched`` is another term: it describes a function that accepts any leading axes.
+Leaves have scopes too, which ``leaf`` in ``crazysim.engine.pytree`` defines. A function is
+``batched`` if it also accepts leading axes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ step, or once after the last."""
 
 PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
-RESERVED_SCOPES = ("batch", "batched", "shared", "opaque", "parameter", "member")
+RESERVED_SCOPES = ("batch", "shared", "opaque", "parameter", "member")
 """Names of scopes that ``stage`` does not accept, and that no population may have as its name."""
 
 
@@ -262,7 +262,7 @@ class Axes:
     def unbatched_shape(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the shape and type of leaf ``i`` as a stage with a scope receives it."""
         leaf_scope, n_leading = self.scopes[i], 0
-        if scope != "batch" and leaf_scope != "batched":  # stages receive batched leaves unchanged
+        if scope != "batch" and leaf_scope != "batch":
             n_leading = n_batch_axes(leaf_scope) if leaf_scope == scope else n_world_axes(leaf_scope)
         return jax.ShapeDtypeStruct(jnp.shape(x)[n_leading:], x.dtype)
 
@@ -271,9 +271,9 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
     """Transform a function of one world to a function of all worlds.
 
     Leaves of records have the batch axes that they declare. The function receives leaves of drones as (n_drones, ...),
-    leaves of other populations as (n_members, ...), and leaves of worlds and batched leaves without batch axes. All
-    other leaves are passed unchanged, and must be returned unchanged. The first axis of an array outside of a record is
-    over worlds.
+    leaves of other populations as (n_members, ...), and leaves of worlds and of the scope ``batch`` without batch axes.
+    All other leaves are passed unchanged, and must be returned unchanged. The first axis of an array outside of a
+    record is over worlds.
 
     Args:
         fn: The function of one world: takes any number of trees of arrays, and returns a tree of arrays.
@@ -302,7 +302,7 @@ def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[...
                 if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= min_batch_axes:
                     input_indices[k] = None  # a shared leaf, returned in a field that has a value for every world
                 elif i is not None and n_batch_axes(result_scopes[k]) < min_batch_axes:
-                    # A batched leaf of another library's record appears as opaque without its axis over worlds.
+                    # A leaf (scope "batch") of another library's record appears as opaque without its axis over worlds.
                     result_scopes[k] = leaf_scopes[i]
             result_structure["input_indices"] = input_indices
             for (path, _), scope, i in zip(paths, result_scopes, input_indices, strict=True):
@@ -343,12 +343,12 @@ def vmap_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _leaf_scopes(tree: object) -> list[str]:
-    """Return the scope of every leaf: the one that its record declares, or ``batched`` outside of records."""
+    """Return the scope of every leaf: the one that its record declares, or ``batch`` outside of records."""
 
     def is_record(x: object) -> bool:
         return isinstance(x, PyTree)
 
-    return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
+    return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batch", tree, is_leaf=is_record))
 
 
 def world_function(stage: Stage, axes: Axes) -> Callable[[Any], Any]:

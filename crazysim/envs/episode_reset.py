@@ -31,7 +31,7 @@ class EpisodeReset:
         first_stage, *other_stages = sim.reset_pipeline.items()
         batched_stages = [name for name, fn in other_stages if not isinstance(fn, Stage)]
         batched_stages += [] if first_stage[1] is reset else [first_stage[0]]
-        self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
+        self.has_foreign_record = "batch" in jax.tree.leaves(scopes(sim.default_data))
         """True if a record in ``data.plugins`` is a class of another library. Such records are not split by world."""
         self.takes_all_worlds = bool(batched_stages) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""

@@ -68,7 +68,7 @@ def check_record(state: EnvState, stepped: EnvState) -> None:
     for (path, x), scope in zip(start_leaves.items(), leaf_scopes, strict=True):
         name = keystr(path).lstrip(".")
         require(
-            scope not in ("batched", "opaque"),
+            scope not in ("batch", "opaque"),
             f"expected {name} to be declared for drones, worlds or as shared, got a field that is {scope!r}. "
             f'Declare it with leaf("drone"), leaf("world") or leaf("shared").',
         )

@@ -14,7 +14,7 @@ class Numbers(PyTree):
 
     of_drone: jax.Array = leaf("drone", 1)
     of_world: jax.Array = leaf("world", 1)
-    batched: jax.Array = leaf("batched")
+    batched: jax.Array = leaf("batch")
     shared: jax.Array = leaf("shared", 1)
     opaque: jax.Array = leaf("opaque")
 

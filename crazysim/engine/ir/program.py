@@ -40,7 +40,7 @@ class Leaf:
     name: str
     """Path of the field in the record."""
     scope: str
-    """Scope of the field: ``drone``, ``world``, ``batched``, ``shared`` or ``opaque``."""
+    """Scope of the field: ``drone``, ``world``, ``batch``, ``shared`` or ``opaque``."""
     shape: tuple[int, ...]
     """Shape, for all worlds."""
     dtype: Any

@@ -152,7 +152,7 @@ def list_quantities(sim: Sim) -> list[str]:
     for path, scope, x in _numeric_leaves(sim.data):
         if scope in ("drone", "world"):
             names.append(path)
-        elif has_members(scope) and scope not in ("shared", "opaque", "batched"):
+        elif has_members(scope) and scope not in ("shared", "opaque", "batch"):
             names += [f"{path}[{k}]" for k in range(x.shape[1])]
     return names
 
