@@ -6,15 +6,15 @@ the population in lanes. `Step` runs stages on a record, and `explain` says how.
 
 from typing import TYPE_CHECKING
 
+from crazysim.engine.pair_reductions import reduce_over_others
+from crazysim.engine.pytree import Members, PyTree, leaf, leaf_indices, scopes, static
+from crazysim.engine.record import Record, Roles
+from crazysim.engine.sharding import shard, world_mesh
+from crazysim.engine.stage import stage
 from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
-    from crazysim.engine.pair_reductions import reduce_over_others
     from crazysim.engine.plan import ENGINES
-    from crazysim.engine.pytree import Members, PyTree, leaf, scopes, static
-    from crazysim.engine.record import Record
-    from crazysim.engine.sharding import shard, world_mesh
-    from crazysim.engine.stage import Stage, stage
     from crazysim.engine.step import Step
     from crazysim.engine.tools.explain import explain
 
@@ -23,10 +23,11 @@ __all__ = [
     "Members",
     "PyTree",
     "Record",
-    "Stage",
+    "Roles",
     "Step",
     "explain",
     "leaf",
+    "leaf_indices",
     "reduce_over_others",
     "scopes",
     "shard",
@@ -39,18 +40,7 @@ __getattr__ = lazy_getattr(
     __name__,
     {
         "ENGINES": "crazysim.engine.plan",
-        "Members": "crazysim.engine.pytree",
-        "PyTree": "crazysim.engine.pytree",
-        "Record": "crazysim.engine.record",
-        "Stage": "crazysim.engine.stage",
         "Step": "crazysim.engine.step",
         "explain": "crazysim.engine.tools.explain",
-        "leaf": "crazysim.engine.pytree",
-        "reduce_over_others": "crazysim.engine.pair_reductions",
-        "scopes": "crazysim.engine.pytree",
-        "shard": "crazysim.engine.sharding",
-        "stage": "crazysim.engine.stage",
-        "static": "crazysim.engine.pytree",
-        "world_mesh": "crazysim.engine.sharding",
     },
 )

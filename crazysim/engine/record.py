@@ -42,14 +42,14 @@ class Record(PyTree):
 
     def check(self) -> None:
         """Raise an error for values that no step accepts. It is called once for each structure."""
-        raise NotImplementedError
+        require_arrays(self)
 
     def without_sizes(self) -> Self:
         """Return the record with equal static fields for any number of worlds and members.
 
         Stages with ``trace_once`` are traced once for all records that are then alike.
         """
-        raise NotImplementedError
+        return self
 
 
 def require_arrays(data: Record) -> None:

@@ -44,9 +44,6 @@ class Workshop(Record):
     def check(self):
         check_axes(self, len(self.ticks), 0)
 
-    def without_sizes(self):
-        return self
-
 
 def make_workshop(n_worlds=3, n_pendulums=2, n_sparks=3):
     def ids(n):
