@@ -17,14 +17,12 @@ from crazysim.arguments import check_flag
 from crazysim.errors import ConfigError, require
 from crazysim.tables import MAX_NUMBER, read_floats
 from crazysim.trajectories.interpolation import unit_coefficients
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory
 
 FIT_TOLERANCE = 5e-6
 """Largest error of the position of a fitted curve, m. Rounding to float32 adds 6e-8 of a coordinate."""
 MAX_PIECES = 20_000
 """Largest number of pieces of a fitted curve."""
-MAX_SIZE = 1e6
-"""Largest length, m, number of oscillations, or phase, rad."""
 PERIOD_RANGE = (1e-3, 1e6)
 """Shortest and longest period, s."""
 DEFAULT_PERIOD = 5.0

@@ -12,6 +12,7 @@ from crazysim.core.settings import positive_integer
 from crazysim.errors import require
 from crazysim.tables import read_floats
 from crazysim.trajectories.curves import require_positive, require_vector
+from crazysim.trajectories.trajectory import MAX_SIZE
 
 CENTER = (0.0, 0.0, 1.0)
 """Default centre of a formation, m."""
@@ -84,8 +85,12 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     """
     a, b = read_floats("starts", starts), read_floats("targets", targets)
     require(
-        a.shape == b.shape and a.ndim == 2 and a.shape[1] == 3 and np.all(np.isfinite(a) & np.isfinite(b)),
-        f"expected as many finite starts as targets, (n, 3) each, got shapes {a.shape} and {b.shape}",
+        a.shape == b.shape
+        and a.ndim == 2
+        and a.shape[1] == 3
+        and np.all((np.abs(a) <= MAX_SIZE) & (np.abs(b) <= MAX_SIZE)),
+        f"expected as many finite starts as targets, (n, 3) each and of a size up to {MAX_SIZE:g}, got "
+        f"shapes {a.shape} and {b.shape}. Pass positions in metres.",
     )
     from scipy.optimize import linear_sum_assignment  # a fifth of a second to import
 

@@ -12,7 +12,7 @@ from crazysim.errors import ConfigError, expect, require
 from crazysim.tables import read_floats
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.bezier import power_coefficients
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory, ends_of
 
 SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
 """Order of the derivative that a spline minimises (the integral of its square), by the degree of the spline."""
@@ -55,6 +55,7 @@ def spline(
         raise ConfigError(
             f"expected finite, ascending times, got {knots.tolist()}. Remove points that share their time."
         )
+    ends_of(durations)
     nodes = np.full((len(knots), SPLINE_ORDERS[degree], 4), np.nan)
     nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(knots))[:, None]], axis=1)
     if at_rest:
@@ -134,14 +135,19 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     return np.unwrap(np.broadcast_to(angles, (n_points,)))
 
 
-def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Return the values after a check that all are finite.
+def require_finite(values: NDArray[np.float64], name: str, limit: float = MAX_SIZE) -> NDArray[np.float64]:
+    """Return the values after a check that all are finite and of a size up to ``limit``, so that no product overflows.
 
     Args:
         values: Numbers. (...)
         name: Name of the values for the message.
+        limit: Largest absolute value.
     """
-    if not np.all(np.isfinite(values)):
-        index = np.argwhere(~np.isfinite(values))[0].tolist()
-        raise ConfigError(f"expected finite {name}, got {values[tuple(index)]} at index {index}. Remove or replace it.")
+    is_wrong = ~(np.abs(values) <= limit)
+    if np.any(is_wrong):
+        index = np.argwhere(is_wrong)[0].tolist()
+        raise ConfigError(
+            f"expected finite {name} of a size up to {limit:g}, got {values[tuple(index)]:g} at index {index}. Remove "
+            "or replace it."
+        )
     return values

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from numpy.polynomial.polynomial import polyder, polyval
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_arguments, check_flag
 from crazysim.control.setpoint import Setpoint
@@ -24,6 +24,8 @@ from crazysim.trajectories.interpolation import unit_coefficients
 
 MAX_COUNTED_PIECES = 16
 """Largest number of pieces of a single trajectory at which ``_find_piece`` counts ends instead of bisecting."""
+MAX_SIZE = 1e6
+"""Largest coordinate, m, angle, rad, or number of oscillations."""
 N_DERIVATIVES = 4
 """Highest derivative of a setpoint: snap."""
 
@@ -62,22 +64,17 @@ class Trajectory(PyTree):
             f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}. Pass one set of coefficients "
             "per piece.",
         )
-        require(
-            c.shape[2] and np.all(np.isfinite(c)),
-            f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for NaN.",
-        )
-        ends = np.cumsum(lengths).astype(float_dtype())
-        steps = np.diff(ends, prepend=0.0)
-        if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
-            k = int(np.argmin(np.where(np.isfinite(steps), steps, -np.inf)))
-            raise ConfigError(
-                f"expected finite, positive durations that add up to ascending times in {ends.dtype.name}, "
-                f"got {lengths[k]!r} s for piece {k}. Merge pieces that are too short."
-            )
+        ends = ends_of(lengths)
         if c.shape[1] == 3:
             c = np.concatenate([c, np.zeros_like(c[:, :1])], axis=1)
-        c = c * lengths[:, None, None] ** np.arange(c.shape[2])
-        return Trajectory(ends, c.astype(float_dtype()), np.bool_(check_flag("repeats", repeats)))  # type: ignore[arg-type]
+        with np.errstate(over="ignore", invalid="ignore"):
+            c = (c * lengths[:, None, None] ** np.arange(c.shape[2])).astype(float_dtype())
+        require(
+            c.shape[2] and np.all(np.isfinite(c)),
+            f"expected coefficients finite in {c.dtype.name}, at least one for each axis, got shape {c.shape}. Check "
+            "the input for NaN and for numbers that are too large.",
+        )
+        return Trajectory(ends, c, np.bool_(check_flag("repeats", repeats)))  # type: ignore[arg-type]
 
     @property
     def n_pieces(self) -> int:
@@ -275,8 +272,8 @@ class Trajectory(PyTree):
             )
         is_number = isinstance(transition, (int, float, np.number)) and not isinstance(transition, bool)
         require(
-            is_number and 0 <= transition < np.inf,
-            f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.",
+            is_number and 0 <= transition <= MAX_SIZE,
+            f"expected a transition from 0 to {MAX_SIZE:g} s, got {transition!r}. Use for example 1.0.",
         )
         if transition > 0:
             before, after = self._end_derivatives(at_end=True), other._end_derivatives(at_end=False)
@@ -327,10 +324,10 @@ class Trajectory(PyTree):
         for name, value, shape in (("offset", offset, (3,)), ("yaw", yaw, ())):
             is_concrete = not isinstance(value, jax.core.Tracer)
             array = np.asarray(value) if is_concrete else value
-            is_finite = is_concrete and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
+            is_finite = is_concrete and array.dtype.kind in "iuf" and np.all(np.abs(array) <= MAX_SIZE)
             expect(
                 array.shape == shape and (not is_concrete or is_finite),
-                f"{name} as finite numbers of shape {shape}",
+                f"{name} as finite numbers of shape {shape} and a size up to {MAX_SIZE:g}",
                 value,
             )
         xp = _array_module([self, offset, yaw])
@@ -340,6 +337,20 @@ class Trajectory(PyTree):
         rotated_coefficients = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
         constant = rotated_coefficients[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
         return self.replace(coefficients=xp.concatenate([constant, rotated_coefficients[..., 1:]], axis=-1))
+
+
+def ends_of(durations: NDArray[np.float64]) -> NDArray:
+    """Return the end of each piece, s, after a check of the durations, s. (n_pieces,)"""
+    with np.errstate(over="ignore", invalid="ignore"):
+        ends = np.cumsum(durations).astype(float_dtype())
+        steps = np.diff(ends, prepend=0.0)
+    if not np.all(np.isfinite(ends)) or not np.all(durations > 0) or not np.all(steps > 0):
+        k = int(np.argmin(np.where(np.isfinite(steps), steps, -np.inf)))
+        raise ConfigError(
+            f"expected finite, positive durations that add up to ascending times in {ends.dtype.name}, "
+            f"got {durations[k]!r} s for piece {k}. Merge pieces that are too short."
+        )
+    return ends
 
 
 def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Trajectory]:

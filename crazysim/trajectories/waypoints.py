@@ -16,7 +16,7 @@ from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits, require_limits
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces, unwrap_yaw
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory, ends_of
 
 YAW_ORDER = 2
 """Order of the yaw derivative in the cost of the yaw. The torque depends on the second derivative (Mellinger and Kumar
@@ -224,9 +224,9 @@ def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike 
             continue
         array = read_floats(name, values)
         require(
-            array.shape == positions.shape and not np.any(np.isinf(array)),
-            f"expected finite {name} {positions.shape}, NaN where free, got shape {array.shape}. Pass one row per "
-            "waypoint.",
+            array.shape == positions.shape and not np.any(np.abs(array) > MAX_SIZE),
+            f"expected finite {name} {positions.shape} of a size up to {MAX_SIZE:g}, NaN where free, got shape "
+            f"{array.shape}. Pass one row per waypoint.",
         )
         nodes[:, k] = array
     return nodes
@@ -262,4 +262,5 @@ def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
             f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}. Pass "
             "limits= to have them chosen."
         )
+    ends_of(lengths)
     return lengths

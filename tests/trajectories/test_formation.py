@@ -53,6 +53,8 @@ def test_matched_targets_keep_straight_flights_clear(n, seed):
 def test_matching_refuses_different_numbers():
     with pytest.raises(ConfigError, match="as many finite starts as targets"):
         formation.matched(np.zeros((2, 3)), np.zeros((3, 3)))
+    with pytest.raises(ConfigError, match="of a size up to"):
+        formation.matched(np.zeros((2, 3)), np.full((2, 3), 1e300))
 
 
 @pytest.mark.parametrize("make", SHAPES.values())

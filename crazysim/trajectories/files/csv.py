@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import require, short_repr
 from crazysim.storage import read_text, write_file
-from crazysim.tables import read_floats
+from crazysim.tables import MAX_NUMBER, read_floats
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.polynomials import trajectory_from_rows, trajectory_rows
 from crazysim.trajectories.interpolation import unit_coefficients
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces
-from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory
 
 POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
 """Header of Crazyswarm's files, as ``uav_trajectories`` writes them."""
@@ -117,8 +117,8 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
         shapes == [(n,), (n, 3), (n,)][: len(shapes)],
         f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {shapes}. Pass one row per time.",
     )
-    for name, column in zip(("times", "pos", "yaw"), columns, strict=False):
-        require_finite(column, name)
+    for name, column, limit in zip(("times", "pos", "yaw"), columns, (MAX_NUMBER, MAX_SIZE, MAX_SIZE), strict=False):
+        require_finite(column, name, limit)
     columns = [column.reshape(n, -1) for column in columns]
     lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in np.concatenate(columns, axis=1))]
     write_file(path, "".join(f"{line}\n" for line in lines).encode())
