@@ -51,10 +51,6 @@ def spline(
         "the degree.",
     )
     durations = np.diff(knots)
-    if not np.all(np.isfinite(knots)) or not np.all(durations > 0):
-        raise ConfigError(
-            f"expected finite, ascending times, got {knots.tolist()}. Remove points that share their time."
-        )
     ends_of(durations)
     nodes = np.full((len(knots), SPLINE_ORDERS[degree], 4), np.nan)
     nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(knots))[:, None]], axis=1)
@@ -95,10 +91,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         "all curves a yaw, or none.",
     )
     durations = np.diff(end_times, prepend=0.0)
-    if not np.all(np.isfinite(end_times)) or not np.all(durations > 0):
-        raise ConfigError(
-            f"expected finite, positive, ascending ends, got {end_times.tolist()}. Remove curves without duration."
-        )
+    ends_of(durations)
     degree = max(len(curve) for curve in curves) - 1
     pieces = [
         interpolation.pad_degree(power_coefficients(require_finite(curve, "control points")), degree)

@@ -257,10 +257,10 @@ def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float
 def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s, after a check. (n_pieces,)"""
     lengths = read_floats("durations", durations)
-    if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
-        raise ConfigError(
-            f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}. Pass "
-            "limits= to have them chosen."
-        )
+    require(
+        lengths.shape == (n_pieces,),
+        f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}. Pass limits= to "
+        "have them chosen.",
+    )
     ends_of(lengths)
     return lengths
