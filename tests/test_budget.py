@@ -25,7 +25,7 @@ BUDGET = {
     "scene": 3099,
     "sim": 1215,
     "train": 2455,
-    "trajectories": 1380,
+    "trajectories": 1385,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
 
