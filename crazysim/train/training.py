@@ -34,8 +34,7 @@ from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
 from crazysim.errors import ConfigError, DivergedError, require, require_callable, warn
 from crazysim.progress import progress_bar
-from crazysim.sim.sim import Sim
-from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, open_replacement, read_text, write_file
+from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, read_text, write_file
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, find_recipe
@@ -139,229 +138,273 @@ def train_many(
         DivergedError: If weights or losses of all trainings become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
-    folder = as_path(folder)
-    path = folder / CHECKPOINT_FILE
-    start_time = time.perf_counter()
-    evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     require_callable("on_iteration", on_iteration)
-    log = log if is_first_host() else lambda _: None
-    if checkpoint_every is not None:
-        checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
-    metadata = {name: _run_metadata(config) for name, config in configs.items()}
-    code_hash = next(iter(metadata.values()))["code"]  # of the task
-    stored_arrays, runs, stored_hash, seconds_before = _read_run(path, configs) if resume else ({}, {}, code_hash, 0.0)
-    trainings = [_Training(name, config, folder / name, metadata[name]) for name, config in configs.items()]
-    for training in trainings if resume else ():
-        training.curve, training.divergence_iteration = (
-            list(runs[training.name]["curve"]),
-            runs[training.name]["diverged"],
-        )
-    config, n_trainings = trainings[0].config, len(trainings)
-    _require_same_on_hosts(
-        metadata,
-        devices=config.devices,
-        evaluation_worlds=evaluation_worlds,
-        checkpoint_every=checkpoint_every,
-        resume=resume,
-        seconds_of_checkpoint=seconds_before,
+    run = _Run(
+        configs,
+        as_path(folder),
+        resume,
+        positive_integer("evaluation_worlds", evaluation_worlds),
+        None if checkpoint_every is None else read_number("checkpoint_every", checkpoint_every, POSITIVE),
+        log if is_first_host() else lambda _: None,
     )
-    if not resume:
-        require_no_run(folder)
-    algorithm = ALGORITHMS[config.algorithm]
-    hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
-    n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
-    base_env = config.make_training_env(n_trainings)
-    wrapped_env = dagger.wrap_with_teacher(base_env, hyperparameters[0]) if algorithm is dagger else base_env
-    is_privileged = config.config.get("critic") in PRIVILEGED_CRITICS
-    wrapped_env = PrivilegedObservation(base_env) if is_privileged else wrapped_env
-    env = base_env if algorithm is apg else AutoReset(wrapped_env)
-    eval_env = config.make_env(n_trainings * evaluation_worlds)
-    check_key = jax.random.key(CHECK_SEED)
-    seed_keys = [jax.random.key(training.config.seed) for training in trainings]
-    keys = jax.jit(lambda keys: jnp.stack([jax.random.fold_in(key, 1) for key in keys]))(seed_keys)
-    init_fn = algorithm.init if config.network is None else partial(algorithm.init, network=config.network)
-    shapes = jax.eval_shape(partial(init_fn, env, hyperparameters), keys)
-    shardings, replicated = learner_shardings(shapes, base_env.sim, n_trainings), replicated_sharding(base_env.sim)
-    init = jax.jit(init_fn, static_argnums=(0, 1), out_shardings=shardings)
-    iterate_fn = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
-    policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
-    kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policy_shapes)] * n_trainings
-    for training in trainings if is_first_host() else ():
-        make_folder(training.folder)
+    run.compile()
+    run.log_start()
+    n_done, n_iterations = int(run.learner.iteration), run.n_iterations
+    try:
+        if not resume or n_done >= n_iterations:
+            run.evaluate()
+        with _iteration_bar(n_iterations, n_done, progress) as show_progress:
+            for i in range(n_done + 1, n_iterations + 1):
+                run.iterate(i)
+                show_progress(run.metrics if i % 5 == 1 else {})
+                evaluation: dict[str, np.ndarray] = {}
+                if i % run.evaluation_period == 0 or i == n_iterations:
+                    evaluation = run.evaluate()
+                    show_progress(evaluation, 0)
+                else:
+                    run.save_if_due()
+                if on_iteration is not None:
+                    on_iteration(i, _host_metrics(run.metrics, evaluation))
+                if must_stop(i):
+                    raise SystemExit(128 + signal.SIGTERM)
+    except (KeyboardInterrupt, SystemExit) as error:
+        if jax.process_count() == 1 or isinstance(error, SystemExit):  # else the other hosts would not join
+            run.evaluate()
+            run.log(
+                f"interrupted after iteration {int(run.learner.iteration)}; wrote {run.path}; continue with --resume"
+            )
+        raise
+    return run.results()
 
-    @keep_programs()
-    def load_or_init() -> tuple[Learner, list[Policy]]:
-        if resume:
-            files = checkpoint.restore(path, stored_arrays, {"learner": shapes, "kept": kept_shapes})
-            return distribute(files["learner"], shardings), jax.device_put(files["kept"], eval_env.sim.device)
-        learner = init(env, hyperparameters, distribute(keys, replicated))
-        require_finite_start(base_env.task, learner.env)
-        policies = fetch_arrays(learner.as_policy())
-        return learner, [take_seed(policies, i) for i in range(n_trainings)]
 
-    def evaluate_policies(policies: Policy, key: Array | None) -> list[dict[str, float]]:
+class _Run:
+    """The trainings of a program: their learner, compiled functions, evaluations and files."""
+
+    def __init__(
+        self,
+        configs: Mapping[str, TrainConfig],
+        folder: Path,
+        resume: bool,
+        n_starts: int,
+        checkpoint_every: float | None,
+        log: Callable[[str], None],
+    ):
+        self.folder, self.path, self.log = folder, folder / CHECKPOINT_FILE, log
+        self.n_starts, self.checkpoint_every = n_starts, checkpoint_every
+        self.start_time = time.perf_counter()
+        metadata = {name: _run_metadata(config) for name, config in configs.items()}
+        self.code_hash = next(iter(metadata.values()))["code"]  # of the task
+        runs: dict[str, Any] = {name: {"curve": [], "diverged": None} for name in configs}
+        self.stored_arrays, runs, self.stored_hash, self.seconds_before = (
+            _read_run(self.path, metadata) if resume else (None, runs, self.code_hash, 0.0)
+        )
+        self.trainings = [
+            _Training(name, config, folder / name, metadata[name], list(runs[name]["curve"]), runs[name]["diverged"])
+            for name, config in configs.items()
+        ]
+        self.config = self.trainings[0].config
+        _require_same_on_hosts(
+            metadata,
+            devices=self.config.devices,
+            evaluation_worlds=n_starts,
+            checkpoint_every=checkpoint_every,
+            resume=resume,
+            seconds_of_checkpoint=self.seconds_before,
+        )
+        if not resume:
+            require_no_run(folder)
+        self.evaluation_period = find_recipe(self.config.task, self.config.algorithm).evaluate_every
+        self.hyperparameters = tuple([training.config.algorithm_config() for training in self.trainings])
+        self.n_iterations = self.hyperparameters[0].iterations
+        self.env = self.config.make_training_env(len(configs))
+        self.eval_env = self.config.make_env(len(configs) * n_starts)
+        self.description = describe(self.env)
+        n_steps = self.hyperparameters[0].n_steps
+        self.steps_per_iteration = self.config.n_worlds * self.env.sim.n_drones * n_steps
+
+    def compile(self) -> None:
+        """Compile iteration and evaluation, and make or load the learner and the kept policies."""
+        n_trainings, sim = len(self.trainings), self.env.sim
+        algorithm, network = ALGORITHMS[self.config.algorithm], self.config.network
+        arguments = self._wrapped_env(), self.hyperparameters
+        seed_keys = [jax.random.key(training.config.seed) for training in self.trainings]
+        keys = jax.jit(lambda keys: jnp.stack([jax.random.fold_in(key, 1) for key in keys]))(seed_keys)
+        init_fn = algorithm.init if network is None else partial(algorithm.init, network=network)
+        shapes = jax.eval_shape(partial(init_fn, *arguments), keys)
+        shardings, replicated = learner_shardings(shapes, sim, n_trainings), replicated_sharding(sim)
+        init = jax.jit(init_fn, static_argnums=(0, 1), out_shardings=shardings)
+        attach = partial(jax.tree.map, lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding))
+        iterate = jax.jit(algorithm.iterate, static_argnums=(1, 2), out_shardings=(shardings, replicated))
+        policies = jax.eval_shape(self._policies_of, shapes)
+        kept_shapes = [jax.eval_shape(lambda policies: take_seed(policies, 0), policies)] * n_trainings
+        for training in self.trainings if is_first_host() else ():
+            make_folder(training.folder)
+
+        @keep_programs()
+        def load_or_init() -> tuple[Learner, list[Policy]]:
+            if self.stored_arrays is not None:
+                template = {"learner": shapes, "kept": kept_shapes}
+                files = checkpoint.restore(self.path, self.stored_arrays, template)
+                return distribute(files["learner"], shardings), files["kept"]
+            learner = init(*arguments, distribute(keys, replicated))
+            require_finite_start(self.env.task, learner.env)
+            policies = fetch_arrays(self._policies_of(learner))
+            return learner, [take_seed(policies, i) for i in range(n_trainings)]
+
+        @keep_programs()
+        def compile_evaluation() -> str:
+            self._evaluate_policies(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policies), None)
+            return sim.explain().splitlines()[0]
+
+        @keep_programs()
+        def compile_iteration() -> tuple[Any, float]:
+            start_time = time.perf_counter()
+            compiled = iterate.lower(attach(shapes, shardings), *arguments).compile()
+            return compiled, time.perf_counter() - start_time
+
+        # Each compilation takes seconds, mostly on one core, so they run in parallel.
+        with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as executor:
+            iteration, start = executor.submit(compile_iteration), executor.submit(load_or_init)
+            evaluation = executor.submit(compile_evaluation)
+            (self.learner, kept_policies), self.engine = start.result(), evaluation.result()
+            self._iterate, self.compile_seconds = iteration.result()
+        for training, policy in zip(self.trainings, kept_policies, strict=True):
+            training.kept_policy = policy
+        self.metrics: dict[str, Array] = {}
+        self.saved_iteration, self.save_time = int(self.learner.iteration), time.perf_counter()
+
+    def _wrapped_env(self) -> Env:
+        if self.config.algorithm == "apg":
+            return self.env
+        if self.config.algorithm == "dagger":
+            return AutoReset(dagger.wrap_with_teacher(self.env, self.hyperparameters[0]))
+        is_privileged = self.config.config["critic"] in PRIVILEGED_CRITICS
+        return AutoReset(PrivilegedObservation(self.env) if is_privileged else self.env)
+
+    @property
+    def seconds(self) -> float:
+        return self.seconds_before + time.perf_counter() - self.start_time
+
+    def _policies_of(self, learner: Learner) -> Policy:
+        return learner.as_policy().replace(interface=Interface.read(self.description))
+
+    def _evaluate_policies(self, policies: Policy, key: Array | None) -> list[dict[str, float]]:
         """Return the metrics of each training's policy. The policies are host arrays, so slices need no compilation."""
+        n_trainings, device = len(self.trainings), self.eval_env.sim.device
         policy = take_seed(policies, 0) if n_trainings == 1 else Policies(policies)
-        return evaluate_blocks(eval_env, jax.device_put(policy, eval_env.sim.device), key, n_trainings)
+        return evaluate_blocks(self.eval_env, jax.device_put(policy, device), key, n_trainings)
 
-    @keep_programs()
-    def compile_evaluation() -> tuple[dict[str, Any], str]:
-        zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy_shapes)
-        description = describe(base_env)
-        evaluate_policies(zeros.replace(interface=Interface.read(description)), None)
-        return description, base_env.sim.explain().splitlines()[0]
+    def iterate(self, iteration: int) -> None:
+        """Begin an iteration, and wait for the previous one while it runs."""
+        metrics_before = self.metrics
+        self.learner, self.metrics = self._iterate(self.learner)  # no signal is handled between the two
+        self._mark_diverged(metrics_before, iteration - 1)
 
-    @keep_programs()
-    def compile_iteration() -> tuple[Any, float]:
-        compile_start = time.perf_counter()
-        compiled = iterate_fn.lower(_attach_shardings(shapes, shardings), env, hyperparameters).compile()
-        return compiled, time.perf_counter() - compile_start
-
-    # Each compilation takes seconds, mostly on one core, so they run in parallel.
-    with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as executor:
-        iteration_future, init_future = executor.submit(compile_iteration), executor.submit(load_or_init)
-        evaluation_future = executor.submit(compile_evaluation)
-        (learner, kept_policies), (description, engine) = init_future.result(), evaluation_future.result()
-        iterate, compile_s = iteration_future.result()
-    interface = Interface.read(description)
-    for training, policy in zip(trainings, kept_policies, strict=True):
-        training.kept_policy = policy.replace(interface=interface)
-    n_done = saved_iteration = int(learner.iteration)
-    save_time = time.perf_counter()
-    steps_per_iteration = config.n_worlds * base_env.sim.n_drones * n_steps
-    repetition_text = "" if n_trainings == 1 else f"{n_trainings} times "
-    log(
-        f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n_trainings == 1 else ', '.join(configs)}: "
-        f"{_iterations_text(n_iterations)} of {repetition_text}{steps_per_iteration:,} steps "
-        f"in {repetition_text}{config.n_worlds:,} worlds, "
-        f"{_describe_devices(base_env.sim, iterate)}"
-        f"{base_env.sim.control.value} commands, {engine}" + (f"; continues after iteration {n_done}" if n_done else "")
-    )
-    if stored_hash != code_hash:
-        log("the file of the task has changed since the checkpoint was written; it is used as it is now")
-    if n_done >= n_iterations:
-        log(
-            f"nothing is left to train after {_iterations_text(n_done)}; "
-            f"continue with more: --iterations {2 * n_done or 100}"
-        )
-
-    def elapsed_seconds() -> float:
-        return seconds_before + time.perf_counter() - start_time
-
-    def save_checkpoint(learner: Learner) -> None:
-        """Write the checkpoint."""
-        nonlocal saved_iteration, save_time
-        runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in trainings}
-        meta = {"crazysim": crazysim.__version__, "code": code_hash, "runs": runs, "seconds": elapsed_seconds()}
-        files = fetch_arrays({"learner": learner, "kept": [training.kept_policy for training in trainings]})
-        if is_first_host():
-            checkpoint.save(path, files, meta)
-        saved_iteration, save_time = int(learner.iteration), time.perf_counter()
-
-    def evaluate_and_save(learner: Learner, metrics: dict[str, Array]) -> list[dict[str, Any]]:
-        """Evaluate the policies, update the kept policies, write all files, and return the last point of each curve."""
-        iteration, policies = int(learner.iteration), fetch_arrays(learner.as_policy()).replace(interface=interface)
-        mark_diverged(metrics, iteration)
-        is_planned = iteration % evaluation_period == 0 or iteration == n_iterations
-        results, checks = evaluate_policies(policies, None), evaluate_policies(policies, check_key)
-        counters = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": elapsed_seconds()}
-        for i, training in enumerate(trainings):
+    def evaluate(self) -> dict[str, np.ndarray]:
+        """Evaluate and keep policies, write all files, and return the latest metrics of each training, by name."""
+        iteration, policies = int(self.learner.iteration), fetch_arrays(self._policies_of(self.learner))
+        self._mark_diverged(self.metrics, iteration)
+        is_planned = iteration % self.evaluation_period == 0 or iteration == self.n_iterations
+        results = self._evaluate_policies(policies, None)
+        checks = self._evaluate_policies(policies, jax.random.key(CHECK_SEED))
+        env_steps = iteration * self.steps_per_iteration
+        counters = {"iteration": iteration, "env_steps": env_steps, "seconds": self.seconds}
+        for i, training in enumerate(self.trainings):
             if training.divergence_iteration is None:
-                point = counters | results[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
-                training.add_evaluation(point, take_seed(policies, i), evaluation_worlds, description, is_planned)
-        if "" not in configs and is_first_host():
-            write_table(folder, [training.row for training in trainings])
-        save_checkpoint(learner)
-        return [training.curve[-1] for training in trainings]
+                check = {"compile_seconds": self.compile_seconds, "check": checks[i]["success"]}
+                point, policy = counters | results[i] | check, take_seed(policies, i)
+                training.add_evaluation(point, policy, self.n_starts, self.description, is_planned)
+        if self.trainings[0].name and is_first_host():
+            write_table(self.folder, [training.row for training in self.trainings])
+        self.save()
+        points = [training.curve[-1] for training in self.trainings]
+        return {name: np.array([float(point[name]) for point in points]) for name in points[0]}
 
-    def mark_diverged(metrics: dict[str, Array], iteration: int) -> None:
-        """Mark the trainings that have diverged according to the metrics of an iteration; raise an error if all have.
+    def save_if_due(self) -> None:
+        """Write the checkpoint if the time between two checkpoints has passed."""
+        every = self.checkpoint_every
+        if every is not None and broadcast_decision(time.perf_counter() - self.save_time > every):
+            self._mark_diverged(self.metrics, int(self.learner.iteration))
+            self.save()
 
-        Args:
-            metrics: Metrics of the iteration; none before the first one.
-            iteration: Number of the iteration.
-        """
-        finite = np.asarray(metrics.get("finite", np.full(n_trainings, True)))
-        for training, is_finite in zip(trainings, finite, strict=True):
-            if is_finite or training.divergence_iteration is not None:
-                continue
-            training.divergence_iteration = iteration
-            if n_trainings > 1:
-                log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
-        if all(training.divergence_iteration is not None for training in trainings):
+    def save(self) -> None:
+        """Write the checkpoint."""
+        runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in self.trainings}
+        meta = {"crazysim": crazysim.__version__, "code": self.code_hash, "runs": runs, "seconds": self.seconds}
+        files = fetch_arrays({"learner": self.learner, "kept": [training.kept_policy for training in self.trainings]})
+        if is_first_host():
+            checkpoint.save(self.path, files, meta)
+        self.saved_iteration, self.save_time = int(self.learner.iteration), time.perf_counter()
+
+    def _mark_diverged(self, metrics: dict[str, Array], iteration: int) -> None:
+        """Mark the trainings that have diverged in an iteration; raise an error if all have."""
+        finite = np.asarray(metrics.get("finite", np.full(len(self.trainings), True)))
+        for training, is_finite in zip(self.trainings, finite, strict=True):
+            if not is_finite and training.divergence_iteration is None:
+                training.divergence_iteration = iteration
+                if training.name:
+                    self.log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
+        if all(training.divergence_iteration is not None for training in self.trainings):
             is_taught = np.all(metrics.get("taught", True))
             remedy = (
                 "Use a smaller learning_rate or max_grad_norm"
                 if is_taught
                 else "The teacher's actions are NaN: use another"
             )
-            names = [f" ({training.name})" * (n_trainings > 1) for training in trainings]
-            diverged = [f"{x.divergence_iteration}{name}" for x, name in zip(trainings, names, strict=True)]
-            kept = [f"{kept_point(x.curve)['iteration']}{name}" for x, name in zip(trainings, names, strict=True)]
+            names = [training.name and f" ({training.name})" for training in self.trainings]
+            diverged = [f"{x.divergence_iteration}{name}" for x, name in zip(self.trainings, names, strict=True)]
+            kept = [f"{kept_point(x.curve)['iteration']}{name}" for x, name in zip(self.trainings, names, strict=True)]
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {', '.join(diverged)} of "
-                f"{config.title} by {config.algorithm}; {path} is of iteration {saved_iteration}, {POLICY_FILE} of "
-                f"iteration {', '.join(kept)}. {remedy}, with another --out."
+                f"{self.config.title} by {self.config.algorithm}; {self.path} is of iteration {self.saved_iteration}, "
+                f"{POLICY_FILE} of iteration {', '.join(kept)}. {remedy}, with another --out."
             )
 
-    evaluation_period = find_recipe(config.task, config.algorithm).evaluate_every
-    # Learner and metrics are replaced together, so an interrupt never leaves a learner with the metrics of another.
-    learner_and_metrics: tuple[Learner, dict[str, Array]] = learner, {}
-    try:
-        if not resume:
-            evaluate_and_save(*learner_and_metrics)
-        with _iteration_bar(n_iterations, n_done, progress) as show_progress:
-            for i in range(n_done, n_iterations):
-                metrics_before = learner_and_metrics[1]
-                learner_and_metrics = iterate(learner_and_metrics[0])
-                mark_diverged(metrics_before, i)  # waits for the previous iteration while this one runs
-                show_progress(learner_and_metrics[1] if i % 5 == 0 else None)
-                points = None
-                if (i + 1) % evaluation_period == 0 and i + 1 < n_iterations:
-                    points = evaluate_and_save(*learner_and_metrics)
-                    show_progress(
-                        {name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0
-                    )
-                elif checkpoint_every is not None and broadcast_decision(
-                    time.perf_counter() - save_time > checkpoint_every
-                ):
-                    mark_diverged(learner_and_metrics[1], i + 1)
-                    save_checkpoint(learner_and_metrics[0])
-                if on_iteration is not None and i + 1 < n_iterations:
-                    on_iteration(i + 1, _host_metrics(learner_and_metrics[1], points))
-                if must_stop(i + 1):
-                    raise SystemExit(128 + signal.SIGTERM)
-        final_points = evaluate_and_save(*learner_and_metrics)
-    except (KeyboardInterrupt, SystemExit) as error:
-        if jax.process_count() > 1 and not isinstance(error, SystemExit):
-            raise  # the other hosts continue, and would not join the evaluation
-        evaluate_and_save(*learner_and_metrics)
-        log(
-            f"interrupted after iteration {int(learner_and_metrics[0].iteration)}; wrote {path}; continue with --resume"
+    def log_start(self) -> None:
+        """Log the settings of the run, and what has changed since its checkpoint."""
+        config, sim, n_done = self.config, self.env.sim, int(self.learner.iteration)
+        names = [training.name or f"seed {config.seed}" for training in self.trainings]
+        devices = ""
+        if sim.mesh is not None:
+            n, n_bytes = sim.mesh.size, sum(exchanged_bytes(self._iterate.as_text()).values())
+            devices = f"{sim.n_worlds // n:,} on each of {n} devices, which exchange {n_bytes:,} bytes an iteration, "
+        repetition = "" if len(names) == 1 else f"{len(names)} times "
+        self.log(
+            f"{config.title} by {config.algorithm}, {', '.join(names)}: "
+            f"{self.n_iterations} iteration{'s' * (self.n_iterations != 1)} of {repetition}"
+            f"{self.steps_per_iteration:,} steps in {repetition}{config.n_worlds:,} worlds, {devices}"
+            f"{sim.control.value} commands, {self.engine}" + (f"; continues after iteration {n_done}" if n_done else "")
         )
-        raise
-    if on_iteration is not None and learner_and_metrics[1]:
-        on_iteration(n_iterations, _host_metrics(learner_and_metrics[1], final_points))
-    criterion = f"error below {base_env.task.tolerance:g} {base_env.task.unit} for the last {base_env.task.hold:g} s"
-    if type(base_env.task).succeeded is not Task.succeeded:
-        criterion = "as the task judges it"
-    results = {}
-    for training in trainings:
-        best, latest, name = kept_point(training.curve), training.curve[-1], f"{training.name}: " * (n_trainings > 1)
-        if best is not latest:
-            log(
-                f"{name}kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
-                f"{evaluation_worlds:,} other starts, by more than two standard errors"
+        if self.stored_hash != self.code_hash:
+            self.log("the file of the task has changed since the checkpoint was written; it is used as it is now")
+        if n_done >= self.n_iterations:
+            self.log(
+                f"nothing is left to train after {n_done} iteration{'s' * (n_done != 1)}; "
+                f"continue with more: --iterations {2 * n_done or 100}"
             )
-        point = best | {name: latest[name] for name in ("env_steps", "seconds", "compile_seconds")}
-        log(
-            f"{name}success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({criterion}), "
-            f"{describe_outcome(point, base_env.task.unit)}; "
-            f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
-        )
-        policy = jax.device_put(training.kept_policy, eval_env.sim.device)
-        results[training.name] = TrainResult(training.folder, point, policy, eval_env)
-    return results
+
+    def results(self) -> dict[str, TrainResult]:
+        """Log and return the results of the trainings by name."""
+        task, results = self.env.task, {}
+        criterion = f"error below {task.tolerance:g} {task.unit} for the last {task.hold:g} s"
+        if type(task).succeeded is not Task.succeeded:
+            criterion = "as the task judges it"
+        for training in self.trainings:
+            best, latest, name = kept_point(training.curve), training.curve[-1], training.name and f"{training.name}: "
+            if best is not latest:
+                self.log(
+                    f"{name}kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
+                    f"{self.n_starts:,} other starts, by more than two standard errors"
+                )
+            point = best | {name: latest[name] for name in ("env_steps", "seconds", "compile_seconds")}
+            self.log(
+                f"{name}success {point['success']:.1%} of {self.n_starts:,} held-out starts ({criterion}), "
+                f"{describe_outcome(point, task.unit)}; {point['env_steps']:,} steps in {point['seconds']:.1f} s, "
+                f"including {self.compile_seconds:.1f} s of compilation"
+            )
+            policy = jax.device_put(training.kept_policy, self.eval_env.sim.device)
+            results[training.name] = TrainResult(training.folder, point, policy, self.eval_env)
+        return results
 
 
 def require_no_run(folder: Path) -> None:
@@ -387,10 +430,10 @@ class _Training:
     """Metadata of the files."""
     curve: list[dict[str, Any]] = field(default_factory=list)
     """Evaluations so far."""
-    kept_policy: Any = None
-    """The kept policy."""
     divergence_iteration: int | None = None
     """Iteration in which weights or losses became non-finite; None if they are finite."""
+    kept_policy: Any = None
+    """The kept policy."""
 
     def add_evaluation(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], is_planned: bool
@@ -437,25 +480,18 @@ class _Training:
 def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     """Write the table of all trainings as JSON and CSV, with null or an empty cell for a missing value."""
     rows = [{name: None if x != x else x for name, x in row.items()} for row in rows]
-    with open_replacement(folder / TABLE_FILE) as file:
-        file.write(json.dumps(rows, indent=1).encode())
+    write_file(folder / TABLE_FILE, json.dumps(rows, indent=1))
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with open_replacement((folder / TABLE_FILE).with_suffix(".csv")) as file:
-        file.write(text.getvalue().encode())
+    write_file((folder / TABLE_FILE).with_suffix(".csv"), text.getvalue())
 
 
-def _host_metrics(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
-    """Return the metrics of an iteration, and of the evaluations after it if there are any.
-
-    Metrics are floats, or arrays with one number for each training if there are several.
-    """
+def _host_metrics(metrics: dict[str, Array], evaluation: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return the metrics of an iteration and of an evaluation after it: numbers, or arrays for several trainings."""
     numbers = {name: x for name, x in jax.device_get(metrics).items() if x.dtype != bool}
-    for name in points[0] if points else ():
-        if name != "iteration":
-            numbers[f"evaluation {name}"] = np.array([float(point[name]) for point in points])
+    numbers |= {f"evaluation {name}": x for name, x in evaluation.items() if name != "iteration"}
     return {name: float(x[0]) if len(x) == 1 else x for name, x in numbers.items()}
 
 
@@ -477,21 +513,6 @@ def least_kept_success(success: float, n_worlds: int) -> float:
 def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the last point of a learning curve whose policy was kept."""
     return next(point for point in reversed(curve) if point["kept"])
-
-
-def _describe_devices(sim: Sim, iterate: Any) -> str:
-    """Return the text of the log on worlds per device and bytes exchanged between devices; empty for one device."""
-    if sim.mesh is None:
-        return ""
-    n, n_bytes = sim.mesh.size, sum(exchanged_bytes(iterate.as_text()).values())
-    return f"{sim.n_worlds // n:,} on each of {n} devices, which exchange {n_bytes:,} bytes an iteration, "
-
-
-def _attach_shardings(shapes: Learner, shardings: Learner) -> Learner:
-    """Return the shapes with shardings attached."""
-    return jax.tree.map(
-        lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes, shardings
-    )
 
 
 def load_policy(
@@ -549,10 +570,6 @@ def load_policy(
     return policy, config, meta
 
 
-def _iterations_text(n: int) -> str:
-    return "1 iteration" if n == 1 else f"{n} iterations"
-
-
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
     """Return the metadata of the files of a run."""
     stored_fields = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
@@ -580,7 +597,7 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
 
 
 def _read_run(
-    path: Path, configs: Mapping[str, TrainConfig]
+    path: Path, metadata: Mapping[str, dict[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
     """Return the contents of a checkpoint: arrays, metadata by training, hash of the task's code, and time so far, s.
 
@@ -589,43 +606,40 @@ def _read_run(
     """
     arrays, meta = checkpoint.read(path)
     with checkpoint.wrap_checkpoint_errors(path):
-        if meta["crazysim"] != crazysim.__version__:
-            raise ConfigError(
-                f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a "
-                f"new run in another folder with --out"
-            )
+        require(
+            meta["crazysim"] == crazysim.__version__,
+            f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
+            f"run in another folder with --out",
+        )
         runs = meta["runs"]
         require(
-            list(runs) == list(configs),
+            list(runs) == list(metadata),
             f"expected the seeds and the sweep of {path}, {', '.join(runs) or 'none'}, got "
-            f"{', '.join(configs) or 'none'}; resume with the same ones, or start a new run in another folder with "
+            f"{', '.join(metadata) or 'none'}; resume with the same ones, or start a new run in another folder with "
             f"--out",
         )
-        for name, config in configs.items():
-            _require_same_settings(path, runs[name]["settings"], config)
+        for name, run in metadata.items():
+            _require_same_settings(path, runs[name]["settings"], run["settings"])
         return arrays, runs, meta["code"], float(meta["seconds"])
 
 
-def _require_same_settings(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
-    """Check that the settings of a stored run equal a configuration, except for settings that may change."""
-    stored_settings, requested_settings = (
-        _fixed_settings(settings) for settings in (settings, _run_metadata(config)["settings"])
+def _require_same_settings(path: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:
+    """Check that the settings of a stored run equal others, except for settings that may change."""
+    has_own_network = stored.get("own_network", False)
+    require(
+        has_own_network == requested["own_network"],
+        f"expected {path} to be resumed with {'its custom network' if has_own_network else 'the built-in network'}. "
+        f"Use network={'network' if has_own_network else None}, or start a new run in another folder with --out.",
     )
-    if settings.get("own_network", False) != config.own_network:
-        has_own_network = not config.own_network
-        raise ConfigError(
-            f"expected {path} to be resumed with "
-            f"{'its custom network' if has_own_network else 'the built-in network'}. "
-            f"Use network={'network' if has_own_network else None}, or start a new run in another folder with --out."
+    stored_values, values = _fixed_settings(stored), _fixed_settings(requested)
+    alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in requested["config"]]
+    for name in {**stored_values, **values}:
+        expected, got = (x.get(name, "its default") for x in (stored_values, values))
+        require(
+            expected == got,
+            f"expected {name} = {expected!r} as in {path}, got {got!r}; resume with the same value, or start a new run "
+            f"in another folder with --out. A resumed run may change {', '.join(alterable)}, device and devices.",
         )
-    for name in {**stored_settings, **requested_settings}:
-        if stored_settings.get(name, "its default") != requested_settings.get(name, "its default"):
-            alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in config.config]
-            raise ConfigError(
-                f"expected {name} = {stored_settings.get(name, 'its default')!r} as in {path}, got "
-                f"{requested_settings.get(name, 'its default')!r}; resume with the same value, or start a new run in "
-                f"another folder with --out. A resumed run may change {', '.join(alterable)}, device and devices."
-            )
 
 
 def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
@@ -655,13 +669,11 @@ def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[
         yield lambda *_: None
         return
     with bar:
-        postfix: dict[str, str] = {}
+        shown: dict[str, str] = {}
 
-        def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:
-            if metrics is not None:
-                values = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
-                postfix.update({k: f"{np.median(v):.3f}" for k, v in values.items()})
-                bar.set_postfix(postfix, refresh=False)
+        def show(metrics: dict[str, Any], iterations: int = 1) -> None:
+            shown.update({k: f"{np.median(metrics[k]):.3f}" for k in ("success", "error", "reward") if k in metrics})
+            bar.set_postfix(shown, refresh=False)
             bar.update(iterations)
 
         yield show

@@ -164,7 +164,7 @@ def test_a_later_policy_within_two_standard_errors_is_kept():
 
 
 def test_the_last_evaluation_of_a_resumed_run_stays_kept_where_it_is_repeated(tmp_path):
-    training = runs._Training("", runs.TrainConfig.create("hover"), tmp_path, {})
+    training = runs._Training("", runs.TrainConfig.create("hover"), tmp_path, {}, [])
     for iteration, is_planned in ((120, True), (130, True), (130, False)):
         point = {"iteration": iteration, "check": 1.0}
         training.add_evaluation(point, np.int32(iteration), 1000, {}, is_planned)
