@@ -86,14 +86,16 @@ def run(
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
     _check_settings(settings, RUN_SETTINGS)
-    config = TrainConfig.create(task, **settings)
-    folder = Path("out") / config.title if folder is None else as_path(folder)
-    train_settings = (evaluation_worlds, log, progress, checkpoint_every)
-    if _train_teacher(config, folder, resume, *train_settings):
-        config, resume = _with_teacher(config, folder), False
-    elif resume:
-        config = TrainConfig.create(task, **settings, resumed=_stored_config(folder))
-    result = train(config, folder, resume, *train_settings, on_iteration)
+    options = {
+        "evaluation_worlds": evaluation_worlds,
+        "log": log,
+        "progress": progress,
+        "checkpoint_every": checkpoint_every,
+    }
+    folder, configs, results = _train_variants(
+        task, folder, resume, {"": (settings.get("seed"), {})}, settings, options, on_iteration
+    )
+    config, result = configs[""], results[""]
     if not is_first_host():
         return result
     log(f"wrote {folder / CHECKPOINT_FILE}, {folder / POLICY_FILE}")
@@ -158,19 +160,13 @@ def run_many(
     """
     _check_settings(settings, tuple(x for x in RUN_SETTINGS if x != "seed"))
     variants = make_variants(seeds, sweep or {}, settings.get("config") or {})
-    first_seed = next(iter(variants.values()))[0]
-    config = TrainConfig.create(task, **settings, seed=first_seed)
-    folder = Path("out") / config.title if folder is None else as_path(folder)
-    train_settings = (evaluation_worlds, log, progress, checkpoint_every)
-    has_teacher = _train_teacher(config, folder, resume, *train_settings)
-    resume = resume and not has_teacher
-    stored_by_name = stored_configs(folder) if resume else {}
-    configs = {}
-    for name, (seed, changes) in variants.items():
-        seed_settings = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
-        config = TrainConfig.create(task, **seed_settings, resumed=stored_by_name.get(name))
-        configs[name] = _with_teacher(config, folder) if has_teacher else config
-    results = train_many(configs, folder, resume, *train_settings, on_iteration)
+    options = {
+        "evaluation_worlds": evaluation_worlds,
+        "log": log,
+        "progress": progress,
+        "checkpoint_every": checkpoint_every,
+    }
+    folder, configs, results = _train_variants(task, folder, resume, variants, settings, options, on_iteration)
     if not is_first_host():
         return results
     log(
@@ -178,7 +174,7 @@ def run_many(
         f"{', '.join(configs)}"
     )
     curves: dict[str, list[Any]] = {}
-    for name in configs:
+    for name, config in configs.items():
         curves.setdefault(name.rpartition("seed-")[0].strip("-") or config.title, []).append(read_curve(folder / name))
     try:
         plot_spread(curves, folder / "curve.png", next(iter(results.values())).env.task.unit)
@@ -208,7 +204,12 @@ def make_variants(
     """
     expect(isinstance(sweep, Mapping), "sweep as a dict of values by name", sweep, "Use {'clip': [0.1, 0.2]}.")
     for name, values in {"seeds": seeds, **sweep}.items():
-        _require_iterable(name, values)
+        expect(
+            np.iterable(values) and not isinstance(values, str),
+            f"{name} as a list of values",
+            values,
+            f"Use [{values!r}], for example.",
+        )
     values_by_name: dict[str, list[Any]] = {
         name: list(itertools.islice(values, MAX_TRAININGS + 1)) for name, values in {"seeds": seeds, **sweep}.items()
     }
@@ -238,25 +239,44 @@ def make_variants(
     }
 
 
-def _train_teacher(
-    student: TrainConfig,
-    folder: Path,
+def _train_variants(
+    task: str | Task,
+    folder: str | Path | None,
     resume: bool,
-    evaluation_worlds: int,
-    log: Callable[[str], None],
-    progress: bool,
-    checkpoint_every: float | None,
-) -> bool:
-    """Train the teacher of the recipe and return True, or return False if there is none or the student has begun.
+    variants: Mapping[str, tuple[int | None, Mapping[str, float]]],
+    settings: Mapping[str, Any],
+    options: Mapping[str, Any],
+    on_iteration: Callable[[int, dict[str, Any]], None] | None,
+) -> tuple[Path, dict[str, TrainConfig], dict[str, TrainResult]]:
+    """Train the teacher of the recipe if it has one, and then the variants, with ``options`` of ``train_many``.
+
+    Returns:
+        The folder of the run, and configurations and results by the name of the variant.
+    """
+    first_seed, _ = next(iter(variants.values()))
+    config = TrainConfig.create(task, **{**settings, "seed": first_seed})
+    folder = Path("out") / config.title if folder is None else as_path(folder)
+    has_teacher = _train_teacher(config, folder, resume, options)
+    resume = resume and not has_teacher
+    stored_by_name = stored_configs(folder) if resume else {}
+    configs = {}
+    for name, (seed, changes) in variants.items():
+        own_settings = {**settings, "seed": seed, "config": {**(settings.get("config") or {}), **changes}}
+        config = TrainConfig.create(task, **own_settings, resumed=stored_by_name.get(name))
+        if has_teacher:
+            config = dataclasses.replace(config, config=config.config | {"teacher": str(folder / TEACHER_FOLDER)})
+        configs[name] = config
+    return folder, configs, train_many(configs, folder, resume, on_iteration=on_iteration, **options)
+
+
+def _train_teacher(student: TrainConfig, folder: Path, resume: bool, options: Mapping[str, Any]) -> bool:
+    """Train the teacher of a student's recipe; return False if there is none, or if the student has begun.
 
     Args:
         student: Configuration of the student.
         folder: Folder of the student's run.
         resume: True to continue an interrupted run, of the teacher or of the student.
-        evaluation_worlds: Number of held-out initial states of each evaluation.
-        log: Function that is called with each line of output.
-        progress: True to show progress bars.
-        checkpoint_every: Time between checkpoints, s.
+        options: Further options of ``train``.
     """
     teacher = student.teacher_config()
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
@@ -267,11 +287,11 @@ def _train_teacher(
         f"expected a run to resume in {folder}, got none. Train without --resume first.",
     )
     _check_student(student)
-    log(
+    options["log"](
         f"first the teacher of {student.title}, then the student by {student.algorithm}; if the teacher is "
         f"interrupted, repeat the command with --resume"
     )
-    train(teacher, folder / TEACHER_FOLDER, resume, evaluation_worlds, log, progress, checkpoint_every)
+    train(teacher, folder / TEACHER_FOLDER, resume, **options)
     return True
 
 
@@ -282,11 +302,6 @@ def _check_student(student: TrainConfig) -> None:
         images_of(env, jax.eval_shape(env.reset, jax.random.key(0)).obs)
 
 
-def _with_teacher(student: TrainConfig, folder: Path) -> TrainConfig:
-    """Return the configuration of a student whose teacher is in the folder of the student's run."""
-    return dataclasses.replace(student, config=student.config | {"teacher": str(folder / TEACHER_FOLDER)})
-
-
 def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
     """Check the names of the settings of ``TrainConfig.create``."""
     if unknown := settings.keys() - set(names):
@@ -294,24 +309,3 @@ def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
             f"expected settings among {', '.join(names)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
             f"in config={{...}}, such as config={{'iterations': 100}}."
         )
-
-
-def _stored_config(folder: Path) -> TrainConfig:
-    """Return the configuration of the run in a folder, which must have a single training."""
-    configs = stored_configs(folder)
-    require(
-        list(configs) == [""],
-        f"expected a run of one training in {folder}, got one of {', '.join(configs)}. Resume it with the same "
-        f"--seeds and --sweep.",
-    )
-    return configs[""]
-
-
-def _require_iterable(name: str, values: object) -> None:
-    """Check that an argument is a list of values, or another iterable."""
-    expect(
-        np.iterable(values) and not isinstance(values, str),
-        f"{name} as a list of values",
-        values,
-        f"Use [{values!r}], for example.",
-    )
