@@ -12,11 +12,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from crazysim.commands.options import MAX_WAIT, number
 from crazysim.errors import ConfigError, DivergedError, require
+
+if TYPE_CHECKING:
+    from crazysim.engine.jaxcompat import Hosts
 
 MAX_PORT = 65535
 """Largest TCP port."""
@@ -28,24 +30,6 @@ POLL_SECONDS = 0.5
 """Time between two checks whether another host stops, s."""
 END_SECONDS = 24 * 3600
 """Time for which hosts wait until the last host ends, s: host 0 draws and films when the others have finished."""
-
-
-@dataclass(frozen=True)
-class Host:
-    """One of the hosts of a command."""
-
-    coordinator: str
-    """Address at which host 0 coordinates the hosts, HOST:PORT."""
-    host_id: int
-    """Number of this host, from 0."""
-    n_hosts: int
-    """Number of hosts."""
-    devices: list[int] | None
-    """Indices of its devices; None for all."""
-    heartbeat_timeout: int
-    """Time without a heartbeat after which a host is treated as lost, s."""
-    connect_timeout: int
-    """Time within which all hosts must have connected, s."""
 
 
 def add_options(add: Callable[..., Any]) -> None:
@@ -84,26 +68,31 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     Raises:
         ConfigError: If the options are invalid, or no hosts are found.
     """
-    host = _host_from_scheduler(options) if options.coordinator == "auto" else _host_from_options(options)
-    print(f"host {host.host_id} of {host.n_hosts} connects with {host.coordinator}", flush=True)
+    addresses = _host_addresses(options)
 
     import jax
 
+    from crazysim.engine.jaxcompat import connected_hosts
     from crazysim.train.hosts import require_same_versions
 
     try:
         jax.distributed.initialize(
-            host.coordinator,
-            host.n_hosts,
-            host.host_id,
-            host.devices,
-            cluster_detection_method="deactivate",
-            initialization_timeout=host.connect_timeout,
-            heartbeat_timeout_seconds=host.heartbeat_timeout,
+            **addresses,
+            initialization_timeout=options.connect_timeout,
+            heartbeat_timeout_seconds=options.heartbeat_timeout,
             shutdown_timeout_seconds=END_SECONDS,
         )
-    except RuntimeError as error:
-        raise ConfigError(f"expected an address to listen at as {host.coordinator}, got: {error}") from error
+    except (RuntimeError, ValueError) as error:
+        expected, remedy = (
+            (f"an address to listen at as {options.coordinator}", "Use another port, for example.")
+            if addresses
+            else (
+                "the variables of SLURM or Open MPI for --coordinator auto",
+                "Start the command with srun or mpirun, or use --coordinator HOST:PORT, --hosts and --host-id.",
+            )
+        )
+        raise ConfigError(f"expected {expected}, got: {str(error).rstrip('.')}. {remedy}") from error
+    host: Any = connected_hosts()
     signal.signal(signal.SIGINT, _stop_all)
     threading.Thread(target=_stop_with_others, args=(host,), daemon=True).start()
     try:
@@ -115,7 +104,7 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
         status = int(end.code or 0)
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):  # probably a host is lost: JAX's runtime then ends this process
-            time.sleep(host.heartbeat_timeout + STOP_SECONDS)
+            time.sleep(options.heartbeat_timeout + STOP_SECONDS)
         _stop_others(host, error)
     except BaseException as error:
         _stop_others(host, error)
@@ -131,16 +120,20 @@ def _stop_all(number: int, frame: object) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _host_from_options(options: argparse.Namespace) -> Host:
-    """Return the host that the options describe."""
-    n, i = options.hosts, options.host_id
-    if n is None or i is None or not 0 <= i < n:
-        raise ConfigError(
-            f"expected --hosts N, and --host-id from 0 to N - 1, got --hosts {n} --host-id {i}. Use for example "
-            f"--hosts 2 --host-id 0 on the host of the coordinator, and --hosts 2 --host-id 1 on the other."
-        )
-    _check_coordinator(options.coordinator)
-    return Host(options.coordinator, i, n, None, options.heartbeat_timeout, options.connect_timeout)
+def _host_addresses(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings with which JAX connects the hosts; none if it reads them from the scheduler's variables."""
+    address, n, i = options.coordinator, options.hosts, options.host_id
+    if address == "auto":
+        return {}
+    require(
+        n is not None and i is not None and 0 <= i < n,
+        f"expected --hosts N, and --host-id from 0 to N - 1, got --hosts {n} --host-id {i}. Use for example "
+        f"--hosts 2 --host-id 0 on the host of the coordinator, and --hosts 2 --host-id 1 on the other.",
+    )
+    _check_coordinator(address)
+    print(f"host {i} of {n} connects with {address}", flush=True)
+    hosts = {"coordinator_address": address, "num_processes": n, "process_id": i}
+    return hosts | {"cluster_detection_method": "deactivate"}
 
 
 def _check_coordinator(text: str) -> None:
@@ -160,21 +153,7 @@ def _check_coordinator(text: str) -> None:
         ) from error
 
 
-def _host_from_scheduler(options: argparse.Namespace) -> Host:
-    """Return the host that the variables of SLURM or Open MPI describe."""
-    from crazysim.engine.jaxcompat import detect_hosts
-
-    coordinator, n_hosts, host_id, devices = detect_hosts(options.connect_timeout)
-    if coordinator is None or n_hosts is None or host_id is None:
-        raise ConfigError(
-            "expected the variables of SLURM or Open MPI for --coordinator auto, got none. Start the command with "
-            "srun or mpirun, or use --coordinator HOST:PORT, --hosts and --host-id."
-        )
-    devices = None if devices is None else list(devices)
-    return Host(coordinator, host_id, n_hosts, devices, options.heartbeat_timeout, options.connect_timeout)
-
-
-def _stop_others(host: Host, error: BaseException) -> None:
+def _stop_others(host: Hosts, error: BaseException) -> None:
     """Print an error, send it to the other hosts, and end the process when they have ended."""
     is_expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
     text = str(error) if is_expected else f"{type(error).__name__}: {error}"
@@ -189,36 +168,28 @@ _end_lock = threading.Lock()
 """Held by the thread that ends the process."""
 
 
-def _end_process(host: Host, line: str, reason: str | None) -> None:
+def _end_process(host: Hosts, line: str, reason: str | None) -> None:
     """Print a line, send a reason to the other hosts unless it is None, wait until they end, and end the process."""
-    from crazysim.engine.jaxcompat import connected_hosts
-
     if not _end_lock.acquire(blocking=False):
         time.sleep(2 * STOP_SECONDS)
     print(line, file=sys.stderr)
-    hosts = connected_hosts()
     with suppress(Exception):  # the process ends in any case
-        if hosts is not None:
-            if reason is not None:
-                hosts.client.key_value_set(f"{STOP_KEY}/{host.host_id}", reason)
-            hosts.client.wait_at_barrier(STOP_KEY, 1000 * STOP_SECONDS)
-            if host.host_id == 0:  # the coordinator ends last
-                time.sleep(2 * POLL_SECONDS)
+        if reason is not None:
+            host.client.key_value_set(f"{STOP_KEY}/{host.host_id}", reason)
+        host.client.wait_at_barrier(STOP_KEY, 1000 * STOP_SECONDS)
+        if host.host_id == 0:  # the coordinator ends last
+            time.sleep(2 * POLL_SECONDS)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(2)
 
 
-def _stop_with_others(host: Host) -> None:
+def _stop_with_others(host: Hosts) -> None:
     """End this process as soon as another host stops with an error."""
-    from crazysim.engine.jaxcompat import connected_hosts
-
     while True:
         time.sleep(POLL_SECONDS)
-        hosts = connected_hosts()
         with suppress(Exception):  # the coordinator has gone: JAX's runtime ends this process
-            stop_reasons = [] if hosts is None else hosts.client.key_value_dir_get(STOP_KEY)
-            for name, reason in stop_reasons:
+            for name, reason in host.client.key_value_dir_get(STOP_KEY):
                 other = int(name.rpartition("/")[2])
                 if other != host.host_id:
                     _end_process(host, f"crazysim: host {host.host_id} stops: host {other} ended: {reason}", None)

@@ -25,8 +25,8 @@ would be replaced if a release removed it, and whether the replacement is implem
   where the name is missing.
 - **The log level of XLA** (``set_xla_log_level``): the variable ``TF_CPP_MIN_LOG_LEVEL`` alone, which has no effect if
   JAX was imported before crazysim. It is used where jaxlib lacks the function.
-- **The coordinator of several hosts** (``connected_hosts``, ``detect_hosts``): exchanges of arrays instead of its store
-  of texts, and the variables of SLURM. Not implemented.
+- **The coordinator of several hosts** (``connected_hosts``): exchanges of arrays instead of its store of texts. Not
+  implemented.
 - **jax.experimental.multihost_utils** (``gather_from_hosts``, ``broadcast_from_first``): programs with replicated
   results. Not implemented.
 - **backends_are_initialized** (``require_unforked_process``): a flag that the first call sets. Not implemented.
@@ -87,7 +87,6 @@ __all__ = [
     "connected_hosts",
     "constants_to_inputs",
     "custom_vmap",
-    "detect_hosts",
     "equations",
     "expand_primitive",
     "ffi_include_folder",
@@ -616,21 +615,6 @@ def connected_hosts() -> Hosts | None:
 
     client = global_state.client
     return None if client is None else Hosts(client, global_state.process_id, global_state.num_processes)
-
-
-def detect_hosts(timeout: int) -> tuple[str | None, int | None, int | None, Sequence[int] | None]:
-    """Return the hosts that SLURM or Open MPI report, as ``jax.distributed.initialize`` detects them.
-
-    Args:
-        timeout: Time limit of the detection, s.
-
-    Returns:
-        Address of the coordinator, number of hosts, number of this host, and indices of its devices; None for each
-        that was not found.
-    """
-    from jax._src.clusters import ClusterEnv
-
-    return ClusterEnv.auto_detect_unset_distributed_params(None, None, None, None, None, timeout)
 
 
 def gather_from_hosts(arrays: Sequence[jax.Array]) -> list[np.ndarray]:

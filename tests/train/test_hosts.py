@@ -1,6 +1,5 @@
 """Trainings of two processes with two devices each, which act as two hosts."""
 
-import argparse
 import json
 import os
 import re
@@ -14,7 +13,6 @@ import pytest
 from waiting import wait_for
 
 from crazysim.__main__ import main
-from crazysim.commands import hosts
 from crazysim.train import checkpoint
 from crazysim.train.training import CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE
 
@@ -166,7 +164,6 @@ def test_a_coordinator_that_does_not_answer_is_an_error_with_its_address(tmp_pat
         ("--coordinator here --hosts 2 --host-id 0", "expected HOST:PORT or auto as --coordinator"),
         ("--coordinator here:1 --hosts 2 --host-id 2", "got --hosts 2 --host-id 2"),
         ("--coordinator here:1 --hosts 2", "got --hosts 2 --host-id None"),
-        ("--coordinator auto", "expected the variables of SLURM or Open MPI"),
     ],
 )
 def test_options_of_hosts_are_checked(options, message, capsys):
@@ -174,9 +171,18 @@ def test_options_of_hosts_are_checked(options, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_slurm_says_which_host_this_is(monkeypatch):
-    variables = {"JOB_ID": "4097", "STEP_NODELIST": "gpu[07-08]", "NTASKS": "8", "PROCID": "5", "LOCALID": "1"}
-    for name, value in variables.items():
-        monkeypatch.setenv(f"SLURM_{name}", value)
-    options = argparse.Namespace(heartbeat_timeout=7, connect_timeout=30)
-    assert hosts._host_from_scheduler(options) == hosts.Host("gpu07:61441", 5, 8, [1], 7, 30)
+@pytest.mark.long("two processes import JAX")
+def test_jax_finds_the_hosts_of_a_scheduler_or_there_is_an_error(tmp_path):
+    """A step of SLURM with one task is a training of one host; without a scheduler, the options name the hosts."""
+    arguments = ["-m", "crazysim", *training_arguments(tmp_path, "--coordinator", "auto"), "--set", "secnds=1"]
+    port = free_address().rpartition(":")[2]
+    slurm = {"JOB_ID": "1", "STEP_NODELIST": "localhost", "NTASKS": "1", "PROCID": "0", "LOCALID": "0"}
+    variables = {f"SLURM_{name}": value for name, value in slurm.items()} | {"JAX_COORDINATOR_PORT": port}
+    started = Process(tmp_path, "slurm", sys.executable, *arguments, **variables)
+    alone = Process(tmp_path, "alone", sys.executable, *arguments)
+    (status, text), (other_status, other_text) = started.end(), alone.end()
+    assert (status, other_status) == (2, 2)
+    assert "host 0 of 1: 2 cpu" in text
+    assert "did you mean seconds?" in text
+    assert "expected the variables of SLURM or Open MPI" in other_text
+    assert "--hosts and --host-id" in other_text
