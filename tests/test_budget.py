@@ -10,13 +10,13 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 1179,
+    "commands": 1165,
     "control": 1987,
     "core": 1549,
     "crazysim": 808,
     "drones": 514,
     "dynamics": 576,
-    "engine": 6747,
+    "engine": 6744,
     "envs": 3834,
     "geometry": 1089,
     "lab": 9752,
@@ -24,7 +24,7 @@ BUDGET = {
     "plugins": 7277,
     "scene": 3099,
     "sim": 1215,
-    "train": 2455,
+    "train": 2449,
     "trajectories": 1385,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
