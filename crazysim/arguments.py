@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import itertools
+import math
+import os
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -132,6 +134,40 @@ def check_array(name: str, value: object, remedy: str = "Use an array of numbers
         value,
         remedy,
     )
+
+
+def require_memory(what: str, n_bytes: float, remedy: str, device: jax.Device, n_devices: int = 1) -> None:
+    """Check that arrays fit into the memory of their devices: a system without memory ends the process.
+
+    Args:
+        what: The arrays, for the message.
+        n_bytes: Lower bound of their size, bytes.
+        remedy: Sentence for the end of the message.
+        device: Device of the arrays, or one of several.
+        n_devices: Number of devices among which the arrays are divided.
+    """
+    n_devices = 1 if device.platform == "cpu" else n_devices  # several on a host share its memory
+    memory, others = n_devices * _memory_size(device), f" and {n_devices - 1} more" if n_devices > 1 else ""
+    if n_bytes > memory:
+        raise ConfigError(
+            f"expected arrays that fit into the {memory / 2**30:.1f} GiB of {device}{others}, got {what}, which need "
+            f"{n_bytes / 2**30:.1f} GiB. {remedy}"
+        )
+
+
+def tree_bytes(tree: Any) -> int:
+    """Return the size of all arrays of a tree, which may be traced, bytes."""
+    return sum(np.size(x) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def _memory_size(device: jax.Device) -> float:
+    """Return the memory of a device in bytes; infinite if it is unknown."""
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    if device.platform != "cpu" or "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return math.inf
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def annotated_types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:

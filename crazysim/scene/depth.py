@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -15,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.arguments import check_flag
+from crazysim.arguments import check_flag, require_memory
 from crazysim.core.data import SimData, require_states
 from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.scene.collision import CollisionModel, body_name
@@ -168,23 +167,8 @@ def check_image_memory(
         device: Device of the images, or one of several.
         n_devices: Number of devices among which the images are divided.
     """
-    n_bytes, memory = n_images * width * height * bytes_per_pixel, n_devices * _memory_size(device)
-    if n_bytes > memory:
-        others = f" and {n_devices - 1} more" if n_devices > 1 else ""
-        raise ConfigError(
-            f"expected images that fit into the {memory / 2**30:.1f} GiB of {device}{others}, got {n_images} of "
-            f"{width} x {height} pixels, which need {n_bytes / 2**30:.1f} GiB. Use fewer worlds or pixels."
-        )
-
-
-def _memory_size(device: jax.Device) -> float:
-    """Return the memory of a device in bytes; infinite if it is unknown."""
-    stats = device.memory_stats() or {}
-    if "bytes_limit" in stats:
-        return stats["bytes_limit"]
-    if device.platform != "cpu" or "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
-        return math.inf
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    what = f"{n_images} images of {width} x {height} pixels"
+    require_memory(what, n_images * width * height * bytes_per_pixel, "Use fewer worlds or pixels.", device, n_devices)
 
 
 DepthFn = Callable[..., Hits]

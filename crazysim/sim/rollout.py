@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from crazysim.arguments import check_array
+from crazysim.arguments import check_array, require_memory, tree_bytes
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive_integer
@@ -102,8 +102,15 @@ def rollout(
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "wait")
 
-compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
-"""``rollout`` in one compiled call, which does not donate the buffers of its arguments."""
+
+@functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)
+@functools.wraps(rollout)
+def compiled_rollout(step: Step, *args: Any, **settings: Any) -> tuple[SimData, Any]:
+    """Return the results of ``rollout`` in one compiled call, which does not donate the buffers of its arguments."""
+    data, recordings = rollout(step, *args, **settings)
+    remedy, n_bytes = "Keep less, or use several rollouts.", tree_bytes(recordings)
+    require_memory("the records of all steps", n_bytes, remedy, jax.devices(step.platform)[0], jax.device_count())
+    return data, recordings
 
 
 def run_rollout(

@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.arguments import check_arguments, check_flag
+from crazysim.arguments import check_arguments, check_flag, require_memory, tree_bytes
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
@@ -181,7 +181,7 @@ class Sim:
         self._seed = as_key(rng_key)
         try:
             self.build_data()
-        except MemoryError as error:
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:
             raise ConfigError(
                 f"expected a number of worlds that fits into memory, got n_worlds={n_worlds}: {error}. Use fewer."
             ) from error
@@ -341,10 +341,17 @@ class Sim:
     def build_data(self) -> SimData:
         """Replace the data by the data of drones at rest, with new records of all plugins, and return the new data."""
         c, freqs = self.configuration, dict(self.configuration.control_freqs)
-        data = SimData.create(
-            c.n_worlds, c.n_drones, c.dynamics, c.control, c.airframes, c.freq, freqs, self._scene.drone_mocap_ids,
-            self._seed, c.controller,
-        )  # fmt: skip
+
+        def create(n_worlds: int) -> SimData:
+            return SimData.create(
+                n_worlds, c.n_drones, c.dynamics, c.control, c.airframes, c.freq, freqs, self._scene.drone_mocap_ids,
+                self._seed, c.controller,
+            )  # fmt: skip
+
+        world_bytes = tree_bytes(create(2)) - tree_bytes(create(1))  # without what all worlds share
+        what, n_devices = f"n_worlds={c.n_worlds}, before and after a step", getattr(self.mesh, "size", 1)
+        require_memory(what, 2 * c.n_worlds * world_bytes, "Use fewer worlds.", self.device, n_devices)
+        data = create(c.n_worlds)
         self._stepper.assign(data.replace(objects=self._scene.objects(None)))
         self.plugins.build_records()
         return self.data

@@ -131,8 +131,11 @@ def test_law_09_wrong_cameras_are_errors():
         (lambda: sim.add(Camera(freq=333)), "Use the nearest rate below, 250 Hz"),
         (lambda: sim.add(Camera(latency=1.0)), "expected a latency of 'camera' of at most 63 images"),
         (lambda: sim.add(Camera(4, 3, latency=np.int16(100), freq=50)), "expected a latency of 'camera' of at most 63"),
-        (lambda: sim.add(Camera(10**6, 10**6)), "got 2 of 1000000 x 1000000 pixels, which need"),
-        (lambda: sim.depth("fpv_cam", 10**6, 10**6), "got 2 of 1000000 x 1000000 pixels, which need 29802.3 GiB"),
+        (lambda: sim.add(Camera(10**6, 10**6)), "got 2 images of 1000000 x 1000000 pixels, which need"),
+        (
+            lambda: sim.depth("fpv_cam", 10**6, 10**6),
+            "got 2 images of 1000000 x 1000000 pixels, which need 29802.3 GiB",
+        ),
         (lambda: Camera().read(sim.data), "expected data with a record of plugin 'camera', got records of none"),
     ):
         with pytest.raises(ConfigError) as error:

@@ -230,7 +230,10 @@ def test_law_09_wrong_noise_lenses_and_patterns_are_errors():
         (lambda: Lidar(elevation=()), "expected at least one elevation and azimuth"),
         (lambda: Lidar(elevation=(95.0,)), "elevation of Lidar"),
         (lambda: Lidar(dropout=1.5), "dropout of Lidar"),
-        (lambda: Sim().add(Lidar(np.zeros(10**5), np.zeros(10**6))), "got 1 of 1000000 x 100000 pixels, which need"),
+        (
+            lambda: Sim().add(Lidar(np.zeros(10**5), np.zeros(10**6))),
+            "got 1 images of 1000000 x 100000 pixels, which need",
+        ),
     ):
         with pytest.raises(ConfigError) as error:
             call()
