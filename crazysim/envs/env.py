@@ -59,27 +59,27 @@ class Env(ABC):
     @property
     def sim(self) -> Sim:
         """The simulation from which the environment was made. It renders states; ``step`` does not advance it."""
-        return self.base.sim
+        return self.base._sim
 
     @property
     def task(self) -> Task:
         """The task."""
-        return self.base.task
+        return self.base._task
 
     @property
     def actions(self) -> Actions:
         """Meaning of an action."""
-        return self.base.actions
+        return self.base._actions
 
     @property
     def n_substeps(self) -> int:
         """Physics steps in one environment step."""
-        return self.base.n_substeps
+        return self.base._n_substeps
 
     @property
     def max_steps(self) -> int:
         """Environment steps in one episode."""
-        return self.base.max_steps
+        return self.base._max_steps
 
     def image_formats(self) -> dict[str, dict[str, Any]]:
         """Return the formats of observations that are images, by name; see ``Hooks.describe_images``."""
@@ -225,11 +225,11 @@ class Env(ABC):
         if structure in self._known_structures:
             return
         expected = jax.eval_shape(self.reset, jax.random.key(0))
-        if structure not in self._known_structures:
-            raise ConfigError(
-                f"expected a state of this environment, {_describe_state(expected)}, got one of "
-                f"{_describe_state(state)}. Use the reset of this environment."
-            )
+        require(
+            structure in self._known_structures,
+            f"expected a state of this environment, {_describe_state(expected)}, got one of "
+            f"{_describe_state(state)}. Use the reset of this environment.",
+        )
 
     @functools.cached_property
     def _action_format(self) -> jax.ShapeDtypeStruct:
@@ -377,29 +377,9 @@ class DroneEnv(Env):
     def wrappers(self) -> tuple[Hooks, ...]:
         return ()
 
-    @property
-    def sim(self) -> Sim:
-        return self._sim
-
-    @property
-    def task(self) -> Task:
-        return self._task
-
-    @property
-    def actions(self) -> Actions:
-        return self._actions
-
-    @property
-    def n_substeps(self) -> int:
-        return self._n_substeps
-
-    @property
-    def max_steps(self) -> int:
-        return self._max_steps
-
     def initial_data(self, key: Array) -> SimData:
         """Return the data of all worlds before their first episode, with the random key or keys of ``reset``."""
-        plugins = tuple(self._sim.plugins.values())
+        plugins, arrays = tuple(self._sim.plugins.values()), _default_arrays(self._sim)
         if [*map(id, plugins)] != [*map(id, self._plugins)]:
             names = ", ".join(plugin.name for plugin in self._plugins)
             raise ConfigError(
@@ -407,14 +387,12 @@ class DroneEnv(Env):
                 f"{', '.join(plugin.name for plugin in plugins) or 'none'}: an environment does not follow "
                 f"changes of its simulation. Use make(..., effects=[...]), or a new environment."
             )
-        if len(arrays := _default_arrays(self._sim)) != len(self._default_arrays) or not all(
-            map(is_, arrays, self._default_arrays)
-        ):
-            raise ConfigError(
-                "expected the default data with which the environment was made, got others: an environment does not "
-                "follow changes of its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data "
-                "of a state."
-            )
+        require(
+            len(arrays) == len(self._default_arrays) and all(map(is_, arrays, self._default_arrays)),
+            "expected the default data with which the environment was made, got others: an environment does not "
+            "follow changes of its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data "
+            "of a state.",
+        )
         data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=_set_keys(data.core, key))
         if mesh is not None:

@@ -153,12 +153,12 @@ def make(
         )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, freq=sim_freq, **settings)
-    repeated_names = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
-    if repeated_names:
-        raise ConfigError(
-            f"expected no plugin {repeated_names[0]!r} besides those that the simulation's settings add, got another. "
-            f"Leave it out, give it another name=, or use estimator=Kalman([...]) with your own sensors."
-        )
+    repeated_name = next((plugin.name for plugin in plugins if plugin.name in sim.plugins), None)
+    require(
+        repeated_name is None,
+        f"expected no plugin {repeated_name!r} besides those that the simulation's settings add, got another. "
+        f"Leave it out, give it another name=, or use estimator=Kalman([...]) with your own sensors.",
+    )
     task.install(sim)
     for plugin in plugins:
         sim.add(plugin)

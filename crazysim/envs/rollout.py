@@ -108,11 +108,11 @@ def rollout(
                 f"expected initial_memory of shape ({n_worlds}, ...) = (n_worlds, ...), got {shapes[0]}. Use "
                 f"jnp.broadcast_to(x, (n_worlds, *x.shape))."
             )
-        if _formats(memory) != _formats(initial_memory):
-            raise ConfigError(
-                f"expected a memory of the shapes and types of initial_memory, {_formats(initial_memory)}, got "
-                f"{_formats(memory)}. Use the memory that a rollout of the same policy returned."
-            )
+        require(
+            _formats(memory) == _formats(initial_memory),
+            f"expected a memory of the shapes and types of initial_memory, {_formats(initial_memory)}, got "
+            f"{_formats(memory)}. Use the memory that a rollout of the same policy returned.",
+        )
 
     def step(flat: FlatData, memory: Any, key: Array) -> tuple[FlatData, Any, Any]:
         state = EnvState(flat.data())
@@ -139,11 +139,11 @@ def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array,
         results,
         "A policy without memory returns (action, memory, ()) with the memory that it receives.",
     )
-    if _formats(memory) != _formats(results[1]):
-        raise ConfigError(
-            f"expected a policy that returns a memory of the shapes and types that it receives, {_formats(memory)}, "
-            f"got {_formats(results[1])}. Pass initial_memory= of the shapes that it returns."
-        )
+    require(
+        _formats(memory) == _formats(results[1]),
+        f"expected a policy that returns a memory of the shapes and types that it receives, {_formats(memory)}, "
+        f"got {_formats(results[1])}. Pass initial_memory= of the shapes that it returns.",
+    )
     return results[0], results[1], results[2]
 
 

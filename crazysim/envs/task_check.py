@@ -29,8 +29,7 @@ REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 def require_installed(sim: Sim, task: object) -> None:
     """Check that a task was installed in a simulation."""
     expect(isinstance(sim, Sim), "a simulation", sim, "Use Sim(), or crazysim.envs.make.")
-    if not isinstance(task, Task):
-        raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
+    require(isinstance(task, Task), f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
     require(
         task.Record is None or isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record),
@@ -72,23 +71,23 @@ def check_record(state: EnvState, stepped: EnvState) -> None:
             f"expected {name} to be declared for drones, worlds or as shared, got a field that is {scope!r}. "
             f'Declare it with leaf("drone"), leaf("world") or leaf("shared").',
         )
-        if scope == "drone" and x.shape[1:2] != (n_drones,):
-            raise ConfigError(
-                f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
-                f"Return one row for every drone."
-            )
-        if path[0] == GetAttrKey("obs") and x.ndim != 3:
-            raise ConfigError(
-                f"expected {name} of shape (n_drones, k) in one world, got {x.shape[1:]}. For one number per drone use "
-                f"x[:, None]; for one array per drone use x.reshape(n_drones, -1)."
-            )
+        require(
+            scope != "drone" or x.shape[1:2] == (n_drones,),
+            f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
+            f"Return one row for every drone.",
+        )
+        require(
+            path[0] != GetAttrKey("obs") or x.ndim == 3,
+            f"expected {name} of shape (n_drones, k) in one world, got {x.shape[1:]}. For one number per drone use "
+            f"x[:, None]; for one array per drone use x.reshape(n_drones, -1).",
+        )
         y = stepped_leaves.get(path)
-        if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
-            raise ConfigError(
-                f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
-                f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the "
-                f"same names and shapes."
-            )
+        require(
+            y is not None and (x.shape, x.dtype) == (y.shape, y.dtype),
+            f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
+            f"{'none' if y is None else _describe(y)}. Tasks and wrappers must always return the "
+            f"same names and shapes.",
+        )
     if added_names := [keystr(path).lstrip(".") for path in stepped_leaves if path not in start_leaves]:
         raise ConfigError(
             f"expected a step to return the entries that exist at the start of an episode, got "
@@ -126,38 +125,38 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         )  # fmt: skip
 
     for method, result in (("observe", obs), ("rewards", rewards)):
-        if not isinstance(result, Mapping) or not result:
-            raise ConfigError(
-                f"{title}: expected {method} to return a dict of names to arrays, got {_describe(result)}. {GUIDE} "
-                f"has an example."
-            )
+        require(
+            isinstance(result, Mapping) and result,
+            f"{title}: expected {method} to return a dict of names to arrays, got {_describe(result)}. {GUIDE} "
+            f"has an example.",
+        )
     drones = (*batch, n_drones)
     for name, x in obs.items():
         shape = getattr(x, "shape", ())
-        if shape[:-1] != drones or len(shape) != len(drones) + 1:
-            raise ConfigError(
-                f"{title}: expected observation {name!r} of shape ({batch_name}n_drones, k) = "
-                f"({', '.join(map(str, drones))}, k), got {_describe(x)}. For one number per drone use x[:, None]; "
-                f"for one array per drone use x.reshape(n_drones, -1)."
-            )
-    for name, x in [(f"reward term {name!r}", x) for name, x in rewards.items()] + [("error", error)]:
-        if getattr(x, "shape", None) != drones:
-            raise ConfigError(
-                f"{title}: expected {name} of shape ({batch_name}n_drones,) = {drones}, got {_describe(x)}. For the "
-                f"same number for all drones use jnp.full(data.core.n_drones, x)."
-            )
-    for name, x in info.items():
-        if x.shape != batch and x.shape[: len(drones)] != drones:
-            raise ConfigError(
-                f"{title}: expected info {name!r} of shape ({batch_name.removesuffix(', ')}) or "
-                f"({batch_name}n_drones, ...) = ({', '.join(map(str, drones))}, ...), got {_describe(x)}. For an array "
-                f"of the world use jnp.broadcast_to(x, (data.core.n_drones, *x.shape))."
-            )
-    if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
-        raise ConfigError(
-            f"{title}: expected terminated of type bool and shape ({batch_name.removesuffix(', ')}), got "
-            f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over the drones."
+        require(
+            shape[:-1] == drones and len(shape) == len(drones) + 1,
+            f"{title}: expected observation {name!r} of shape ({batch_name}n_drones, k) = "
+            f"({', '.join(map(str, drones))}, k), got {_describe(x)}. For one number per drone use x[:, None]; "
+            f"for one array per drone use x.reshape(n_drones, -1).",
         )
+    for name, x in [(f"reward term {name!r}", x) for name, x in rewards.items()] + [("error", error)]:
+        require(
+            getattr(x, "shape", None) == drones,
+            f"{title}: expected {name} of shape ({batch_name}n_drones,) = {drones}, got {_describe(x)}. For the "
+            f"same number for all drones use jnp.full(data.core.n_drones, x).",
+        )
+    for name, x in info.items():
+        require(
+            x.shape == batch or x.shape[: len(drones)] == drones,
+            f"{title}: expected info {name!r} of shape ({batch_name.removesuffix(', ')}) or "
+            f"({batch_name}n_drones, ...) = ({', '.join(map(str, drones))}, ...), got {_describe(x)}. For an array "
+            f"of the world use jnp.broadcast_to(x, (data.core.n_drones, *x.shape)).",
+        )
+    require(
+        getattr(terminated, "shape", None) == batch and jnp.issubdtype(terminated.dtype, jnp.bool_),
+        f"{title}: expected terminated of type bool and shape ({batch_name.removesuffix(', ')}), got "
+        f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over the drones.",
+    )
 
 
 def _world_shape(scope: str, x: Array) -> jax.ShapeDtypeStruct:

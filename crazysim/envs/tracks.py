@@ -83,16 +83,15 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
             expected = str(shape).replace("-1", "n")
             raise ConfigError(f"expected {name} of the track as finite numbers, {expected}, got shape {value.shape}")
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
-    if np.any(high <= low):
-        raise ConfigError(f"expected upper limits of the arena above the lower ones, got {high} and {low}")
+    require(np.all(high > low), f"expected upper limits of the arena above the lower ones, got {high} and {low}")
     if is_random:
         n_x, n_y = track.grid
-        if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
-            raise ConfigError(
-                f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
-                f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m. Start and gates need a cell "
-                f"each. Set wider limits with Track(low=..., high=...), or use fewer gates or obstacles."
-            )
+        require(
+            n_x * n_y > track.n_gates and (n_x + 1) * (n_y + 1) >= track.n_obstacles,
+            f"expected an arena with room for a random course of {track.n_gates} gates and {track.n_obstacles} "
+            f"obstacles, got {n_x} x {n_y} cells of {CELL_SIZE[0]} x {CELL_SIZE[1]} m. Start and gates need a cell "
+            f"each. Set wider limits with Track(low=..., high=...), or use fewer gates or obstacles.",
+        )
         require(n_drones <= 8, f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
         return track
     starts = np.asarray(track.start) + start_offsets(n_drones)
@@ -104,11 +103,11 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
                 f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, "
                 f"got {distance[:, k].min():.2f} m. Move it, or set Track(start=...)."
             )
-    if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
-        raise ConfigError(
-            f"expected starts at least 0.2 m within the limits of the arena and above the floor, got {n_drones} drones "
-            f"around {tuple(track.start)}. Move Track(start=...), or set wider limits low= and high=."
-        )
+    require(
+        np.all(starts >= low + [0.2, 0.2, 0.2]) and np.all(starts <= high - 0.2),
+        f"expected starts at least 0.2 m within the limits of the arena and above the floor, got {n_drones} drones "
+        f"around {tuple(track.start)}. Move Track(start=...), or set wider limits low= and high=.",
+    )
     return track
 
 

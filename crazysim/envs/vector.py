@@ -23,7 +23,7 @@ from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import NO_EPISODE, EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
-from crazysim.errors import ConfigError, require, short_repr
+from crazysim.errors import require, short_repr
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -230,14 +230,16 @@ def make_vector(
         render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
     """
-    if "n_worlds" in options:
-        raise ConfigError(f"expected num_envs, got n_worlds={short_repr(options['n_worlds'])}. Use num_envs alone.")
+    require(
+        "n_worlds" not in options,
+        f"expected num_envs, got n_worlds={short_repr(options.get('n_worlds'))}. Use num_envs alone.",
+    )
     if max_episode_steps is not None:
-        if "seconds" in options:
-            raise ConfigError(
-                f"expected max_episode_steps or seconds, got {short_repr(max_episode_steps)} and "
-                f"{short_repr(options['seconds'])}: both are the length of an episode. Leave one out."
-            )
+        require(
+            "seconds" not in options,
+            f"expected max_episode_steps or seconds, got {short_repr(max_episode_steps)} and "
+            f"{short_repr(options.get('seconds'))}: both are the length of an episode. Leave one out.",
+        )
         options["seconds"] = positive_integer("max_episode_steps", max_episode_steps) / positive_integer(
             "freq", options.get("freq", 50)
         )

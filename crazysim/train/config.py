@@ -181,11 +181,11 @@ class TrainConfig:
             raise ConfigError(
                 f"expected hyperparameters of {self.algorithm}, got {', '.join(unknown)}; use {', '.join(names)}"
             )
-        if "mesh" in self.options:
-            raise ConfigError(
-                f"expected no option 'mesh' of a training, got {short_repr(self.options['mesh'])}. Use --devices all, "
-                f"or devices='all' in Python: the worlds are then distributed over a mesh of these devices."
-            )
+        require(
+            "mesh" not in self.options,
+            f"expected no option 'mesh' of a training, got {short_repr(self.options.get('mesh'))}. Use --devices all, "
+            f"or devices='all' in Python: the worlds are then distributed over a mesh of these devices.",
+        )
         if self.network is not None:
             require(
                 self.algorithm == "ppo",

@@ -17,7 +17,7 @@ from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.envs.state import Obs
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 KERNEL_SIZE, STRIDE = 3, 2
 """Side of a patch, and distance between neighbouring patches, pixels. Images are padded by one zero on each side."""
@@ -73,11 +73,11 @@ def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any
             channels = sizes[name] // (height * width)
             images.append(Image(start, height, width, channels, formats[name]["unit"] == "m"))
         start += sizes[name]
-    if not images:
-        raise ConfigError(
-            f"expected an image among the observations for a convolution, got {', '.join(sorted(sizes))}. Use "
-            f"depth_image=(16, 12), or leave out convolution."
-        )
+    require(
+        images,
+        f"expected an image among the observations for a convolution, got {', '.join(sorted(sizes))}. Use "
+        f"depth_image=(16, 12), or leave out convolution.",
+    )
     return tuple(images)
 
 

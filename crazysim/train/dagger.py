@@ -304,10 +304,12 @@ def imitate(
         if on_iteration is not None:
             numbers = jax.device_get(metrics)
             on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if x.dtype != bool})
-    if not taught:
-        raise DivergedError(NAN_TEACHER)
-    if not metrics["finite"].all():
-        raise DivergedError("expected finite weights and losses, got NaN or infinity. Use a smaller learning_rate.")
+    require(taught, NAN_TEACHER, DivergedError)
+    require(
+        metrics["finite"].all(),
+        "expected finite weights and losses, got NaN or infinity. Use a smaller learning_rate.",
+        DivergedError,
+    )
     return take_seed(learner.as_policy(), 0).replace(interface=interface)
 
 
@@ -339,15 +341,15 @@ def _check_teacher(teacher: Any, env: Env, teacher_obs: Obs, folder: str) -> Non
     if isinstance(interface, Interface):
         description = describe_env(env, sizes_of(teacher_obs)) | {"task": None, "task_code": None, "images": {}}
         student = Interface.read(description)
-        if interface.level == student.level and not interface.has_ranges_of(student):
-            raise ConfigError(
-                f"expected a teacher whose actions have the meaning of the student's, {env.actions}, got "
-                f"{folder or 'a policy'} with centre and scale {interface.ranges}. Use the same drone for both."
-            )
+        require(
+            interface.level != student.level or interface.has_ranges_of(student),
+            f"expected a teacher whose actions have the meaning of the student's, {env.actions}, got "
+            f"{folder or 'a policy'} with centre and scale {interface.ranges}. Use the same drone for both.",
+        )
         interface.require(student, f"a student of the teacher {folder}".rstrip())
     action, shape = jax.eval_shape(teacher, teacher_obs), (env.sim.n_worlds, env.sim.n_drones, env.actions.size)
-    if getattr(action, "shape", None) != shape:
-        raise ConfigError(
-            f"expected actions of the teacher of shape {shape} = (n_worlds, n_drones, {shape[-1]}), got {action}. "
-            f"Use a function from the observations of all worlds to actions."
-        )
+    require(
+        getattr(action, "shape", None) == shape,
+        f"expected actions of the teacher of shape {shape} = (n_worlds, n_drones, {shape[-1]}), got {action}. "
+        f"Use a function from the observations of all worlds to actions.",
+    )

@@ -26,7 +26,7 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import ConfigError, not_installed, require, require_type
+from crazysim.errors import not_installed, require, require_type
 from crazysim.storage import as_path, write_file
 from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
 from crazysim.train.interface import Interface, describe_env, sizes_text
@@ -311,11 +311,11 @@ def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
     if isinstance(body, Encoder):
         body, convolutions = body.memory, body.convolutions
     n_obs, n_actions = sum(described.sizes.values()), len(described.ranges)
-    if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
-        raise ConfigError(
-            f"expected a policy from {sizes_text(described.sizes)} to {n_actions} actions, got one from {len(mean)} to "
-            f"{len(layers[-1][1])}. Describe the environment that it was trained in."
-        )
+    require(
+        (len(mean), len(layers[-1][1])) == (n_obs, n_actions),
+        f"expected a policy from {sizes_text(described.sizes)} to {n_actions} actions, got one from {len(mean)} to "
+        f"{len(layers[-1][1])}. Describe the environment that it was trained in.",
+    )
     require(
         all(np.isfinite(x).all() for x in jax.tree.leaves(host_policy)),
         "expected finite weights, got NaN or infinity; the training diverged, so train again",

@@ -11,7 +11,7 @@ import jax
 
 import crazysim
 from crazysim.engine import jaxcompat
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 SETTINGS_TIMEOUT = 300
 """Time that a host waits for the settings of the other hosts, s; JAX waits as long for their connections."""
@@ -51,11 +51,11 @@ def _require_same_values(kind: str, values: Mapping[str, Any], remedy: str) -> N
     first_values, *other_hosts = (json.loads(text) for text in _exchange_texts(json.dumps(dict(values)), hosts))
     for host, other_values in enumerate(other_hosts, 1):
         for name in {**first_values, **other_values}:
-            if first_values.get(name) != other_values.get(name):
-                raise ConfigError(
-                    f"expected the same {kind} on all hosts, got {name} = {first_values.get(name)!r} on host 0 and "
-                    f"{other_values.get(name)!r} on host {host}. {remedy}"
-                )
+            require(
+                first_values.get(name) == other_values.get(name),
+                f"expected the same {kind} on all hosts, got {name} = {first_values.get(name)!r} on host 0 and "
+                f"{other_values.get(name)!r} on host {host}. {remedy}",
+            )
 
 
 def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:

@@ -79,10 +79,10 @@ def _check_count(name: str, value: object) -> int:
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> str:
-    if value not in choices:
-        raise ConfigError(
-            f"expected {name} as one of {', '.join(choices)}, got {value!r}. Use for example {choices[0]}."
-        )
+    require(
+        value in choices,
+        f"expected {name} as one of {', '.join(choices)}, got {value!r}. Use for example {choices[0]}.",
+    )
     return str(value)
 
 

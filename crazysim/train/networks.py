@@ -222,8 +222,9 @@ def choose_network(
     if network is None:
         base = gru_network(memory) if memory else MEMORYLESS_NETWORK
         return _convolution_network(tuple(convolution), images, base) if convolution else base
-    if not isinstance(network, Network):
-        raise ConfigError(f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply).")
+    require(
+        isinstance(network, Network), f"expected a Network, got {network!r}. Use crazysim.train.Network(init, apply)."
+    )
     require(
         not convolution,
         f"expected no convolution with a custom network, got {list(convolution)}. Put it into the network.",

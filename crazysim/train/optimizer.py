@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import require
 
 MAX_GROUPS = 64
 """Largest number of groups of neighbouring worlds. A minibatch takes the same number of worlds from every group. A
@@ -33,11 +33,11 @@ def build_optimizer(learning_rate: Any, max_grad_norm: Any, n_updates: int) -> o
 
 def check_minibatches(minibatches: int, n_worlds: int) -> None:
     """Check that minibatches have the same number of worlds."""
-    if n_worlds % minibatches:
-        raise ConfigError(
-            f"expected a number of worlds that {minibatches} minibatches divide, got {n_worlds}. Use for example "
-            f"{-(-n_worlds // minibatches) * minibatches} worlds, or minibatches={math.gcd(n_worlds, 8)}."
-        )
+    require(
+        n_worlds % minibatches == 0,
+        f"expected a number of worlds that {minibatches} minibatches divide, got {n_worlds}. Use for example "
+        f"{-(-n_worlds // minibatches) * minibatches} worlds, or minibatches={math.gcd(n_worlds, 8)}.",
+    )
 
 
 def run_epochs(

@@ -192,8 +192,7 @@ def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndar
         goals.shape == (n_drones, 3) and np.all(np.isfinite(goals)),
         f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {goals.shape}",
     )
-    if goals[:, 2].min() < 0.2:
-        raise ConfigError(f"expected a formation at least 0.2 m above the floor, got {goals[:, 2].min()} m")
+    require(goals[:, 2].min() >= 0.2, f"expected a formation at least 0.2 m above the floor, got {goals[:, 2].min()} m")
     separations = np.asarray(separation(jnp.asarray(goals)))
     if separations.min() < 1.2:
         pair = sorted(np.argsort(separations)[:2].tolist())

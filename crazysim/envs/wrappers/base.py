@@ -15,8 +15,7 @@ class Wrapper(Hooks, Env):
 
     @check_arguments
     def __init__(self, env: Env):
-        if not isinstance(env, Env):
-            raise ConfigError(f"expected an environment, got {env!r}")
+        require(isinstance(env, Env), f"expected an environment, got {env!r}")
         require(
             env.reset_policy is None,
             "expected an environment without AutoReset, got one with it. AutoReset is the outermost wrapper, and "

@@ -8,7 +8,7 @@ from typing import Any
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError, expect, short_repr
+from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
 from crazysim.plugins.sensors.sensor import rate_in
 
@@ -34,8 +34,10 @@ class CameraImages(Wrapper):
         super().__init__(env)
         self._sim: Any = env.sim
         sim = self._sim
-        if not isinstance(camera, ImageSensor):
-            raise ConfigError(f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).")
+        require(
+            isinstance(camera, ImageSensor),
+            f"expected a camera or lidar, got {camera!r}. Use for example Camera(16, 12).",
+        )
         self.camera = camera
         expect(isinstance(names, (Mapping, type(None))), "names as a dict by output", names, "Use {'depth': 'view'}.")
         if unknown_outputs := set(names or {}) - set(camera.outputs):
