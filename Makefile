@@ -12,7 +12,7 @@ PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile --junitxml=out/tests/$@$
 # What `make test` runs, about eight minutes on two cores; TESTS=tests/control for another part.
 tests_of = $(patsubst %,tests/$(1)/test_%.py,$(2))
 TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
-  $(patsubst %,tests/test_%.py,eager machine package prose rotation startup storage utils) \
+  $(patsubst %,tests/test_%.py,eager machine package rotation startup storage utils) \
   $(call tests_of,control,allocation attitude flat_state flatness setpoint state) \
   $(call tests_of,docs,first_pages imports site) \
   $(call tests_of,engine,gradient_kernels interpret ir passes plan rules simplify step symbolic) \
