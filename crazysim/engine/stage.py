@@ -27,7 +27,7 @@ from crazysim.engine.pytree import (
     select_worlds,
 )
 from crazysim.engine.record import Record
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, expect
 
 T = TypeVar("T")
 
@@ -216,6 +216,12 @@ class Axes:
             stage: The stage.
         """
         name = stage.__name__
+        expect(
+            isinstance(after, Record),
+            f"stage {name!r} to return the data that it got, with other values",
+            after,
+            "End its function with return data, or return data.replace(...).",
+        )
         new_leaves, treedef = jax.tree.flatten(after)
         if treedef != self.treedef:
             raise ConfigError(

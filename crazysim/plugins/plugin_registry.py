@@ -21,7 +21,7 @@ from crazysim.eager import jit_eager_calls
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.pytree import PyTree, n_batch_axes, watched_flags
 from crazysim.engine.stage import Axes, vmap_drones, vmap_worlds
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, short_repr
 from crazysim.plugins.plugin_stages import PluginStages
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -42,7 +42,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._last_moved: tuple[list[Any], Any] = [], None
         """Arrays that plugins moved objects by last, and these objects."""
-        self._observe_fn: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
+        self._observe_fn: tuple[list[Any], Callable[..., Any]] = [], _no_observations
         self._is_checked = True
         self._is_changing = False
         self._last_revision = 0  # of the scene at the last refresh
@@ -306,9 +306,11 @@ class PluginRegistry(Mapping[str, Plugin]):
             measured: True for observations that are calculated from the states as sensors measure them.
         """
         plugins = tuple(self.values())
-        is_changed = [*map(id, plugins)] != [*map(id, self._observe_fn[0])]
+        # What has arrays is read from the data; its settings are part of their structure.
+        key = [(p.name, type(p)) if isinstance(data.plugins.get(p.name), type(p)) else p for p in plugins]
+        is_changed = key != self._observe_fn[0]
         if is_changed:
-            self._observe_fn = plugins, jit_eager_calls("measured")(functools.partial(_observations, plugins))
+            self._observe_fn = key, jit_eager_calls("measured")(functools.partial(_observations, plugins))
         with keep_programs(enabled=is_changed):
             return self._observe_fn[1](data, measured=measured)
 
@@ -453,9 +455,21 @@ def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> d
     def observe_drone(drone: SimData) -> dict[str, Array]:
         measured_drone = with_measured_states(plugins, drone) if measured else drone
         sources = [(p, drone if isinstance(p, Sensor) else measured_drone) for p in plugins]
-        return {
-            f"{p.name}.{key}": x for p, values in sources for key, x in p.bound(values).observations(values).items()
-        }
+        observations: dict[str, Array] = {}
+        for p, values in sources:
+            measured_values = p.bound(values).observations(values)
+            expect(
+                isinstance(measured_values, Mapping), f"observations of {p.name!r} as a dict by name", measured_values
+            )
+            for key, x in measured_values.items():
+                expect(
+                    isinstance(x, (jax.Array, np.ndarray)) and x.ndim == 1,
+                    f"observation {key!r} of plugin {p.name!r} of shape (k,) for one drone",
+                    getattr(x, "shape", x),
+                    "Use jnp.atleast_1d(x) for a number, and x.reshape(-1) for more axes.",
+                )
+                observations[f"{p.name}.{key}"] = x
+        return observations
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     world_axes = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]

@@ -12,7 +12,7 @@ from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.engine.stage import Stage, is_first_step
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, expect
 
 
 class Edit(NamedTuple):
@@ -214,6 +214,13 @@ def _make_stages(plugin: Plugin, sim: Simulation) -> MadeStages:
         raise ConfigError(
             f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
             f"[StagePlacement(stage, before='increment_steps')]."
+        )
+    for placement in placements:
+        expect(
+            not isinstance(getattr(placement.stage, "__self__", None), Plugin),
+            f"methods of plugin {plugin.name!r} as stages, which see its arrays",
+            placement.stage,
+            f"Use StagePlacement(self.stage(self.{getattr(placement.stage, '__name__', 'method')})).",
         )
     if plugin.resets_episode:
         begin, before = plugin.stage(plugin.reset_episode, when=is_first_step), plugin.reset_before

@@ -13,7 +13,7 @@ from crazysim.core.settings import as_mask
 from crazysim.engine import jaxcompat
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.stage import Stage
-from crazysim.errors import require
+from crazysim.errors import expect, require
 
 
 class Reset:
@@ -63,6 +63,12 @@ class Reset:
         for name, fn in self._stages:
             with jax.named_scope(name):
                 data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
+            expect(
+                isinstance(data, SimData),
+                f"stage {name!r} of the reset to return the data that it got, with other values",
+                data,
+                "End its function with return data, or return data.replace(...).",
+            )
         return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
 
     def lower(self, data: SimData, default_data: SimData, mask: Any = None) -> Any:

@@ -202,8 +202,12 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     sim.add(Wind((2.0, 0, 0), 7.7))
     sim.add(Wake())
     fly_on(sim)
+    sim.plugins.observations(sim.data)
     flown, step, n = sim.data.plugins, sim.step_pipeline, sim.step_fn._cache_size()
+    observe = sim.plugins._observe_fn[1]
     wind = sim.replace(Wind(np.full((3, 2, 3), 4.0) * [1, 0, 0], 3.0))
+    sim.plugins.observations(sim.data)
+    assert sim.plugins._observe_fn[1] is observe
     sim.replace(Wake(rate=60.0))
     sim.replace(Wind((4.0, 0, 0), 3.0))
     assert sim.plugins["wind"] is not wind
@@ -403,6 +407,55 @@ def test_law_01_methods_get_one_drone():
     assert set(shapes) == {((3,), ())}
 
 
+@pytest.mark.parametrize(
+    ("observe", "message"),
+    [
+        (lambda data: {"height": data.states.pos[2]}, r"'height' of plugin 'observer' of shape \(k,\) .* got \(\)"),
+        (lambda data: {"height": jnp.zeros((2, 3))}, r"got \(2, 3\).*reshape\(-1\)"),
+        (lambda data: {"height": "high"}, "got 'high'"),
+        (lambda data: data.states.pos, "observations of 'observer' as a dict by name"),
+    ],
+)
+def test_observations_of_another_form_are_named(observe, message):
+    class Observer(Plugin):
+        """A plugin that measures."""
+
+        name: str = "observer"
+
+        def observations(self, data):
+            return observe(data)
+
+    sim = Sim(2, 2)
+    sim.add(Observer())
+    with pytest.raises(ConfigError, match=message):
+        sim.plugins.observations(sim.data)
+
+
+def add_stage(sim, fn):
+    sim.step_pipeline = sim.step_pipeline | {"mine": fn}
+    sim.step()
+
+
+def add_reset(sim):
+    sim.reset_pipeline = sim.reset_pipeline | {"mine": lambda data, default_data, mask: None}
+    sim.reset()
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda sim: add_stage(sim, lambda data: None),
+        lambda sim: add_stage(sim, stage("drone")(lambda data: None)),
+        lambda sim: add_stage(sim, stage("world")(lambda data: data.states.pos)),
+        add_reset,
+    ],
+)
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_a_stage_that_does_not_return_the_data_is_named(act, engine):
+    with pytest.raises(ConfigError, match=r"expected stage '(mine|<lambda>)' .*to return the data .*End its function"):
+        act(Sim(engine=engine))
+
+
 def test_functions_can_be_a_plugin():
     sim = Sim(n_worlds=2)
 
@@ -489,6 +542,19 @@ class Unlisted(Plugin):
         return StagePlacement(lambda data: data)
 
 
+class Unstaged(Plugin):
+    """A plugin whose stage is a method without a scope, which would see numbers instead of arrays."""
+
+    name: str = "unstaged"
+    count: jax.Array = state()
+
+    def add_one(self, data):
+        return self.write(data, self.replace(count=self.count + 1))
+
+    def stages(self, sim):
+        return [StagePlacement(self.add_one)]
+
+
 class Undeclared(Plugin):
     """A plugin whose record declares nothing."""
 
@@ -524,6 +590,7 @@ def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
     (lambda sim: sim.add(FunctionPlugin("a", None, [StagePlacement(lambda data: data, before="lunch")])),
      UnknownNameError, "No stage named 'lunch'"),
     (lambda sim: sim.add(Unlisted()), ConfigError, "expected stages of plugin 'unlisted' to return a list"),
+    (lambda sim: sim.add(Unstaged()), ConfigError, r"'unstaged' .*Use StagePlacement\(self.stage\(self.add_one\)\)"),
     (lambda sim: sim.add(Undeclared()), ConfigError, "expected record of plugin 'undeclared' to return a PyTree or"),
     (lambda sim: sim.remove("wake"), UnknownNameError, "got 'wake'. Added are: wind, latency"),
     (lambda sim: sim.replace(Wake()), UnknownNameError, "got 'wake'"),

@@ -387,6 +387,12 @@ def test_parameters_that_cannot_be_randomised_are_errors(env):
         (lambda env: Observe(env, lambda obs, data: {"z": data.states.pos[:, 2]}).reset(KEY), r"\(n_drones, k\)"),
         (lambda env: RandomizeWith(env, None), "expected a function"),
         (lambda env: RandomizeWith(env, lambda data, key: None).reset(KEY), "to return the data"),
+        (
+            lambda env: RandomizeWith(
+                env, lambda data, key: data.replace(params=data.params.replace(mass=jnp.float32(0.03))), ("mass",)
+            ).reset(KEY),
+            r"keep the shape \(1, 1\) of params.mass, got \(\). Use jnp.broadcast_to",
+        ),
         (lambda env: Normalize(env, 5), "stats as a dict"),
         (lambda env: env.reset(0), r"random key, got 0.*jax.random.key\(0\)"),
         (lambda env: env.reset(jax.random.PRNGKey(0)), "wrap_key_data"),

@@ -59,11 +59,17 @@ class RandomizeWith(Wrapper):
             f"{type(randomised).__name__}. Use data.replace(params=...).",
         )
         axes = Axes(data)
-        leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)
+        leaves = [*zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)]
         shared_names = [name for name, scope, x, y in leaves if scope in ("shared", "opaque") and y is not x]
         require(
             not shared_names,
             f"{', '.join(shared_names)} cannot be randomised: all worlds share it. Name parameters that get a "
             f"value per drone in params=, as in RandomizeWith(env, fn, params=('mass',)).",
         )
+        for name, _, x, y in leaves:
+            require(
+                jnp.shape(x) == jnp.shape(y),
+                f"expected the function of RandomizeWith to keep the shape {jnp.shape(x)} of {name}, got "
+                f"{jnp.shape(y)}. Use jnp.broadcast_to(value, {jnp.shape(x)}).",
+            )
         return randomised
