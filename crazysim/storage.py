@@ -143,7 +143,9 @@ def read_text(path: str | Path, max_bytes: int) -> str:
         ConfigError: If it does not exist, cannot be read, is larger, or is not text in UTF-8.
     """
     try:
-        return read_bytes(path, max_bytes).decode("utf-8-sig")
+        text = read_bytes(path, max_bytes).decode("utf-8-sig")
+        require("\0" not in text, f"expected text in UTF-8 in {path}, got zero bytes, as in UTF-16. Save it as UTF-8.")
+        return text
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"expected text in {path}, got bytes that are not UTF-8: {error}. Save it as UTF-8."

@@ -1,4 +1,4 @@
-"""Waiting for events of other threads and processes."""
+"""Waiting for events of other threads and processes, and a clock that only a test advances."""
 
 import time
 
@@ -9,3 +9,18 @@ def wait_for(condition, seconds=300.0):
     while not condition():
         assert time.monotonic() < deadline, "the condition did not hold in time"
         time.sleep(0.01)
+
+
+class Clock:
+    """A clock that stands in for ``time.monotonic`` and others: sleeping advances it, a busy machine does not."""
+
+    def __init__(self):
+        self.now = 10.0
+
+    def __call__(self):
+        return self.now
+
+    monotonic = perf_counter = __call__
+
+    def sleep(self, seconds):
+        self.now += seconds

@@ -488,6 +488,7 @@ def test_law_09_files_that_are_no_text_or_too_deep_or_too_large_are_named(tmp_pa
     path = tmp_path / "mine.toml"
     for content, message in (
         (b"\xff\xfe[rotors]", "expected text in .*mine.toml, got bytes that are not UTF-8"),
+        ("[rotors]".encode("utf-16-le"), "expected text in UTF-8 in .*mine.toml, got zero bytes, as in UTF-16"),
         (b"a = " + b"[" * 5000, "mine.toml is not valid TOML"),
         (b"a = " + b"{a=" * 5000, "mine.toml is not valid TOML"),
         (b"rotors." + b"a." * 5000 + b"a = 1", "expected a table that exists"),

@@ -85,13 +85,15 @@ def _read_source(
         start = file.read(8)
     for first_bytes, (got, remedy) in OTHER_FORMATS.items():
         require(not start.startswith(first_bytes), f"{path.name}: expected a log, got {got}. {remedy}")
+    is_text = path.suffix.lower() == ".csv"
+    require(not is_text or b"\0" not in start, f"{path.name}: expected a log, got text in UTF-16. Save it as UTF-8.")
     with wrap_read_errors(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix.lower() == ".ulg":
             return path.stem, read_ulog(path, repairs)
         if path.suffix.lower() == ".npz":
             with path.open("rb") as file:
                 table = read_arrays(file, path.name)
-        elif path.suffix.lower() != ".csv":
+        elif not is_text:
             return path.stem, read_crazyflie(path, repairs, columns)
         elif find_header(path) is not None:
             return path.stem, read_blackbox(path, repairs)

@@ -88,7 +88,7 @@ class Live(Interaction, Closeable):
         self.step = round(float(sim.time[0, 0]) * control_freq)
         self.n_steps_run = 0
         self._dt = 1.0 / control_freq
-        self._pace = Pace(self._dt, speed)
+        self._pace = Pace(self._dt, speed, perf_counter)
         self._commands = StagedCommands(sim)
         self._history = History(positive_integer("n_snapshots", n_snapshots))
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
@@ -255,7 +255,7 @@ class Live(Interaction, Closeable):
         end = None if seconds is None else self.n_steps_run + round(seconds * self.control_freq)
         self._is_stopped = False
         self._warm_up()
-        self._pace = Pace(self._dt, self._pace.speed)
+        self._pace = Pace(self._dt, self._pace.speed, perf_counter)
         first_step, first_picture = self.n_steps_run, self._viewers.n_pictures
         paused_s, start_time = 0.0, perf_counter()
         with protect_loop(), contextlib.suppress(KeyboardInterrupt):

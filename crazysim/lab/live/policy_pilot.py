@@ -23,7 +23,7 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import FLOOR, GoalTask
 from crazysim.errors import ConfigError, require
 from crazysim.lab.live.loop import Live
-from crazysim.storage import MAX_TEXT_BYTES, open_file, wrap_read_errors
+from crazysim.storage import MAX_TEXT_BYTES, read_text
 from crazysim.train.evaluation import act, initial_memory
 from crazysim.train.interface import check_policy
 
@@ -225,11 +225,8 @@ def read_points(path: str | Path) -> NDArray:
     Raises:
         ConfigError: If the file does not exist, or a line is not a point.
     """
-    errors = wrap_read_errors(path, "a list of points", "Write x,y,z in each line, m.")
-    with errors, open_file(path, MAX_TEXT_BYTES) as file:
-        lines = file.read().decode("utf-8-sig").splitlines()
     points = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(path, MAX_TEXT_BYTES).splitlines(), 1):
         if text := line.partition("#")[0].strip():
             points.append(parse_point(text, f"{path}, line {number}: "))
     require(points, f"expected points in {path}, got none. Write x,y,z in each line, m.")

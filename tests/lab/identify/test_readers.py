@@ -63,6 +63,8 @@ TABLE = b"t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n"
         ("a.csv", bz2.compress(TABLE), "Unpack it with bunzip2"),
         ("a.csv", lzma.compress(TABLE), "Unpack it with unxz"),
         ("a.csv", TABLE.decode().encode("utf-16"), "text in UTF-16. Save it as UTF-8"),
+        ("a.csv", TABLE.decode().encode("utf-16-le"), "text in UTF-16. Save it as UTF-8"),
+        ("a.csv", TABLE.decode().encode("utf-16-be"), "text in UTF-16. Save it as UTF-8"),
         ("a.csv", b"\xfe\xff" + TABLE.decode().encode("utf-16-be"), "text in UTF-16. Save it as UTF-8"),
     ],
 )

@@ -2,17 +2,10 @@
 
 import numpy as np
 import pytest
+from waiting import Clock
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.pace import BIN_WIDTH, MAX_LAG, Pace
-
-
-class Clock:
-    def __init__(self):
-        self.now = 10.0
-
-    def __call__(self):
-        return self.now
 
 
 @pytest.fixture

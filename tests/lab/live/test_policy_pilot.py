@@ -135,7 +135,10 @@ def test_points_are_read_from_text(tmp_path):
     path.write_text("# nothing\n")
     with pytest.raises(ConfigError, match="expected points in"):
         read_points(path)
-    with pytest.raises(ConfigError, match="an existing file with a list of points"):
+    path.write_text("0,0,1\n", encoding="utf-16-le")
+    with pytest.raises(ConfigError, match=r"expected text in UTF-8 in .*Save it as UTF-8"):
+        read_points(path)
+    with pytest.raises(ConfigError, match=r"expected an existing file, got .*none.csv"):
         read_points(tmp_path / "none.csv")
 
 
@@ -160,7 +163,7 @@ def test_the_command_flies_to_typed_and_to_listed_goals(folder, tmp_path, capsys
     assert main([*arguments, "--seconds", "6", "--goals", str(path)]) == 0
     assert "points passed: 2" in capsys.readouterr().out
     wrong = {
-        ("--goals", "none.csv"): "an existing file with a list of points",
+        ("--goals", "none.csv"): "expected an existing file, got 'none.csv'",
         ("--drones", "2"): "the settings of the run with --policy, got --drones",
         ("--pilot",): "got --pilot",
     }

@@ -117,7 +117,7 @@ class SoftwareInTheLoop(Closeable):
             self._is_compiled = True
         dt, start_time = self._n_steps / self.sim.freq, time.monotonic()
         self._last_command_times = [start_time] * len(self.links)
-        pace = Pace(dt, speed)
+        pace = Pace(dt, speed, time.perf_counter)
         for k in range(round(seconds / dt)):
             if (wait := pace.time_until_due()) > 0:
                 time.sleep(wait)
