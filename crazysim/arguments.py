@@ -111,6 +111,8 @@ def check_arguments(function: F) -> F:
             remedy = f"help({function.__qualname__.removesuffix('.__init__')}) describes it."
             if np.ndarray in types and not isinstance(value, tuple(set(types) - NUMERIC_TYPES)):
                 check_array(key, value, remedy)
+                is_tree = hasattr(value, "dtype") or isinstance(value, (bool, int, float, list, tuple))
+                bound.arguments[key] = value if is_tree else np.asarray(value)  # JAX takes no range, for example
             else:
                 check_value(key, value, types, remedy=remedy)
                 # One number in an array becomes a number, which can be compared, used as an index, and hashed.

@@ -389,7 +389,7 @@ EMPTY_TEXTS = np.zeros(0, "U3")
         ("sim.depth", "camera", np.array(0, np.int8)), ("sim.depth", "camera", jnp.array(0)),
         ("sim.depth", "along", EMPTY_TEXTS), ("sim.rollout", "every", np.array(0, np.int8)),
         ("sim.rollout", "every", jnp.array(1)), ("envs.rollout", "policy", 95.0),
-        ("evaluate", "t", RAGGED), ("evaluate", "t", [1.0, 2.0]), ("derivatives", "t", RAGGED),
+        ("evaluate", "t", RAGGED), ("evaluate", "t", [1.0, 2.0]), ("evaluate", "t", range(3)), ("derivatives", "t", RAGGED),
         ("to_casadi", "sim", Lazy(env)), ("to_casadi", "parameters", 3), ("draw_points", "sim", Lazy(env)),
         ("DroneVectorEnv", "render_mode", np.zeros(0, bool)), ("estimate_airframe", "layout", EMPTY_TEXTS),
     ],
