@@ -13,7 +13,7 @@ BUDGET = {
     "commands": 1165,
     "control": 1987,
     "core": 1549,
-    "crazysim": 826,
+    "crazysim": 828,
     "drones": 514,
     "dynamics": 576,
     "engine": 6745,
