@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, dataclass_transform
@@ -24,7 +24,7 @@ from crazysim.core.settings import Setting, check_settings, setting
 from crazysim.drones import Airframe
 from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
 from crazysim.engine.stage import Stage
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, require, short_repr
 from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
@@ -460,6 +460,14 @@ class Plugin(PyTree):
         return "drone"
 
     @property
+    def companions(self) -> Mapping[str, type]:
+        """Names and classes of plugins that must be added before, because ``bind`` or ``stages`` read them.
+
+        If one of them is replaced, both are called again.
+        """
+        return {}
+
+    @property
     def replaced_terms(self) -> tuple[str, ...]:
         """Terms of the dynamics model that the plugin replaces with its settings; by default those of its class."""
         return self.replaces
@@ -493,19 +501,25 @@ class Plugin(PyTree):
 
         A plugin on which the check depends cannot be removed.
         """
-        for companion in self.requires:
-            if isinstance(companion, type) and not any(isinstance(x, companion) for x in sim.plugins.values()):
-                raise ConfigError(
-                    f"expected a simulation with a {companion.__name__}, which {type(self).__name__} {self.name!r} "
-                    f"needs, got {', '.join(map(repr, sim.plugins)) or 'no plugin'}. Use sim.add({companion.__name__}"
-                    f"(...)) first."
-                )
+        kinds = [(None, kind) for kind in self.requires if isinstance(kind, type)]
+        self._require_plugins(sim, [*kinds, *self.companions.items()])
+
+    def _require_plugins(self, sim: Simulation, needed: Iterable[tuple[str | None, type]]) -> None:
+        for name, kind in needed:
+            others = sim.plugins.values() if name is None else [sim.plugins.get(name)]
+            require(
+                any(isinstance(other, kind) for other in others),
+                f"expected a simulation with a {kind.__name__}{f' named {name!r}' if name else ''}, which "
+                f"{type(self).__name__} {self.name!r} needs, got {', '.join(map(repr, sim.plugins)) or 'no plugin'}. "
+                f"Use sim.add to add it first.",
+            )
 
     def check_simulation(self, sim: Simulation) -> None:
         """Check the requirements of the class on the simulation that the plugin is being added to."""
         for requirement in self.requires:
             if not isinstance(requirement, type):
                 requirement(sim, self)
+        self._require_plugins(sim, self.companions.items())
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""

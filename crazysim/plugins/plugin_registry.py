@@ -88,7 +88,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             _require_numbers(plugin, default)
             self._put_records(name, record, default)
             self._stages.set_plugin(name, plugin)
-            self._build(plugin)
+            self._build(plugin, [name])
         return plugin
 
     def remove(self, plugin: Plugin | str) -> None:
@@ -140,16 +140,19 @@ class PluginRegistry(Mapping[str, Plugin]):
         with self._restore_on_error():
             readers = [name for name in self if name in self._scene_readers]
             for name in self._record_readers.intersection(readers):
-                records = self._make_records(self[name])
-                present = sim.data.plugins.get(name), sim.default_data.plugins.get(name)
-                carried = [_carry_over(self[name], *xs, ()) for xs in zip(records, present, strict=True)]
-                self._put_records(name, *carried)
+                self._remake_records(name)
             # Functions of plugins, too, may read the scene while the step is traced.
             if readers or (len(self) and self._last_revision != sim.scene.revision):
                 self._stages.build(remake=readers)
                 sim.build_step_fn()
             self._last_revision = sim.scene.revision
         self.is_stale = False
+
+    def _remake_records(self, name: str) -> None:
+        """Make the records of a plugin again; states, and numbers that were set in them, stay as they are."""
+        records, datas = self._make_records(self[name]), (self._sim.data, self._sim.default_data)
+        present = [data.plugins.get(name) for data in datas]
+        self._put_records(name, *[_carry_over(self[name], *xs, ()) for xs in zip(records, present, strict=True)])
 
     @property
     def _scene_readers(self) -> set[str]:
@@ -223,12 +226,18 @@ class PluginRegistry(Mapping[str, Plugin]):
         old_record, (record, default) = sim.data.plugins.get(name), self._make_records(plugin)
         self._put_records(name, _carry_over(plugin, record, old_record), default)
         is_new = not _have_same_code(old_plugin, plugin) or jax.tree.structure(old_record) != jax.tree.structure(record)
-        if is_new:
-            self._stages.require_unedited(name)
         self._stages.set_plugin(name, plugin)
         self._is_checked = False
-        if is_new:
-            self._build(plugin)
+        changed = [name]
+        for other in self.values():  # companions come before the plugins that read them
+            if other.companions.keys() & changed:
+                self._remake_records(other.name)
+                changed.append(other.name)
+        remake = changed[0 if is_new else 1 :]
+        if remake and (is_new or _signature(old_record) != _signature(record)):
+            for other_name in remake:
+                self._stages.require_unedited(other_name)
+            self._build(plugin, remake)
         return plugin
 
     @contextlib.contextmanager
@@ -363,13 +372,12 @@ class PluginRegistry(Mapping[str, Plugin]):
             )
         self._sim.data = _with_record(self._sim.data, name, record)
 
-    def _build(self, changed: Plugin | None = None) -> None:
+    def _build(self, changed: Plugin | None = None, remake: Collection[str] = ()) -> None:
         """Build the pipelines, after a plugin was added, replaced or removed."""
         self._is_checked = False
-        names = {changed.name} if changed is not None else set()
-        self._stages.build(names, changed)
+        self._stages.build(remake, changed)
         self._sim.build_step_fn()
-        self.is_stale = self.is_stale or not self._scene_readers <= names
+        self.is_stale = self.is_stale or not self._scene_readers <= {*remake}
 
 
 def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
@@ -414,7 +422,8 @@ def _carry_over(
         plugin: The plugin.
         record: The new record.
         old_record: The previous record.
-        setting_scopes: Scopes of leaves that are not states; empty to carry over settings, too.
+        setting_scopes: Scopes of leaves that are not states; empty to carry over settings, too, except for ``derived``
+            ones.
     """
     carried_record = _carry_over_states(record, old_record, setting_scopes)
     is_same_kind = carried_record is not None and type(carried_record) is type(old_record)
@@ -429,10 +438,11 @@ def _carry_over_states(
         return record
     states = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
-        new, old = getattr(record, f.name), getattr(old_record, f.name)
+        new, old, scope = getattr(record, f.name), getattr(old_record, f.name), f.metadata.get("scope")
+        is_derived = f.metadata.get("optional") and scope in _SETTING_SCOPES
         if isinstance(new, PyTree):
             states[f.name] = _carry_over_states(new, old, setting_scopes)
-        elif not f.metadata.get("static") and f.metadata.get("scope") not in setting_scopes:
+        elif not f.metadata.get("static") and scope not in setting_scopes and not is_derived:
             states[f.name] = old if _signature(old) == _signature(new) else new
     return record.replace(**states)
 

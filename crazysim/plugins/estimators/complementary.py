@@ -76,9 +76,8 @@ class Complementary(Estimator):
         return Barometer, TimeOfFlight
 
     def bind(self, sim: Simulation) -> Complementary:
-        self.check_sensors(sim)
-        if not self.aiding_sensors or len({type(sensor) for sensor in self.aiding_sensors}) < len(self.aiding_sensors):
-            classes = [type(sensor).__name__ for sensor in self.aiding_sensors]
+        classes = [type(sensor).__name__ for sensor in self.aiding_sensors(sim.data)]
+        if not classes or len(set(classes)) < len(classes):
             raise ConfigError(
                 f"expected a Barometer, a TimeOfFlight or one of each among the sensors of {self.name!r}, got {classes}"
             )
@@ -89,7 +88,8 @@ class Complementary(Estimator):
             )
         return self.with_arrays(sim, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
-    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
+    def filter_stages(self, data: SimData) -> Sequence[tuple[str, Stage]]:
+        freq = data.core.freq
         period = freq // rate_in(self, freq)
         height_period = freq // default_rates(freq, {"rate of the height": HEIGHT_FREQ})["rate of the height"]
 
@@ -132,13 +132,14 @@ class Complementary(Estimator):
         """Return the new height of one drone, m, and the new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         new_height = height
-        for sensor in self.aiding_sensors:
+        sensors = self.aiding_sensors(data)
+        for sensor in sensors:
             if isinstance(sensor, Barometer):
                 new_height = filtered_height(height, sensor.part(data, "height"), shift)
-        for sensor in self.aiding_sensors:
+        for sensor in sensors:
             if isinstance(sensor, TimeOfFlight):
                 distance = sensor.latest(data)
-                is_useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.read(data).max_range)
+                is_useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.max_range)
                 new_height, over_surface = height_over_surface(
                     height, new_height, distance, is_useful, over_surface, shift
                 )

@@ -48,8 +48,8 @@ class ErrorStateFilter(Estimator):
     def default(cls) -> Self:
         return cls([IMU.crazyflie(), MotionCapture()])
 
-    def update_estimate(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
-        """Return the estimate of one drone after the latest measurement of a sensor."""
+    def update_estimate(self, sensor: Sensor, data: SimData) -> Estimate:
+        """Return the estimate of one drone after the latest measurement of a sensor in ``data.plugins``."""
         raise NotImplementedError
 
     def is_valid(self, estimate: Estimate) -> Array:
@@ -67,7 +67,7 @@ class ErrorStateFilter(Estimator):
         raise NotImplementedError
 
     def with_arrays(self, sim: Simulation, **values: Any) -> Self:
-        used_steps = np.full((*sim.data.states.pos.shape[:2], len(self.aiding_sensors)), -1)
+        used_steps = np.full((*sim.data.states.pos.shape[:2], len(self.sensors) - 1), -1)
         return super().with_arrays(sim, used_steps=device_array(used_steps, np.int32), **values)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
@@ -79,12 +79,9 @@ class ErrorStateFilter(Estimator):
         period = freq // rate_in(self, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 
-    def fusion_stages(self) -> list[tuple[str, Stage]]:
+    def fusion_stages(self, data: SimData) -> list[tuple[str, Stage]]:
         """Return the names of the sensors with the stages that use their measurements."""
-        return [
-            (s.name, Stage(self._fusion_fn(k, s), "drone", self._is_new(k, s)))
-            for k, s in enumerate(self.aiding_sensors)
-        ]
+        return [(x.name, self._fusion_stage(k, x.name)) for k, x in enumerate(self.aiding_sensors(data))]
 
     def restart_stage(self) -> Stage:
         """Return the stage that restarts the filter where its estimate has left its bounds."""
@@ -95,20 +92,18 @@ class ErrorStateFilter(Estimator):
         gyro, accel = self.inertial(data)
         return self.write(data, self.replace(accel=self.accel + accel, gyro=self.gyro + gyro))
 
-    def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
-        """Return a function that returns True if the latest measurement of aiding sensor k was not used yet."""
-        return lambda data: sensor.read(data).samples.taken_step[0] != self.read(data).used_steps[k]
+    def _fusion_stage(self, k: int, name: str) -> Stage:
+        def is_new(data: SimData) -> Array:
+            return data.plugins[name].samples.taken_step[0] != self.read(data).used_steps[k]  # type: ignore[attr-defined]
 
-    def _fusion_fn(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse_measurement(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
-            record, taken_step = self.read(data), sensor.read(data).samples.taken_step
-            used_steps = record.used_steps.at[k].set(taken_step[0])
-            return self.write(
-                data, record.replace(estimate=self.update_estimate(sensor, data, record), used_steps=used_steps)
-            )
+            record, sensor = self.read(data), data.plugins[name]
+            used_steps = record.used_steps.at[k].set(sensor.samples.taken_step[0])  # type: ignore[attr-defined]
+            estimate = record.update_estimate(sensor, data)
+            return self.write(data, record.replace(estimate=estimate, used_steps=used_steps))
 
-        return fuse_measurement
+        return Stage(fuse_measurement, "drone", is_new)
 
     def _restart(self, data: SimData) -> SimData:
         """Restart the filter of one drone with a level attitude at the origin."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -98,26 +98,22 @@ class ESKF(ErrorStateFilter):
     def bind(self, sim: Simulation) -> ESKF:
         quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = drone_array(sim, 0.0, error_state.N_BIASED * (error_state.N_BIASED + 1) // 2)
-        self.check_sensors(sim)
-        n_rows = sum(_n_rows_in_transit(sensor, sim.data) for sensor in self.aiding_sensors)
+        n_rows = sum(map(_n_rows_in_transit, self.aiding_sensors(sim.data)))
         row = inertial_path.EMPTY_PATH_ROW
         paths = drone_array(sim, row, n_rows, len(row)) if n_rows else None
         return self.with_arrays(sim, estimate=Estimate(zero, zero, quat, zero, cov, zero, zero), paths=paths)
 
-    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        period, is_due = self.prediction_schedule(freq)
+    def filter_stages(self, data: SimData) -> Sequence[tuple[str, Stage]]:
+        period, is_due = self.prediction_schedule(data.core.freq)
         return [
             ("sample", self.stage(self.add_sample)),
             ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
             *(
-                (
-                    f"{sensor.name}_path",
-                    Stage(self._path_start_fn(sensor, period), "drone", sensor.is_sampled),
-                )
-                for sensor in self.aiding_sensors
+                (f"{sensor.name}_path", self._path_start_stage(sensor.name, period))
+                for sensor in self.aiding_sensors(data)
                 if sensor.is_late
             ),
-            *self.fusion_stages(),
+            *self.fusion_stages(data),
             # The last stage has the name of the estimator.
             ("", self.restart_stage()),
         ]
@@ -175,7 +171,7 @@ class ESKF(ErrorStateFilter):
 
         return predict
 
-    def _path_start_fn(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
+    def _path_start_stage(self, name: str, period: int) -> Stage:
         def start_path(data: SimData) -> SimData:
             """Start a path at a new measurement of one sensor.
 
@@ -190,37 +186,38 @@ class ESKF(ErrorStateFilter):
                 .reverse()
                 .to_row()
             )
-            first, end = self._path_rows(sensor, data)
+            first, end = self._path_rows(name, data)
             paths = [record.paths[:first], path_back[None], record.paths[first : end - 1], record.paths[end:]]
             return self.write(data, record.replace(paths=jnp.concatenate(paths)))
 
-        return start_path
+        return Stage(start_path, "drone", lambda data: data.plugins[name].is_sampled(data))  # type: ignore[attr-defined]
 
-    def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
+    def _path_rows(self, name: str, data: SimData) -> tuple[int, int]:
         """Return the first row of the paths of one sensor, and the row after the last."""
-        counts = [_n_rows_in_transit(other, data) for other in self.aiding_sensors]
-        first = sum(counts[: self.aiding_sensors.index(sensor)])
-        return first, first + counts[self.aiding_sensors.index(sensor)]
+        counts = {sensor.name: _n_rows_in_transit(sensor) for sensor in self.aiding_sensors(data)}
+        first = sum([*counts.values()][: [*counts].index(name)])
+        return first, first + counts[name]
 
-    def update_estimate(self, sensor: Sensor, data: SimData, record: ESKF) -> Estimate:
+    def update_estimate(self, sensor: Sensor, data: SimData) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor.
 
         The estimate is moved to the time at which the measurement was taken, updated, and moved back.
         """
-        steps, taken_step, gravity = data.core.steps, sensor.read(data).samples.taken_step[0], data.params.gravity_vec
+        samples: Any = sensor.samples
+        steps, taken_step, gravity = data.core.steps, samples.taken_step[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
         # Time from the last prediction to the measurement, s; negative if the measurement was taken before.
         since_prediction = (taken_step - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq
         if not sensor.is_late:
-            past_estimate = error_state.propagate(record.estimate, accel, gyro, since_prediction, gravity)
+            past_estimate = error_state.propagate(self.estimate, accel, gyro, since_prediction, gravity)
             past_estimate = _finalize(_update(sensor, self.imu(data), data, past_estimate))
             return error_state.propagate(past_estimate, accel, gyro, -since_prediction, gravity)
-        interval, (first, end) = data.core.freq // sensor.rate(data.core.freq), self._path_rows(sensor, data)
-        paths: Array = record.paths  # type: ignore[assignment]
+        interval, (first, end) = data.core.freq // sensor.rate(data.core.freq), self._path_rows(sensor.name, data)
+        paths: Array = self.paths  # type: ignore[assignment]
         row, age = paths[first], (steps - taken_step) // interval  # age in measurements of the sensor
         for k in range(first + 1, end):
             row = jnp.where(age == k - first, paths[k], row)
-        path, estimate = InertialPath.from_row(row, -since_prediction), record.estimate
+        path, estimate = InertialPath.from_row(row, -since_prediction), self.estimate
         path_back = path.without_biases(estimate).reverse()
         past_estimate = inertial_path.propagate_along(estimate, path_back, gravity)
         past_estimate = _finalize(_update(sensor, self.imu(data), data, past_estimate))
@@ -233,9 +230,9 @@ class ESKF(ErrorStateFilter):
         return self._initial_estimate(data, pos, jnp.zeros_like(pos), quat, RESTART_STD)
 
 
-def _n_rows_in_transit(sensor: Sensor, data: SimData) -> int:
-    """Return the number of measurements of one sensor that can be in transit."""
-    arrival_steps = sensor.read(data).samples.arrival_steps
+def _n_rows_in_transit(sensor: Any) -> int:
+    """Return the number of measurements of a sensor in ``data.plugins`` that can be in transit."""
+    arrival_steps = sensor.samples.arrival_steps
     return 0 if arrival_steps is None else arrival_steps.shape[-1]
 
 
@@ -259,14 +256,14 @@ def _std(variance: Array | float, min_std: float = MIN_STD) -> Array:
 
 
 def _update_by_motion_capture(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    pos_std, angle_std = (_std(sensor.read(data).variance(name)) for name in ("pos", "quat"))
+    pos_std, angle_std = (_std(sensor.variance(name)) for name in ("pos", "quat"))
     estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std))
     return updates.update_quat(estimate, sensor.part(data, "quat"), angle_std)
 
 
 def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     """Use a measurement by the derivatives of the sensor's measurement without errors with respect to the states."""
-    sensor, first, gyro = sensor.bound(data), estimate, imu.measured_states(data)["ang_vel"]
+    first, gyro = estimate, imu.measured_states(data)["ang_vel"]
 
     def predict(errors: Array) -> Array:
         turn = jnp.concatenate([0.5 * errors[6:9], jnp.ones_like(gyro[:1])])
@@ -295,58 +292,57 @@ def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate)
 
 
 def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
-    pos_std, vel_std = (_std(record.variance(name)) for name in ("pos", "vel"))
-    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std, record.pos))
-    return updates.update_vel(estimate, sensor.part(data, "vel"), vel_std, record.pos, gyro)
+    gyro = imu.measured_states(data)["ang_vel"]
+    pos_std, vel_std = (_std(sensor.variance(name)) for name in ("pos", "vel"))
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), pos_std, sensor.pos))
+    return updates.update_vel(estimate, sensor.part(data, "vel"), vel_std, sensor.pos, gyro)
 
 
 def _update_by_barometer(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record = sensor.read(data)
-    altitude = estimate.pos[2:] + record.altitude
+    altitude = estimate.pos[2:] + sensor.altitude
     predicted_pressure = pressure_at(altitude)
     slope = -PRESSURE_EXPONENT * LAPSE_RATE * predicted_pressure / (SEA_LEVEL_TEMPERATURE - LAPSE_RATE * altitude)
     error = sensor.part(data, "pressure") - predicted_pressure
-    std = _std(record.variance("pressure"), 100 * MIN_STD)
+    std = _std(sensor.variance("pressure"), 100 * MIN_STD)
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 
 def _update_by_magnetometer(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record = sensor.read(data)
-    errors, size = record.errors, rotation.safe_norm(record.field)
+    errors: Any = sensor.errors
+    size = rotation.safe_norm(sensor.field)
     noise = errors.noise * math.sqrt(0.5 / sensor.interval(data))
     std = _combined_std(*(x / size for x in (noise, errors.spread[:3], errors.instability)))
-    measured = rotation.rotate(record.quat, sensor.part(data, "field") - errors.mean[:3]) / size
-    return updates.update_direction(estimate, measured, record.field / size, std)
+    measured = rotation.rotate(sensor.quat, sensor.part(data, "field") - errors.mean[:3]) / size
+    return updates.update_direction(estimate, measured, sensor.field / size, std)
 
 
 def _update_by_optical_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
-    scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
-    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _std(record.variance("flow")[0]))
+    gyro = imu.measured_states(data)["ang_vel"]
+    scale, rot = sensor.interval(data) * sensor.scale[0], rotation.matrix(estimate.quat)
+    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _std(sensor.variance("flow"))[0])
 
 
 def _update_by_time_of_flight(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record, distance = sensor.read(data), sensor.latest(data)
-    std = _combined_std(record.deviation(distance))
+    distance = sensor.latest(data)
+    std = _combined_std(sensor.deviation(distance))
     updated = updates.update_ray(estimate, distance[0], std[0])
-    return error_state.select_estimate(distance[0] < record.max_range[0], updated, estimate)
+    return error_state.select_estimate(distance[0] < sensor.max_range[0], updated, estimate)
 
 
 def _update_by_uwb(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    record, measured = sensor.read(data), sensor.latest(data)
-    std = _combined_std(record.noise[0])
+    anchors, measured = sensor.anchors, sensor.latest(data)
+    std = _combined_std(sensor.noise[0])
     if sensor.tdoa:
-        return updates.update_differences(estimate, record.anchors, measured, std)
+        return updates.update_differences(estimate, anchors, measured, std)
     for k in range(measured.shape[0]):
-        estimate = updates.update_distance(estimate, record.anchors[k], measured[k], std)
+        estimate = updates.update_distance(estimate, anchors[k], measured[k], std)
     return estimate
 
 
 def _update_by_lighthouse(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     rot, std = (
         rotation.matrix(estimate.quat),
-        {"sweep": _combined_std(sensor.read(data).noise[0], min_std=0.1 * MIN_STD)},
+        {"sweep": _combined_std(sensor.noise[0], min_std=0.1 * MIN_STD)},
     )
     return KALMAN_UPDATE_FNS[Lighthouse](sensor, imu, data, estimate, rot, std)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
@@ -67,13 +67,10 @@ class Estimator(Plugin):
         """Return True if the filter can use a sensor, beside its ``IMU``."""
         return type(sensor) in self.kinds
 
-    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the names and stages of the filter, in their order.
+    def filter_stages(self, data: SimData) -> Sequence[tuple[str, Stage]]:
+        """Return the names and stages of the filter, in their order, for the data of a simulation.
 
         The last name is empty: that stage has the name of the plugin.
-
-        Args:
-            freq: Steps of the simulation per second, Hz.
         """
         raise NotImplementedError
 
@@ -81,20 +78,27 @@ class Estimator(Plugin):
         """Return the estimated fields of ``data.states`` of one drone; the ``IMU`` measures the others."""
         raise NotImplementedError
 
+    @property
+    def companions(self) -> Mapping[str, type]:
+        return {} if self.is_bound else {sensor.name: type(sensor) for sensor in self.sensors}
+
+    def bound_sensors(self, data: SimData) -> list[Sensor]:
+        """Return all sensors as they are in ``data.plugins``."""
+        names: list[Any] = [getattr(sensor, "name", sensor) for sensor in self.sensors]
+        return [data.plugins[name] for name in names]  # type: ignore[misc]
+
     def imu(self, data: SimData) -> IMU:
         """Return the inertial measurement unit in ``data.plugins``."""
-        names: list[Any] = [getattr(sensor, "name", sensor) for sensor in self.sensors]
-        return next(data.plugins[name] for name in names if isinstance(data.plugins[name], IMU))
+        return next(sensor for sensor in self.bound_sensors(data) if isinstance(sensor, IMU))
 
-    @property
-    def aiding_sensors(self) -> list[Sensor]:
-        """All sensors except for the inertial measurement unit."""
-        return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
+    def aiding_sensors(self, data: SimData) -> list[Sensor]:
+        """Return all sensors in ``data.plugins`` except for the inertial measurement unit."""
+        return [sensor for sensor in self.bound_sensors(data) if not isinstance(sensor, IMU)]
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         placements = [
             StagePlacement(stage, before="increment_steps", name=f"{self.name}_{name}" if name else self.name)
-            for name, stage in self.filter_stages(sim.data.core.freq)
+            for name, stage in self.filter_stages(sim.data)
         ]
         if self.control:
             stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLER_STAGES})
@@ -120,26 +124,20 @@ class Estimator(Plugin):
         return rotation.rotate(imu.quat, gyro), rotation.rotate(imu.quat, accel)
 
     def with_arrays(self, sim: Simulation, **values: Any) -> Self:
-        self.check_sensors(sim)
         return super().with_arrays(sim, sensors=tuple([sensor.name for sensor in self.sensors]), **values)
 
-    def check_plugins(self, sim: Simulation) -> None:
-        self.check_sensors(sim)
-
-    def check_sensors(self, sim: Simulation) -> None:
-        """Check that there is one ``IMU``, that all kinds are supported, and that the simulation has all sensors."""
+    def check_simulation(self, sim: Simulation) -> None:
+        """Check the sensors: one ``IMU``, and others of kinds that the filter can use."""
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
             classes = [type(sensor).__name__ for sensor in self.sensors]
             raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {classes}")
-        for sensor in self.aiding_sensors:
-            if not self.can_fuse(sensor):
-                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
         for sensor in self.sensors:
-            if sensor.name not in sim.data.plugins:
-                raise ConfigError(
-                    f"expected sensor {sensor.name!r} in the simulation, got none; add it before {self.name!r}"
-                )
+            present: Any = sim.plugins.get(sensor.name)
+            sensor = present if isinstance(present, type(sensor)) else sensor
+            if not isinstance(sensor, IMU) and not self.can_fuse(sensor):
+                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
+        super().check_simulation(sim)
 
     def _estimate_controller(self, controller: Stage) -> Stage:
         """Return a controller that reads the estimate in place of the state."""

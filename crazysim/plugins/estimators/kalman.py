@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -83,13 +82,13 @@ class Kalman(ErrorStateFilter):
         deviation_array = device_array(np.array(deviations), quat.dtype)
         return self.with_arrays(sim, estimate=estimate, previous_quat=quat, deviations=deviation_array)
 
-    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        period, is_due = self.prediction_schedule(freq)
+    def filter_stages(self, data: SimData) -> Sequence[tuple[str, Stage]]:
+        period, is_due = self.prediction_schedule(data.core.freq)
         return [
             ("sample", self.stage(self.add_sample)),
             ("predict", Stage(self._prediction_fn(period), "drone", is_due)),
             ("noise", self.stage(self._add_noise)),
-            *self.fusion_stages(),
+            *self.fusion_stages(data),
             ("finalize", self.stage(self._finalize, when=self._is_updated)),
             ("restart", self.restart_stage()),
             # The last stage has the name of the estimator.
@@ -124,9 +123,9 @@ class Kalman(ErrorStateFilter):
         deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * self.gyro_noise])
         return self.write(data, self.replace(estimate=error_state.add_noise(self.estimate, n_loops * deviations**2)))
 
-    def update_estimate(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
-        rot, std = rotation.matrix(record.previous_quat), dict(zip(MEASUREMENT_STD, record.deviations, strict=True))
-        return UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, record.estimate, rot, std)
+    def update_estimate(self, sensor: Sensor, data: SimData) -> Estimate:
+        rot, std = rotation.matrix(self.previous_quat), dict(zip(MEASUREMENT_STD, self.deviations, strict=True))  # type: ignore[arg-type]
+        return UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, self.estimate, rot, std)
 
     def _is_updated(self, data: SimData) -> Array:
         """Return True where measurements of this step have changed the attitude of one drone. ()"""
@@ -154,7 +153,7 @@ def _update_by_motion_capture(
 def _update_by_optical_flow(
     sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
 ) -> Estimate:
-    scale = sensor.interval(data) * sensor.read(data).scale[0]
+    scale = sensor.interval(data) * sensor.scale[0]
     gyro = imu.measured_states(data)["ang_vel"]
     return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
 
@@ -165,11 +164,11 @@ def _update_by_time_of_flight(
     distance = sensor.latest(data)
     deviation = range_deviation(distance, std["range"])[0]
     updated = updates.update_range(estimate, rot, distance[0], deviation)
-    return error_state.select_estimate(distance[0] < sensor.read(data).max_range[0], updated, estimate)
+    return error_state.select_estimate(distance[0] < sensor.max_range[0], updated, estimate)
 
 
 def _update_by_uwb(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
-    anchors, measured = sensor.read(data).anchors, sensor.latest(data)
+    anchors, measured = sensor.anchors, sensor.latest(data)
     for k in range(measured.shape[0]):
         if sensor.tdoa:
             estimate = updates.update_difference(estimate, anchors[0], anchors[k + 1], measured[k], std["difference"])
@@ -181,10 +180,9 @@ def _update_by_uwb(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot
 def _update_by_lighthouse(
     sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std
 ) -> Estimate:
-    lighthouse = sensor.read(data)
     angle, visibility, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
-    for pos, quat in zip(lighthouse.stations, lighthouse.quat, strict=True):
-        for diode in lighthouse.diodes:
+    for pos, quat in zip(sensor.stations, sensor.quat, strict=True):
+        for diode in sensor.diodes:
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
                 updated = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -69,18 +69,25 @@ class RotorJet(Plugin, requires=needs_rotors):
     """Distance between nodes, m; None for the analytic jet. (3,)"""
     name: str = "rotor_jet"
 
+    @property
+    def companions(self) -> Mapping[str, type]:
+        return {self.load: CollidingPlugin}
+
     def bind(self, sim: Simulation) -> RotorJet:
-        self.check_plugins(sim)
+        loads: Any = sim.plugins[self.load]
+        if loads.coupling != "drone":
+            raise ConfigError(
+                f"expected loads of one drone each, got {self.load!r}, which hangs from all drones of a world. Use "
+                f"SlungLoad or Hook."
+            )
         bound, table = self.with_arrays(sim), {} if self.table is None else self.table.checked()._asdict()
         dtype = bound.propeller_radius.dtype
         arrays: Any = {name: None if x is None else device_array(x, dtype) for name, x in table.items()}
         return bound.replace(diameter=stream_diameter(sim, bound.propeller_radius), **arrays)
 
-    def check_plugins(self, sim: Simulation) -> None:
-        self._loads(sim)
-
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        loads, shape = self._loads(sim), self._loads(sim).shape()
+        loads: Any = sim.plugins[self.load]
+        shape = loads.shape()
         edge = 2 * max(shape.size) / PANELS_PER_LENGTH if self.panel is None else self.panel
         panels = shape_panels(shape, edge)
 
@@ -144,22 +151,6 @@ class RotorJet(Plugin, requires=needs_rotors):
         if self.velocity is not None:
             total = total + momentum_flux(rotation.rotate(quat, jet_factor * interpolate(self.velocity, table_index)))
         return total
-
-    def _loads(self, sim: Simulation) -> Any:
-        """Return the plugin of the loads."""
-        loads = [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and p.name == self.load]
-        if not loads:
-            names = [p.name for p in sim.scene.plugins() if isinstance(p, CollidingPlugin)]
-            raise ConfigError(
-                f"expected the name of a plugin of loads, {' or '.join(map(repr, names)) or 'none of which is there'}, "
-                f"got {self.load!r}. Use sim.add(SlungLoad(...)) first, and load= for another name."
-            )
-        if loads[0].coupling != "drone":
-            raise ConfigError(
-                f"expected loads of one drone each, got {self.load!r}, which hangs from all drones of a world. Use "
-                f"SlungLoad or Hook."
-            )
-        return loads[0]
 
 
 def jet_force(data: SimData, name: str) -> Array | None:

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Simulation, param
 from crazysim.core.settings import setting
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 from crazysim.plugins.effects.battery import Battery
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.plugins.sensors.errors import Link, Rounded, White
@@ -92,13 +92,9 @@ class BatteryVoltage(NoisySensor):
 
     channels: ClassVar = {"voltage": 1}
 
-    def bind(self, sim: Simulation) -> BatteryVoltage:
-        self.check_plugins(sim)
-        return self.with_arrays(sim)
-
-    def check_plugins(self, sim: Simulation) -> None:
-        if not isinstance(sim.data.plugins.get(self.battery), Battery):
-            raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
+    @property
+    def companions(self) -> Mapping[str, type]:
+        return {self.battery: Battery}
 
     def ideal(self, data: SimData) -> Array:
         """Return the voltage under load, V. (1,)"""
@@ -126,20 +122,14 @@ class MultiRanger(NoisySensor):
         """Names and lengths of the parts of a measurement."""
         return {"distance": self.n_rays}
 
-    def bind(self, sim: Simulation) -> MultiRanger:
-        self.check_plugins(sim)
-        return self.with_arrays(sim)
+    @property
+    def companions(self) -> Mapping[str, type]:
+        return {self.range_finder: RangeFinder}
 
-    def check_plugins(self, sim: Simulation) -> None:
-        range_finder = sim.data.plugins.get(self.range_finder)
-        if not isinstance(range_finder, RangeFinder):
-            raise ConfigError(
-                f"expected a RangeFinder named {self.range_finder!r}, got none. Use sim.add(RangeFinder()) first."
-            )
-        if range_finder.direction.shape[0] != self.n_rays:
-            raise ConfigError(
-                f"expected n_rays = {range_finder.direction.shape[0]} as the range finder has, got {self.n_rays}"
-            )
+    def bind(self, sim: Simulation) -> MultiRanger:
+        n_rays = sim.data.plugins[self.range_finder].direction.shape[0]  # type: ignore[attr-defined]
+        require(n_rays == self.n_rays, f"expected n_rays = {n_rays} as the range finder has, got {self.n_rays}")
+        return self.with_arrays(sim)
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, m. (n_rays,)"""

@@ -213,7 +213,7 @@ def test_wrong_sensors_are_refused():
     for sensors, message in (
         ([], "expected one IMU"),
         ([imu, Barometer()], "got Barometer"),
-        ([imu, MotionCapture()], "add it before 'kalman'"),
+        ([imu, MotionCapture()], r"named 'motion_capture'.*Use sim\.add"),
     ):
         with pytest.raises(ConfigError, match=message):
             sim.add(Kalman(sensors))
