@@ -239,10 +239,8 @@ def check_parameter(
     name: str,
     value: ArrayLike,
     core: tuple[int, ...] = (1,),
-    low: float = -np.inf,
-    high: float = np.inf,
+    allowed: Range = ANY_NUMBER,
     dtype: DTypeLike | None = None,
-    positive: bool = False,
     per_axis: bool = False,
 ) -> Array:
     """Return a setting as an array that all drones share, or with one entry per drone.
@@ -253,27 +251,13 @@ def check_parameter(
         value: One number for every entry (not for vectors), ``core``, or (n_worlds, n_drones, *core); the last axis
             may be omitted where it has length one.
         core: Shape of the value of one drone.
-        low: Smallest value allowed.
-        high: Largest value allowed.
+        allowed: Range of all entries, such as ``crazysim.tables.range_between(low=0.0)``.
         dtype: Type; None for the type of the states.
-        positive: True to refuse zero and negative values.
         per_axis: True to accept one number for all axes of a vector.
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
     """
-    return _read_parameter(sim, name, value, core, range_between(low, high, positive), dtype, per_axis)
-
-
-def _read_parameter(
-    sim: Simulation,
-    name: str,
-    value: ArrayLike,
-    core: tuple[int, ...],
-    allowed: Range = ANY_NUMBER,
-    dtype: DTypeLike | None = None,
-    per_axis: bool = False,
-) -> Array:
     batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
     if core == (1,) and array.shape == batch:
         array = array[..., None]
@@ -311,7 +295,7 @@ def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any
     batch = (sim.n_worlds, 1) if scope == "world" else sim.data.states.pos.shape[:2]
     if value is None or scope == "world":
         return device_array(np.broadcast_to(value or 0, (*batch, *core)), dtype)
-    array = _read_parameter(sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis)
+    array = check_parameter(sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis)
     return device_array(np.broadcast_to(array, (*batch, *core)), dtype) if scope == "drone" else array
 
 
@@ -501,14 +485,13 @@ class Plugin(PyTree):
 
         A plugin on which the check depends cannot be removed.
         """
-        kinds = [(None, kind) for kind in self.requires if isinstance(kind, type)]
-        self._require_plugins(sim, [*kinds, *self.companions.items()])
+        self._require_plugins(sim, [(None, kind) for kind in self.requires if isinstance(kind, type)])
+        self._require_plugins(sim, self.companions.items())
 
     def _require_plugins(self, sim: Simulation, needed: Iterable[tuple[str | None, type]]) -> None:
         for name, kind in needed:
-            others = sim.plugins.values() if name is None else [sim.plugins.get(name)]
             require(
-                any(isinstance(other, kind) for other in others),
+                any(isinstance(other, kind) and name in (None, other.name) for other in sim.plugins.values()),
                 f"expected a simulation with a {kind.__name__}{f' named {name!r}' if name else ''}, which "
                 f"{type(self).__name__} {self.name!r} needs, got {', '.join(map(repr, sim.plugins)) or 'no plugin'}. "
                 f"Use sim.add to add it first.",

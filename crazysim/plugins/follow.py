@@ -20,6 +20,7 @@ from crazysim.core.settings import setting
 from crazysim.core.stages import is_tick
 from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
+from crazysim.tables import ANY_NUMBER, POSITIVE, range_between
 from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 MIN_SLOT_DEGREE = 7
@@ -221,9 +222,8 @@ def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int
         value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
     elif np.ndim(value) == 1 and np.shape(value) != (1,):
         raise ConfigError(f"expected {name} for each of {sim.n_drones} drones, got {np.size(value)} numbers")
-    if name == "index":
-        return check_parameter(sim, name, value, low=0, high=n_slots - 1, dtype=jnp.int32)
-    return check_parameter(sim, name, value, positive=name == "rate")
+    allowed = {"index": range_between(0, n_slots - 1), "rate": POSITIVE}.get(name, ANY_NUMBER)
+    return check_parameter(sim, name, value, (1,), allowed, jnp.int32 if name == "index" else None)
 
 
 def _check_count(name: str, value: object, minimum: int) -> int:

@@ -100,7 +100,6 @@ class PluginRegistry(Mapping[str, Plugin]):
             if removed_plugin.moves_objects:
                 self._leave_objects(name)
             self._put_records(name, None, None)
-            self._stages.require_unedited(name)
             self._stages.set_plugin(name, None)
             self._record_readers = self._record_readers - {name}
             for other in others:
@@ -235,8 +234,6 @@ class PluginRegistry(Mapping[str, Plugin]):
                 changed.append(other.name)
         remake = changed[0 if is_new else 1 :]
         if remake and (is_new or _signature(old_record) != _signature(record)):
-            for other_name in remake:
-                self._stages.require_unedited(other_name)
             self._build(plugin, remake)
         return plugin
 

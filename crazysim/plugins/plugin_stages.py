@@ -12,7 +12,7 @@ from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.engine.stage import Stage, is_first_step
-from crazysim.errors import ConfigError, expect
+from crazysim.errors import ConfigError, expect, require
 
 
 class Edit(NamedTuple):
@@ -64,18 +64,6 @@ class PluginStages:
             self._history.append(name)
         self.plugins[name] = plugin
 
-    def require_unedited(self, name: str) -> None:
-        """Check that the user has not replaced a stage of a plugin, which may call it."""
-        stages = [x.stage for x in self._made[name].placements]
-        edits = [pipelines for x in self._history if isinstance(x, Edit) for pipelines in zip(*x, strict=True)]
-        for before, after in edits:
-            for stage, fn in before.items():
-                if after.get(stage, fn) is not fn and any(fn is x for x in stages):
-                    raise ConfigError(
-                        f"expected the stages of plugin {name!r} as they were added, got another function as "
-                        f"{stage!r}. Undo that edit first."
-                    )
-
     def build(self, remake: Collection[str] = (), changed: Plugin | None = None) -> None:
         """Set the simulation's pipelines, after ``begin_change``; the dicts stay, because a user may hold them to edit.
 
@@ -85,15 +73,19 @@ class PluginStages:
         """
         sim, live = self._sim, self._pipelines()
         pipelines: Sequence[Pipeline] = [dict(x) for x in self._base]
+        renewed: set[str] = set()  # stages that edits may have replaced, since only what they read has changed
         for k, entry in enumerate(self._history):
             if isinstance(entry, Edit):
-                edited = [replay_edit(*x) for x in zip(*entry, pipelines, strict=True)]
+                edited = [replay_edit(*x, renewed) for x in zip(*entry, pipelines, strict=True)]
                 self._history[k] = Edit(pipelines, edited)
                 pipelines = [dict(x) for x in edited]
                 continue
-            plugin, made = self.plugins[entry], None if entry in remake else self._made.get(entry)
+            plugin, made = self.plugins[entry], self._made.get(entry)
             sim.step_pipeline = pipelines[0]
-            if made is None or not all(map(is_, made.wrapped, _replaced(pipelines[0], made.placements))):
+            is_changed = entry in remake
+            if made is None or is_changed or not all(map(is_, made.wrapped, _replaced(pipelines[0], made.placements))):
+                if made is not None and (changed is None or not is_changed):
+                    renewed |= {entry, *(placement.name or entry for placement in made.placements)}
                 made = self._made[entry] = _make_stages(plugin, sim)
             self._insert_stages(pipelines[0], plugin, made.placements)
             if made.reset is not None:
@@ -101,22 +93,6 @@ class PluginStages:
         self._bare = pipelines
         self._built = [_with_influences(pipelines[0], list(self.plugins.values()), changed), dict(pipelines[1])]
         self._set_stages(zip(live, self._built, strict=True))
-
-    def _note_edits(self) -> None:
-        """Add to the history what the user has edited since the last build."""
-        live = self._pipelines()
-        if not self._built:
-            self._base = self._bare = self._built = [dict(x) for x in live]
-        after = [
-            {name: bare[name] if fn is built.get(name) else fn for name, fn in pipeline.items()}
-            for pipeline, bare, built in zip(live, self._bare, self._built, strict=True)
-        ]
-        last = self._history[-1] if self._history else None
-        before = self._history.pop().before if isinstance(last, Edit) else self._bare  # type: ignore[union-attr]
-        if not all(
-            list(a) == list(b) and all(map(is_, a.values(), b.values())) for a, b in zip(before, after, strict=True)
-        ):
-            self._history.append(Edit(before, after))
 
     def _insert_stages(self, pipeline: Pipeline, plugin: Plugin, placements: Sequence[StagePlacement]) -> None:
         """Insert the stages of a plugin into a pipeline."""
@@ -141,9 +117,21 @@ class PluginStages:
 
     def begin_change(self) -> Callable[[], None]:
         """Note what the user has edited; return a function that restores pipelines and plugins as they are now."""
-        self._note_edits()
+        live = self._pipelines()
+        if not self._built:
+            self._base = self._bare = self._built = [dict(x) for x in live]
+        after = [
+            {name: bare[name] if fn is built.get(name) else fn for name, fn in pipeline.items()}
+            for pipeline, bare, built in zip(live, self._bare, self._built, strict=True)
+        ]
+        last = self._history[-1] if self._history else None
+        before = self._history.pop().before if isinstance(last, Edit) else self._bare  # type: ignore[union-attr]
+        if not all(
+            list(a) == list(b) and all(map(is_, a.values(), b.values())) for a, b in zip(before, after, strict=True)
+        ):
+            self._history.append(Edit(before, after))
         attributes = {name: x if x is self._sim else copy.copy(x) for name, x in vars(self).items()}
-        stages = [(x, dict(x)) for x in self._pipelines()]
+        stages = [(x, dict(x)) for x in live]
 
         def restore() -> None:
             vars(self).update(attributes)
@@ -170,20 +158,24 @@ class PluginStages:
         return [self._sim.step_pipeline, self._sim.reset_pipeline]
 
 
-def replay_edit(before: Pipeline, after: Pipeline, pipeline: Pipeline) -> Pipeline:
+def replay_edit(before: Pipeline, after: Pipeline, pipeline: Pipeline, renewed: Collection[str] = ()) -> Pipeline:
     """Return a pipeline with the edit that has made ``after`` out of ``before``, and with the user's order of stages.
 
     Args:
         before: The pipeline that was edited.
         after: The pipeline after the edit.
         pipeline: A pipeline like ``before``, with more, fewer or other stages.
+        renewed: Names of stages that the pipeline may have in another version.
 
     Raises:
-        ConfigError: If the user has replaced a stage that the pipeline lacks.
+        ConfigError: If the user has replaced a stage that the pipeline lacks, or has in another version.
     """
     changed = {name: fn for name, fn in after.items() if before.get(name) is not fn}
-    if lost := [name for name in changed if name in before and name not in pipeline]:
-        raise ConfigError(f"expected a pipeline with stage {lost[0]!r}, which you have replaced. Undo that edit first.")
+    for name in changed.keys() & before.keys():
+        require(
+            name in pipeline and (pipeline[name] is before[name] or name in renewed),
+            f"expected stage {name!r} as it was when you replaced it, got another or none. Undo that edit first.",
+        )
     old_names, names, order = list(before), list(pipeline), list(after)
     for k, name in reversed([*enumerate(names)]):
         if name not in before:  # it takes the place of a stage that is gone, or precedes the one that it precedes

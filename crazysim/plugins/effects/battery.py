@@ -22,6 +22,7 @@ from crazysim.core.plugin import (
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.eager import jit_eager_calls
 from crazysim.plugins.effects.moving_air import needs_rotors
+from crazysim.tables import POSITIVE
 
 NOMINAL_VOLTAGE = 3.7
 """Nominal voltage of a lithium-polymer cell, V, as printed on cells; the voltage assumed for full rotor speed if an
@@ -75,7 +76,7 @@ class Battery(Plugin, replaces=("battery voltage",), requires=needs_rotors):
             full_speed_voltage = np.where(voltage > 0, voltage, NOMINAL_VOLTAGE * np.asarray(bound.n_cells))
         return bound.replace(
             voltage=open_circuit_voltage(bound.charge, bound.n_cells),
-            full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
+            full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, allowed=POSITIVE),
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:

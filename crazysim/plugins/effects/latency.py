@@ -17,6 +17,7 @@ from crazysim.core.settings import setting
 from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import Stage, as_stages
 from crazysim.errors import ConfigError
+from crazysim.tables import range_between
 
 MAX_DELAY = 100_000
 """Upper limit of the delay, steps."""
@@ -82,7 +83,8 @@ class Latency(Plugin):
         """Return the plugin with the staged command of ``data`` in all rows of the queue."""
         delay, max_delay = np.asarray(self.delay), self.max_delay
         max_delay = int(np.max(delay)) if max_delay is None else max_delay
-        steps, command = check_parameter(sim, "delay", delay, (1,), 0, max_delay, jnp.int32), _staged_command(data)
+        steps = check_parameter(sim, "delay", delay, (1,), range_between(0, max_delay), jnp.int32)
+        command = _staged_command(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(max_delay) + 1, axis=-2)
         return self.with_arrays(sim, delay=steps, queue=device_array(queue, command.dtype), arrived=command)
 

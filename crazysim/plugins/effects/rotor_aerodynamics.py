@@ -25,6 +25,7 @@ from crazysim.plugins.effects.moving_air import (
     needs_rotors,
     rotor_positions,
 )
+from crazysim.tables import range_between
 
 
 class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
@@ -101,7 +102,7 @@ class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
                     f"would follow. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
                     f"N s^2/(m rad) for the Crazyflie 2.0."
                 )
-        return check_parameter(sim, name, value, low=0.0)
+        return check_parameter(sim, name, value, allowed=range_between(0.0))
 
     def _hub_positions(self, sim: Simulation) -> Array:
         """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""

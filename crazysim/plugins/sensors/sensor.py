@@ -22,6 +22,7 @@ from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import is_tick
 from crazysim.errors import ConfigError, require
 from crazysim.plugins.sensors.errors import Link
+from crazysim.tables import range_between
 
 MAX_ROWS = 64
 """Largest number of measurements of one sensor in transit."""
@@ -101,11 +102,6 @@ class Sensor(Plugin):
             key: Random key of the drone at this step.
             dt: Time since the last measurement, s.
         """
-        n = sum(self.channels.values())
-        require(
-            truth.shape == (n,),
-            f"expected ideal of {self.name!r} to return {n} numbers, {dict(self.channels)}, got shape {truth.shape}",
-        )
         parts, changes = self.split(truth), {}
         for name, link, noise in self._draw("n_step", key, truth.dtype):
             parts[name], new = link.step(self, parts[name], noise, dt)
@@ -156,9 +152,10 @@ class Sensor(Plugin):
                 f"{max_delay} s. Use a shorter delay or a lower freq=."
             )
         delay, jitter = (
-            check_parameter(sim, name, getattr(self, name), (1,), 0.0, max_delay) for name in ("delay", "jitter")
+            check_parameter(sim, name, getattr(self, name), allowed=range_between(0.0, max_delay))
+            for name in ("delay", "jitter")
         )
-        dropout = check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0)
+        dropout = check_parameter(sim, "dropout", self.dropout, allowed=range_between(0.0, 1.0))
         return Samples(
             value=drone_array(sim, 0.0, k),
             taken_step=device_array(np.full((*shape, 1), -1), np.int32),
@@ -194,6 +191,11 @@ class Sensor(Plugin):
 
     def split(self, value: Array) -> dict[str, Array]:
         """Return the parts of a measurement by the names of ``channels``. (..., n) each"""
+        require(
+            value.shape[-1:] == (sum(self.channels.values()),),
+            f"expected measurements of {self.name!r} as in channels, {dict(self.channels)}, got shape {value.shape}. "
+            f"Use ideal and measure that return as many numbers.",
+        )
         parts, start = {}, 0
         for name, length in self.channels.items():
             parts[name] = value[..., start : start + length]
