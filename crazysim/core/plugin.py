@@ -24,7 +24,7 @@ from crazysim.core.settings import Setting, check_settings, setting
 from crazysim.drones import Airframe
 from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
 from crazysim.engine.stage import Stage
-from crazysim.errors import ConfigError, UnknownNameError, require, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
@@ -263,12 +263,12 @@ def check_parameter(
         array = array[..., None]
     is_number = array.dtype.kind in ("iu" if dtype is not None and np.issubdtype(dtype, np.integer) else "iuf")
     is_shared = array.shape == core or (array.ndim == 0 and (per_axis or core != (3,)))
-    if not is_number or not (is_shared or array.shape == (*batch, *core)):
-        raise ConfigError(
-            f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all drones, or "
-            f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
-            f"{array.dtype}"
-        )
+    require(
+        is_number and (is_shared or array.shape == (*batch, *core)),
+        f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all drones, or "
+        f"{(*batch, *core)} = (n_worlds, n_drones, {', '.join(map(str, core))}) for each, got shape "
+        f"{array.shape} and type {array.dtype}",
+    )
     array = read_numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
@@ -364,8 +364,11 @@ class Plugin(PyTree):
         cls.requires = (*cls.requires, *(requires if isinstance(requires, tuple) else (requires,)))
         _declare_static_fields(cls)
         super().__init_subclass__(**kwargs)
-        if not abstract and "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
-            raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
+        require(
+            abstract or "name" in {f.name for f in dataclasses.fields(cls)},  # type: ignore[arg-type]
+            f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'",
+            TypeError,
+        )
 
     def __post_init__(self) -> None:
         """Check the user's settings; a plugin with arrays has been checked."""
@@ -595,12 +598,13 @@ class Plugin(PyTree):
         Raises:
             UnknownNameError: If the data has none: the plugin was not added, or was removed.
         """
-        if self.name not in data.plugins:
-            raise UnknownNameError(
-                f"expected data with a record of plugin {self.name!r}, got records of "
-                f"{', '.join(map(repr, data.plugins)) or 'none'}. The plugin was not added, was removed, or has no "
-                f"record. Use sim.add({type(self).__name__}(...)) first."
-            )
+        require(
+            self.name in data.plugins,
+            f"expected data with a record of plugin {self.name!r}, got records of "
+            f"{', '.join(map(repr, data.plugins)) or 'none'}. The plugin was not added, was removed, or has no "
+            f"record. Use sim.add({type(self).__name__}(...)) first.",
+            UnknownNameError,
+        )
         return data.plugins[self.name]
 
     def write(self, data: SimData, record: PyTree) -> SimData:
@@ -633,11 +637,9 @@ def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
         name: Name of the argument in messages.
         plugins: The plugins.
     """
-    if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
-        example = {"sensors": "IMU()", "camera": "Camera(16, 12)"}.get(name, "Wind()")
-        raise ConfigError(
-            f"expected {name} as a list of plugins, got {short_repr(plugins)}. Use {name}=[{example}], say."
-        )
+    example = {"sensors": "IMU()", "camera": "Camera(16, 12)"}.get(name, "Wind()")
+    is_list = isinstance(plugins, (list, tuple)) and all(isinstance(plugin, Plugin) for plugin in plugins)
+    expect(is_list, f"{name} as a list of plugins", plugins, f"Use {name}=[{example}], say.")
     return plugins
 
 
