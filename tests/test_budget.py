@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 9751,
     "media": 986,
-    "plugins": 7287,
+    "plugins": 7278,
     "scene": 3089,
     "sim": 1225,
     "train": 2438,
