@@ -293,8 +293,8 @@ def _as_command(
     if (is_on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
-            f"{name} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}, which would last "
-            f"until their next reset; check the computation that returns it"
+            f"expected a finite {name} command, got one that is NaN or infinite in world(s) {worlds.tolist()}, as "
+            f"{dtype}, which would last until their next reset. Check the computation that returns it."
         )
     return array
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, require
-from crazysim.tables import read_floats
+from crazysim.tables import MAX_NUMBER, read_floats
 
 N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
 """Number of entries of ``Shape.size`` for each kind."""
@@ -98,12 +98,12 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     """
     v = np.asarray(vertices, np.float64)
     require(
-        v.ndim == 2 and v.shape[1] == 3 and len(v) >= 4 and np.all(np.isfinite(v)),
-        f"expected four or more finite vertices, (n_vertices, 3), got shape {v.shape}",
+        v.ndim == 2 and v.shape[1] == 3 and len(v) >= 4 and np.all(np.abs(v) <= MAX_NUMBER),
+        f"expected four or more finite vertices, (n_vertices, 3), of a size up to {MAX_NUMBER:g} m, got {v.shape}",
     )
     scale = float(np.max(np.ptp(v, axis=0)))
     thickness = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
-    if thickness <= 1e-9 * scale:
+    if thickness <= max(1e-9 * scale, 1 / MAX_NUMBER):
         raise ConfigError(f"expected vertices that span a volume, got {len(v)} in one plane; add one outside of it")
     triangles = _find_triangles(v, 1e-9 * scale) if faces is None else np.asarray(faces)
     require(

@@ -68,6 +68,8 @@ def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     (lambda: Shape("hfield", (1, 1, 1, 1)), "expected a hfield with heights"),
     (lambda: hull(CUBE[:3]), r"shape \(3, 3\)"),
     (lambda: hull(CUBE * [1, 1, 0]), "one plane"),
+    (lambda: hull(CUBE * 1e300), "of a size up to"),
+    (lambda: hull(CUBE * 1e-300), "one plane"),
     (lambda: hull(np.random.default_rng(0).normal(size=(65, 3))), "got 65 vertices and no faces"),
     (lambda: hull(CUBE, [[0, 1, 8]]), "expected faces of vertices 0 to 7, got 0 to 8"),
     (lambda: hull(CUBE, [[0.0, 1, 2]]), "integers"),
