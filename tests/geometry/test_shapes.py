@@ -66,7 +66,7 @@ def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     (lambda: Shape("sphere", (np.nan,)), "finite"),
     (lambda: Shape("mesh"), "expected a mesh with vertices"),
     (lambda: Shape("hfield", (1, 1, 1, 1)), "expected a hfield with heights"),
-    (lambda: hull(CUBE[:3]), r"shape \(3, 3\)"),
+    (lambda: hull(CUBE[:3]), r"got \(3, 3\)"),
     (lambda: hull(CUBE * [1, 1, 0]), "one plane"),
     (lambda: hull(CUBE * 1e300), "of a size up to"),
     (lambda: hull(CUBE * 1e-300), "one plane"),
