@@ -175,6 +175,8 @@ RANGES = {
     "wind": (1.0, 3.0),
 }
 """Ranges of all quantities that ``Randomize`` draws without the help of another plugin."""
+PATHS = {"params.rotor_vel_max": 0.2, "plugins.battery.resistance": (0.5, 2.0)}
+"""Ranges of numbers that ``Randomize`` draws by their path."""
 
 
 def triad_errors(size):
@@ -360,7 +362,7 @@ CASES |= {
     "tracking_lqr": build_tracking_sim,
     "effects": make_builder(effects, control="attitude"),
     "randomize": make_builder(
-        lambda: [Randomize(**RANGES, charge=(0.2, 0.6), delay=(1, 4)), Battery(),
+        lambda: [Randomize(PATHS, **RANGES, charge=(0.2, 0.6), delay=(1, 4)), Battery(),
                  Latency(delay=np.zeros((8, 2), int), max_delay=4)],
         control="rotor_vel",
     ),

@@ -9,6 +9,7 @@ from jax import Array
 from crazysim.control import Control, Controller, Setpoint
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.plugin import drawn_data
 from crazysim.engine.stage import Stage, is_tick
 
 
@@ -29,12 +30,12 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
 
     def run_outer(data: SimData) -> SimData:
         data = _apply_staged_command(data, control)
-        record = getattr(data.controls, level).controller
+        record = getattr(drawn_data(data).controls, level).controller
         setpoint: Any = _command_in_force(data, control)
         return _replace_memory(data, control, controller.outer(data, setpoint, record.memory, record.params))
 
     def run_inner(data: SimData) -> SimData:
-        record = getattr(data.controls, level).controller
+        record = getattr(drawn_data(data).controls, level).controller
         command, memory = controller.update(data, _command_in_force(data, control), record.memory, record.params)
         return _replace_memory(_stage_output(data, controller.output, command), control, memory)
 

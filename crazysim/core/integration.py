@@ -14,7 +14,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState, SimStateDeriv
 from crazysim.core.influence import apply_constraint, apply_influence, plugin_rates
-from crazysim.core.plugin import Plugin
+from crazysim.core.plugin import Plugin, drawn_data
 from crazysim.engine.pytree import PyTree
 from crazysim.engine.stage import Stage, vmap_drones
 
@@ -171,6 +171,7 @@ class Integration:
 
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the states of drones and plugins, under all influences and the constraint."""
+        data = drawn_data(data)
         if self.couples_world:
             influenced_data, deriv = data, vmap_drones(lambda drone: self._unconstrained_derivative(drone)[1])(data)
         else:

@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, dataclass_transform
 
+import jax
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, DTypeLike
@@ -522,6 +523,21 @@ class Plugin(PyTree):
         """
         return data
 
+    def with_drawn_numbers(self, data: SimData) -> SimData:
+        """Return data of any scope with the numbers that this plugin has drawn, such as ``Randomize``.
+
+        Dynamics, controllers and stages of plugins compute with them; ``sim.data`` keeps the nominal numbers. A plugin
+        that overrides it begins episodes before all other plugins. A second call must return the data as it is.
+        """
+        return data
+
+    def known_data(self, data: SimData) -> SimData:
+        """Return the data of any scope that the plugin's stages receive: by default with all numbers as drawn.
+
+        Numbers that differ from those of ``data`` keep their nominal values, whatever a stage returns.
+        """
+        return drawn_data(data)
+
     @property
     def resets_episode(self) -> bool:
         """True if ``reset_episode`` must be called."""
@@ -627,7 +643,23 @@ class BoundMethod:
 
     def __call__(self, data: SimData) -> Any:
         """Return what the method returns, such as the data after the stage."""
-        return self.method(self.plugin.bound(data), data)
+        known_data = self.plugin.known_data(data)
+        after = self.method(self.plugin.bound(known_data), known_data)
+        if known_data is data or not isinstance(after, SimData):
+            return after
+        leaves, known_leaves, new_leaves = map(jax.tree.leaves, (data, known_data, after))
+        if len(new_leaves) != len(leaves):
+            return after  # the engine explains it
+        nominal = [new if x is y else x for x, y, new in zip(leaves, known_leaves, new_leaves, strict=True)]
+        return jax.tree.structure(data).unflatten(nominal)
+
+
+def drawn_data(data: SimData) -> SimData:
+    """Return data of any scope with the numbers that plugins have drawn; the data itself if none have."""
+    for record in data.plugins.values():
+        if isinstance(record, Plugin):
+            data = record.with_drawn_numbers(data)
+    return data
 
 
 def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:

@@ -16,6 +16,7 @@ from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import FLOOR_HEIGHT, INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.plugin import drawn_data
 from crazysim.core.settings import as_mask
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.engine.pytree import n_batch_axes, scopes, select_worlds
@@ -72,7 +73,8 @@ def force_torque_controller(data: SimData) -> SimData:
     """Apply the staged wrench, and command the rotor speeds that produce it."""
     controls = controls_of(data)
     force_torque = controls.force_torque
-    rotor_vel = force_torque2rotor_vel(force_torque.staged_cmd, params=force_torque.params)
+    params = controls_of(drawn_data(data)).force_torque.params
+    rotor_vel = force_torque2rotor_vel(force_torque.staged_cmd, params=params)
     new_force_torque = force_torque.replace(cmd=force_torque.staged_cmd)
     return data.replace(controls=controls.replace(force_torque=new_force_torque, rotor_vel=rotor_vel))
 
@@ -80,7 +82,7 @@ def force_torque_controller(data: SimData) -> SimData:
 @_built_in_stage("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
     """Limit commanded rotor speeds to the range of the motors; zero or less switches a motor off."""
-    rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, data.params)
+    rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, drawn_data(data).params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 

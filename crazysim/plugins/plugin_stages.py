@@ -9,8 +9,8 @@ from operator import is_
 from typing import Any, NamedTuple
 
 from crazysim.core.integration import Integration
-from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement
+from crazysim.core.pipeline import Pipeline, insert_fn_after, insert_fn_before
+from crazysim.core.plugin import BoundMethod, Plugin, Simulation, StagePlacement
 from crazysim.engine.stage import Stage, is_first_step
 from crazysim.errors import ConfigError, expect, require
 
@@ -89,7 +89,7 @@ class PluginStages:
                 made = self._made[entry] = _make_stages(plugin, sim)
             self._insert_stages(pipelines[0], plugin, made.placements)
             if made.reset is not None:
-                append_fn(pipelines[1], made.reset, entry)
+                insert_fn_after(pipelines[1], [*pipelines[1]][0 if _draws(plugin) else -1], made.reset, entry)
         self._bare = pipelines
         self._built = [_with_influences(pipelines[0], list(self.plugins.values()), changed), dict(pipelines[1])]
         self._set_stages(zip(live, self._built, strict=True))
@@ -190,6 +190,10 @@ def _is_in_resets(plugin: Plugin) -> bool:
     return plugin.resets_episode and plugin.reset_before is None
 
 
+def _draws(plugin: Plugin) -> bool:
+    return type(plugin).with_drawn_numbers is not Plugin.with_drawn_numbers
+
+
 def _reset_stage_name(plugin: Plugin) -> str:
     return f"{plugin.name}_begin"
 
@@ -214,13 +218,27 @@ def _make_stages(plugin: Plugin, sim: Simulation) -> MadeStages:
             placement.stage,
             f"Use StagePlacement(self.stage(self.{getattr(placement.stage, '__name__', 'method')})).",
         )
+    placements = [dataclasses.replace(x, stage=_as_method(plugin, x.stage)) for x in placements]
     if plugin.resets_episode:
         begin, before = plugin.stage(plugin.reset_episode, when=is_first_step), plugin.reset_before
         if before is None:  # after the stages that begin an episode for other plugins, before all other stages
-            before = next(name for name, fn in pipeline.items() if getattr(fn, "when", None) is not is_first_step)
+            before = next(
+                name
+                for name, fn in pipeline.items()
+                if _draws(plugin) or getattr(fn, "when", None) is not is_first_step
+            )
         placements = [StagePlacement(begin, before=before, name=_reset_stage_name(plugin)), *placements]
     reset = plugin.stage(plugin.reset_episode) if _is_in_resets(plugin) else None
     return MadeStages(placements, _replaced(pipeline, placements), reset, sim.scene.n_reads != n_reads)
+
+
+def _as_method(plugin: Plugin, stage: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a declared stage as a method of a plugin, which computes with ``Plugin.known_data``."""
+    if not isinstance(stage, Stage) or isinstance(stage.fn, BoundMethod):
+        return stage
+    fn, method_stage = stage.fn, copy.copy(stage)
+    method_stage.fn = BoundMethod(plugin, lambda _, data: fn(data))
+    return method_stage
 
 
 def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None) -> Pipeline:

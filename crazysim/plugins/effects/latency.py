@@ -60,6 +60,9 @@ class Latency(Plugin):
             StagePlacement(self._delayed_controller(controller), replaces=name, name=name),
         ]
 
+    def known_data(self, data: SimData) -> SimData:
+        return data  # the delayed controller reads numbers as drawn itself
+
     def influence(self, data: SimData) -> SimData:
         return _with_command(data, self.arrived) if data.controls.mode == Control.rotor_vel else data
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -12,30 +15,51 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Param, Plugin, Simulation, drone_array, param, state
+from crazysim.core.plugin import Param, Plugin, Simulation, check_parameter, derived, drone_array, param, state
 from crazysim.core.random import drone_key, uniform
-from crazysim.errors import ConfigError, short_repr
+from crazysim.engine.pytree import CORE_NDIM_KEY, Members, PyTree
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
+from crazysim.tables import range_between, read_number
 
-FACTOR_SETTINGS = ("mass", "inertia", "torque", "lag", "drag")
-"""Settings whose factors are the entries of ``Randomize.factors``, in this order."""
+FACTOR_PATHS = {
+    "mass": "params.mass",
+    "inertia": "params.J",
+    "torque": "params.rpm2torque",
+    "lag": "params.rotor_dyn_coef",
+    "drag": "params.drag_matrix",
+}
+"""Path of the number that a setting scales. The factors are the entries of ``Randomize.factors``, in this order."""
+FACTOR_SETTINGS = tuple(FACTOR_PATHS)
 RANGE_SETTINGS = (*FACTOR_SETTINGS, "thrust", "rotor_thrust", "wind", "charge", "delay")
 """Settings that are ranges (low, high)."""
+FACTOR_NAMES = (*FACTOR_SETTINGS, "thrust", "rotor_thrust")
+"""Settings that are factors, for which a number r is short for (1 - r, 1 + r)."""
+INVERSES = {"params.J": "params.J_inv", "params.J_inv": "params.J"}
+"""Paths of numbers that are inverse to others, which change with them."""
 
 
 class Randomize(MovingAir, Plugin, requires=needs_rotors):
     """Random differences of the drones from their airframe, drawn anew for every episode; needs rotors.
 
-    Each setting is a range (low, high): one for all drones, (2,), or one per drone, (n_worlds, n_drones, 2). A number
-    is drawn uniformly from it for every drone at every reset, or in the first step of a simulation that was not reset.
-    Two equal numbers give a fixed number; None changes nothing. Controllers use the airframe's numbers. The number
-    drawn for a setting does not depend on the other settings. ``Randomize.crazyflie()`` and ``Randomize.generic()``
-    have ranges from the literature.
+    Numbers of drones, controllers, sensors and other plugins are drawn by their path in ``sim.data``, such as
+    ``Randomize({"plugins.imu.accel.noise": (0.5, 2.0), "controls.controller.params.kp": 0.2})``, as a range of
+    factors of the nominal number. 0.2 is short for (0.8, 1.2). Dynamics, controllers and plugins compute with the
+    product; ``sim.data`` keeps the nominal number, which filters assume and your own stages read.
+
+    The settings below act on several numbers, or are no factors. Each is a range (low, high): one for all drones, (2,),
+    or one per drone, (n_worlds, n_drones, 2); for a factor, a number r is short for (1 - r, 1 + r). A number is drawn
+    uniformly for every drone at every reset, or in the first step of a simulation that was not reset. Two equal numbers
+    give a fixed number; None changes nothing. The number drawn for a path or a setting does not depend on the others.
+    ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges from the literature.
     """
 
+    paths: Mapping[str, ArrayLike] | None = None
+    """Ranges of the factors of numbers by their path, each (2,), (n_worlds, n_drones, 2), or a number r for
+    (1 - r, 1 + r)."""
     mass: Param = param(default=None, core=(2,), positive=True)
     """Factor of the mass. (2,)"""
     inertia: Param = param(default=None, core=(2,), positive=True)
@@ -63,6 +87,12 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
     """Factors of mass, inertia, drag torque, rates of the rotors' lag, and linear drag, 1. (n_worlds, n_drones, 5)"""
     thrust_factors: Array = state(("rotors",))
     """Factors of the thrust of the rotors, 1. (n_worlds, n_drones, n_rotors)"""
+    limits: Array = derived(("paths", 2))
+    """Ranges of the factors of ``paths``, in their order; None without. (n_paths, 2)"""
+    path_factors: Array = state(("paths",), optional=True)
+    """Factors of ``paths``, 1; None without. (n_worlds, n_drones, n_paths)"""
+    is_applied: bool = dataclasses.field(default=False, kw_only=True, repr=False, metadata={"static": True})
+    """Whether the data that holds this record has the numbers as drawn."""
     air_vel: Array = state((3,), optional=True)
     """Mean wind, world frame, m/s; None without wind. (n_worlds, n_drones, 3)"""
     name: str = "randomize"
@@ -131,24 +161,40 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
             has_wind = False
         elif has_wind:
             require_drag(sim, "wind")
-        bound = self.with_arrays(
+        settings = {_full_path(sim, path): x for path, x in (self.paths or {}).items()}
+        ranges = {
+            path: check_parameter(sim, f"paths[{path!r}]", _around_one(path, x), (2,), low=0.0)
+            for path, x in settings.items()
+        }
+        single_factors = {
+            name: _around_one(name, getattr(self, name)) for name in FACTOR_NAMES if getattr(self, name) is not None
+        }
+        bound = self.replace(**single_factors).with_arrays(
             sim,
+            paths=tuple(ranges),
+            limits=jnp.stack(jnp.broadcast_arrays(*ranges.values()), axis=-2) if ranges else None,
+            path_factors=drone_array(sim, 1.0, len(ranges)) if ranges else None,
             factors=drone_array(sim, 1.0, len(FACTOR_SETTINGS)),
             thrust_factors=drone_array(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
             air_vel=drone_array(sim, 0.0, 3) if has_wind else None,
             **({} if has_wind else {"wind": None}),
         )
         for name in RANGE_SETTINGS:
-            limits, values = getattr(bound, name), getattr(self, name)
-            if limits is not None and np.ndim(values) == 0:
-                raise ConfigError(
-                    f"expected {name} as (low, high), got {values!r}. Use ({values}, {values}) for a fixed number."
-                )
-            if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
-                raise ConfigError(f"expected {name} as (low, high), got {values!r}. Use the smaller number first.")
+            values = settings[name] = getattr(self, name)
+            ranges[name] = getattr(bound, name)
+            require(
+                values is None or name in FACTOR_NAMES or np.ndim(values) > 0,
+                f"expected {name} as (low, high), got {values!r}. Use ({values}, {values}) for a fixed number.",
+            )
+        for name, limits in ranges.items():
+            require(
+                limits is None or np.all(np.asarray(limits[..., 0]) <= np.asarray(limits[..., 1])),
+                f"expected {name} as (low, high), got {settings[name]!r}. Use the smaller number first.",
+            )
         return bound
 
     def check_plugins(self, sim: Simulation) -> None:
+        self._check_paths(sim)
         records = sim.data.plugins.values()
         latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, Latency)}
         has_battery = any(isinstance(x, Battery) for x in records)
@@ -173,6 +219,23 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
                     f"{self._latency_code(sim)}."
                 )
 
+    def _check_paths(self, sim: Simulation) -> None:
+        numbers = _numbers(sim.data, "")
+        allowed = [
+            path
+            for path, (metadata, x) in numbers.items()
+            if metadata.get("scope") == "parameter" and jnp.issubdtype(x.dtype, jnp.floating)
+            and not path.startswith(f"plugins.{self.name}.")
+        ]  # fmt: skip
+        for path in {_full_path(sim, path) for path in self.paths or ()} - {*allowed}:
+            names = [x for x in allowed if x.rpartition(".")[2] == path.rpartition(".")[2]]
+            names += difflib.get_close_matches(path, allowed, cutoff=0.4)
+            raise ConfigError(
+                f"expected the path of a number in sim.data that may differ between drones, got {path!r}, which is "
+                f"{'a state, a whole number, or one for all drones' if path in numbers else 'none'}. Near are "
+                f"{', '.join(dict.fromkeys(names)) or 'none'}."
+            )
+
     @property
     def _max_delay(self) -> int:
         """Longest delay, steps."""
@@ -182,28 +245,28 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
         """Return the code, for messages, of a ``Latency`` that allows one random delay per drone."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
+    def with_drawn_numbers(self, data: SimData) -> SimData:
+        if self.is_applied:
+            return data
+        data = self.write(data, self.replace(is_applied=True))
+        factors = [(path, self.factors[..., k]) for k, (name, path) in enumerate(FACTOR_PATHS.items())
+                   if getattr(self, name) is not None]  # fmt: skip
+        factors += [(path, self.path_factors[..., k]) for k, path in enumerate(self.paths or ())]
+        for path, factor in factors:
+            data = _scale(data, path, factor, operator.mul)
+            data = _scale(data, INVERSES.get(path, ""), factor, operator.truediv)
+        if self.thrust is None and self.rotor_thrust is None:
+            return data
+        thrust_curve = self.thrust_factors[..., None] * data.params.rpm2thrust
+        return data.replace(params=data.params.replace(rpm2thrust=thrust_curve))
+
     def influence(self, data: SimData) -> SimData:
-        p = data.params
-        mass, inertia, torque, lag, drag = (self.factors[k : k + 1] for k in range(len(FACTOR_SETTINGS)))
-        changes = {}
-        if self.mass is not None:
-            changes["mass"] = mass * p.mass
-        if self.inertia is not None:
-            changes |= {"J": inertia * p.J, "J_inv": p.J_inv / inertia}
-        if self.torque is not None:
-            changes["rpm2torque"] = torque * p.rpm2torque
-        if self.lag is not None:
-            changes["rotor_dyn_coef"] = lag * p.rotor_dyn_coef
-        if self.drag is not None:
-            changes["drag_matrix"] = drag * p.drag_matrix
-        if self.thrust is not None or self.rotor_thrust is not None:
-            changes["rpm2thrust"] = self.thrust_factors[:, None] * p.rpm2thrust
-        data = data.replace(params=p.replace(**changes))
         return data if self.air_vel is None else with_moving_air(data, self.air_vel)
 
     def observations(self, data: SimData) -> dict[str, Array]:
         observations = {"factors": self.factors, "thrust_factors": self.thrust_factors}
-        return observations if self.air_vel is None else observations | {"air_vel": self.air_vel}
+        optional = {"air_vel": self.air_vel, "path_factors": self.path_factors}
+        return observations | {name: x for name, x in optional.items() if x is not None}
 
     def reset_episode(self, data: SimData) -> SimData:
         n_rotors, dtype = self.thrust_factors.shape[-1], self.factors.dtype
@@ -222,6 +285,10 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
         if self.wind is not None:
             speed, angle = draw_in_range(self.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
+        if self.limits is not None:
+            draws = [uniform(drone_key(data, f"{self.name} {path}"), (1,), dtype) for path in self.paths or ()]
+            low, high = self.limits[:, 0], self.limits[:, 1]
+            changes["path_factors"] = low + jnp.concatenate(draws) * (high - low)
         data = self.write(data, self.replace(**changes))
 
         records = dict(data.plugins)
@@ -233,3 +300,48 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
                 steps = jnp.floor(draw_in_range(self.delay, other_draws[4:5])).astype(other.delay.dtype)
                 records[name] = other.replace(delay=steps)
         return data.replace(plugins=records)
+
+
+def _full_path(sim: Simulation, path: Any) -> str:
+    """Return a path of the data, in which ``controls.controller`` is the controller of the command level."""
+    return str(path).replace("controls.controller.", f"controls.{sim.data.controls.mode.value}.controller.", 1)
+
+
+def _around_one(name: str, value: Any) -> Any:
+    if np.ndim(value) > 0:
+        return value
+    remedy = "Use (low, high), or a number r for (1 - r, 1 + r)."
+    r = read_number(name, value, range_between(0.0, 1.0), remedy)
+    return 1 - r, 1 + r
+
+
+def _numbers(node: Any, prefix: str) -> dict[str, tuple[Mapping[str, Any], Array]]:
+    """Return declaration and value of every array of drones in a record, by its path."""
+    found = {}
+    for name, metadata, x in _children(node):
+        if isinstance(x, (PyTree, dict)) and not isinstance(x, Members):
+            found |= _numbers(x, f"{prefix}{name}.")
+        elif metadata.get(CORE_NDIM_KEY) is not None and hasattr(x, "dtype"):
+            found[f"{prefix}{name}"] = metadata, x
+    return found
+
+
+def _children(node: PyTree | dict[str, Any]) -> list[tuple[str, Mapping[str, Any], Any]]:
+    if isinstance(node, dict):
+        return [(name, {}, x) for name, x in node.items()]
+    return [(f.name, f.metadata, getattr(node, f.name)) for f in dataclasses.fields(node)]  # type: ignore[arg-type]
+
+
+def _scale(node: Any, path: str, factor: Array, operation: Callable[[Array, Array], Array]) -> Any:
+    """Return a record with the number at a path, if it has one, times a factor with any leading axes, or divided."""
+    name, _, rest = path.partition(".")
+    for child_name, metadata, x in _children(node) if isinstance(node, (PyTree, dict)) else ():
+        if child_name == name and x is not None:
+            core_ndim = metadata.get(CORE_NDIM_KEY) or 0
+            new = (
+                _scale(x, rest, factor, operation)
+                if rest
+                else operation(x, factor.reshape(factor.shape + (1,) * core_ndim))
+            )
+            return node | {name: new} if isinstance(node, dict) else node.replace(**{name: new})
+    return node

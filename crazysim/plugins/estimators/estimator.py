@@ -107,6 +107,11 @@ class Estimator(Plugin):
             ]
         return placements
 
+    def known_data(self, data: SimData) -> SimData:
+        # A filter knows only the nominal numbers of drone and sensors.
+        drawn = super().known_data(data)
+        return data if drawn is data else data.replace(plugins=data.plugins | {self.name: drawn.plugins[self.name]})
+
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return the estimated state of one drone; in a world's first step, the true state."""
         s, estimate = data.states, self.estimated_states(data)

@@ -5,13 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
+from jax import Array
 from sweep import RANGES
 
-from crazysim import Battery, ConfigError, Latency, Randomize, RotorAerodynamics, Sim, Wind
+from crazysim import IMU, Battery, ConfigError, Latency, MotionCapture, Randomize, RotorAerodynamics, Sim, Wind
 from crazysim.core.pipeline import append_fn
+from crazysim.core.plugin import Param, Plugin, param, state
 from crazysim.engine.stage import stage
 from crazysim.envs import AutoReset, make
 from crazysim.plugins.effects.battery import open_circuit_voltage
+from crazysim.plugins.estimators import ESKF
 
 
 def build(n_worlds=3, n_drones=2, engine="interpret", **settings):
@@ -147,8 +150,10 @@ def test_a_task_draws_new_drones_in_every_episode():
 def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
     with pytest.raises(ConfigError, match=r"expected mass as \(low, high\), got \(1.1, 0.9\)"):
         build(mass=(1.1, 0.9))
-    with pytest.raises(ConfigError, match=r"mass as \(low, high\), got 0.1. Use \(0.1, 0.1\) for a fixed"):
-        build(mass=0.1)
+    with pytest.raises(ConfigError, match=r"wind as \(low, high\), got 0.1. Use \(0.1, 0.1\) for a fixed"):
+        build(wind=0.1)
+    with pytest.raises(ConfigError, match=r"mass .* to 1, got 1.1.*Use \(low, high\), or a number r"):
+        build(mass=1.1)
     with pytest.raises(ConfigError, match="mass of Randomize to be positive"):
         build(mass=(-1.0, 0.9))
     for optional in (("foo",), "wind", ("wind", 3)):
@@ -265,3 +270,167 @@ def test_a_factor_of_the_drag_acts_on_rotor_aerodynamics():
         velocities.append(np.concatenate([sim.data.states.vel[0, 0], sim.data.states.ang_vel[0, 0]]))
     assert velocities[0][0] < 2.0 - 1e-4
     np.testing.assert_allclose(velocities[0], velocities[1], rtol=1e-5, atol=1e-6)
+
+
+PATHS = {
+    "params.J": 0.2,
+    "params.rotor_vel_max": (0.8, 0.9),
+    "controls.state.controller.params.kp": 0.3,
+    "controls.force_torque.params.rpm2thrust": 0.1,
+    "plugins.battery.resistance": (0.5, 2.0),
+    "plugins.imu.accel.noise": (2.0, 3.0),
+    "plugins.imu.gyro.spread": (0.0, 4.0),
+    "plugins.wind.velocity": 0.5,
+}
+
+
+def number_at(data, path):
+    for name in path.split("."):
+        data = data[name] if isinstance(data, dict) else getattr(data, name)
+    return data
+
+
+def with_number(node, path, value):
+    name, _, rest = path.partition(".")
+    new = with_number(number_at(node, name), rest, value) if rest else value
+    return node | {name: new} if isinstance(node, dict) else node.replace(**{name: new})
+
+
+def fly(plugins, n_worlds=3, **settings):
+    sim = Sim(n_worlds, 2, control="state", controller="crazyflow", rng_key=5, engine="interpret", **settings)
+    sim.data = with_states(sim.data, pos=[0, 0, 2.0], rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    for plugin in plugins:
+        sim.add(plugin)
+    sim.state_control(pos=[0.2, 0.0, 2.5])
+    return sim
+
+
+def physical_plugins():
+    return [Battery(), IMU.bmi088(), Wind([1.0, 0.5, 0.0])]
+
+
+@pytest.mark.parametrize("position", [0, 3])
+@pytest.mark.parametrize("drone", ["cf2x_L250", ["cf2x_L250", "cf21B_500"]], ids=["shared", "per drone"])
+def test_numbers_drawn_by_path_act_as_numbers_set_by_hand(drone, position):
+    """The nominal numbers stay as they are, for numbers that drones share or not, and in any order of adding."""
+    plugins = physical_plugins()
+    plugins.insert(position, Randomize(PATHS))
+    drawn_sim, set_sim = fly(plugins, drone=drone), fly(physical_plugins(), drone=drone)
+    nominal = {path: np.asarray(number_at(drawn_sim.data, path)) for path in PATHS}
+    masks = [None, np.array([True, False, True]), np.array([False, True, True])]
+    last_factors = np.ones((3, 2, len(PATHS)))
+    for mask in masks:
+        drawn_sim.reset(mask)
+        factors = np.asarray(drawn_sim.data.plugins["randomize"].path_factors)
+        is_reset = np.ones(3, bool) if mask is None else mask
+        np.testing.assert_allclose(factors[~is_reset], last_factors[~is_reset], rtol=1e-6)  # rounded by another engine
+        assert np.all(factors[is_reset] != last_factors[is_reset])
+        for k, (path, limits) in enumerate(PATHS.items()):
+            low, high = limits if isinstance(limits, tuple) else (1 - limits, 1 + limits)
+            assert low <= factors[..., k].min() < factors[..., k].max() <= high
+            n_core = nominal[path].ndim - 2 * (nominal[path].shape[:2] == (3, 2))
+            factor = factors[..., k].reshape(3, 2, *[1] * n_core)
+            for owner in ("data", "default_data"):
+                data = with_number(getattr(set_sim, owner), path, jnp.asarray(factor * nominal[path]))
+                if path == "params.J":
+                    data = with_number(data, "params.J_inv", jnp.linalg.inv(data.params.J))
+                setattr(set_sim, owner, data)
+        set_sim.reset(mask)
+        for sim in (drawn_sim, set_sim):
+            sim.state_control(pos=[2.0, -1.0, 2.0])
+            sim.step(20)
+        for path in ("states", "plugins.battery.voltage", "plugins.imu.samples", "plugins.imu.gyro.bias"):
+            results = [jax.tree.leaves(number_at(sim.data, path)) for sim in (drawn_sim, set_sim)]
+            for x, expected in zip(*results, strict=True):
+                np.testing.assert_allclose(x, expected, rtol=1e-3, atol=1e-3, err_msg=path)
+        for path, x in nominal.items():
+            np.testing.assert_array_equal(number_at(drawn_sim.data, path), x)
+        last_factors = factors
+
+
+def test_law_10_numbers_of_a_path_do_not_depend_on_other_paths_or_worlds():
+    all_paths, one_path = (
+        fly([Randomize(paths), *physical_plugins()], n_worlds)
+        for paths, n_worlds in ((PATHS, 3), ({"plugins.wind.velocity": 0.5}, 2))
+    )
+    for sim in (all_paths, one_path):
+        sim.reset()
+    factors = all_paths.data.plugins["randomize"].path_factors[..., list(PATHS).index("plugins.wind.velocity")]
+    np.testing.assert_array_equal(factors[:2], one_path.data.plugins["randomize"].path_factors[..., 0])
+    observed = all_paths.plugins.observations(all_paths.data)["randomize.path_factors"]
+    np.testing.assert_array_equal(observed, all_paths.data.plugins["randomize"].path_factors)
+
+
+def test_episodes_begin_with_drawn_numbers():
+    """Numbers are drawn before all plugins begin an episode, whichever was added first."""
+
+    class Start(Plugin):
+        height: Param = param(default=2.0)
+        start: Array = state()
+        name: str = "start"
+
+        def reset_episode(self, data):
+            return self.write(data, self.replace(start=self.height))
+
+    sim = Sim(3, 2, engine="interpret")
+    start = sim.add(Start())
+    plugin = sim.add(Randomize({"plugins.start.height": 0.5}))
+    for _ in range(2):
+        sim.reset()
+        height = 2.0 * np.asarray(plugin.read(sim.data).path_factors)
+        np.testing.assert_allclose(start.read(sim.data).start, height, rtol=1e-6)
+        sim.step()
+        np.testing.assert_allclose(start.read(sim.data).start, height, rtol=1e-6)
+    assert np.unique(height).size == 6
+
+
+def test_factors_survive_other_numbers_and_edits_of_the_scene():
+    """A replaced plugin has new nominal numbers; ranges that are replaced act from the next episode on."""
+    sim = fly([Randomize(PATHS), *physical_plugins()])
+    sim.step()
+    factors = np.asarray(sim.data.plugins["randomize"].path_factors)
+    sim.replace(Battery(resistance=0.5))
+    sim.scene.add("sphere", pos=[3.0, 0.0, 0.0], radius=0.1)
+    sim.replace(Randomize(PATHS | {"params.J": (3.0, 3.0)}))
+    sim.step()
+    np.testing.assert_array_equal(sim.data.plugins["randomize"].path_factors, factors)
+    np.testing.assert_array_equal(sim.data.plugins["battery"].resistance, np.float32([0.5]))
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.plugins["randomize"].path_factors[..., 0], 3.0)
+    with pytest.raises(ConfigError, match="plugin that needs 'wind'"):
+        sim.remove("wind")
+
+
+def test_a_filter_assumes_nominal_numbers():
+    """The variances of a filter do not depend on the noise that its sensors have."""
+    covariances, accelerations = [], []
+    for ranges in ({}, {"plugins.imu.accel.noise": (9.0, 9.0)}):
+        imu, camera = IMU.bmi088(), MotionCapture()
+        sim = fly([imu, camera, ESKF([imu, camera], control=False), Randomize(ranges)])
+        sim.step(5)
+        covariances.append(np.asarray(sim.data.plugins["eskf"].estimate.cov))
+        accelerations.append(np.asarray(sim.plugins.observations(sim.data)["imu.accel"]))
+    np.testing.assert_allclose(*covariances, rtol=0.01, atol=1e-8)
+    assert np.abs(accelerations[0] - accelerations[1]).max() > 0.01
+
+
+@pytest.mark.parametrize("paths, message", [
+    ({"params.drag": 0.2}, "got 'params.drag', which is none. Near are params.drag_matrix"),
+    ({"controls.mellinger.kp": 0.2}, "Near are .*controls.state.controller.params.kp"),
+    ({"states.pos": 0.2}, "got 'states.pos', which is a state"),
+    ({"core.steps": 0.2}, "got 'core.steps', which is a state, a whole number"),
+    ({"plugins.battery.capacity": 0.2}, "got 'plugins.battery.capacity', which is none"),
+    ({"plugins.randomize.limits": 0.2}, "got 'plugins.randomize.limits'"),
+    ({"params.mass": (1.1, 0.9)}, r"expected params.mass as \(low, high\), got"),
+    ({"params.mass": 1.5}, r"Use \(low, high\), or a number r for"),
+    ({"params.mass": (-1.0, 1.0)}, r"paths\['params.mass'\]"),
+    ({"params.mass": (0.9, 1.0, 1.1)}, r"paths\['params.mass'\] as real numbers of shape \(2,\)"),
+    ({"params.mass": "heavy"}, "params.mass"),
+    ({"params.mass": None}, "params.mass"),
+    ({3: 0.2}, "got '3'"),
+    (("params.mass", 0.2), "paths of Randomize"),
+])  # fmt: skip
+def test_law_09_paths_that_are_no_numbers_of_drones_are_errors(paths, message):
+    with pytest.raises(ConfigError, match=message):
+        fly([Randomize(paths)]).step()
