@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1165,
     "control": 1987,
-    "core": 1549,
+    "core": 1571,
     "crazysim": 828,
     "drones": 514,
     "dynamics": 576,
@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 9751,
     "media": 986,
-    "plugins": 7278,
+    "plugins": 7345,
     "scene": 3089,
     "sim": 1225,
     "train": 2438,
