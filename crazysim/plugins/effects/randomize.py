@@ -23,7 +23,7 @@ from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
-from crazysim.tables import range_between, read_number
+from crazysim.tables import NOT_NEGATIVE, range_between, read_number
 
 FACTOR_PATHS = {
     "mass": "params.mass",
@@ -163,7 +163,7 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
             require_drag(sim, "wind")
         settings = {_full_path(sim, path): x for path, x in (self.paths or {}).items()}
         ranges = {
-            path: check_parameter(sim, f"paths[{path!r}]", _around_one(path, x), (2,), low=0.0)
+            path: check_parameter(sim, f"paths[{path!r}]", _around_one(path, x), (2,), NOT_NEGATIVE)
             for path, x in settings.items()
         }
         single_factors = {
