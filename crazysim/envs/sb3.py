@@ -133,12 +133,10 @@ class DroneVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: ArrayLike | None = None) -> None:
         """Raise an error, because all worlds are one compiled program."""
-        del value, indices
         raise ConfigError(f"cannot set {attr_name!r}: all worlds are one compiled program. Make another environment.")
 
     def env_method(self, method_name: str, *args: Any, indices: ArrayLike | None = None, **kwargs: Any) -> list[Any]:
         """Call ``render``, the only method that is supported."""
-        del indices
         require(
             method_name == "render" and not args and not kwargs,
             f"expected method 'render' without arguments, got {method_name!r}: all worlds are one compiled program",

@@ -43,6 +43,8 @@ class Task:
 
     unit: ClassVar[str] = "m"
     """Unit of ``error``."""
+    film_view: ClassVar[Mapping[str, Any] | None] = None
+    """Settings of the camera of films, if they do not depend on the number of drones; see ``camera``."""
 
     seconds: float = setting(default=5.0, positive=True, high=MAX_SECONDS)
     """Length of an episode, s."""
@@ -84,7 +86,6 @@ class Task:
             data: The world.
             pos: Goal of every drone, or of its load, world frame, m. (n_drones, 3)
         """
-        del data, pos
         raise ConfigError(
             f"expected a task whose goals are positions, got {self.name!r}. Define set_goal(data, pos) in "
             f"{type(self).__name__}, or use a task that has it, such as hover."
@@ -100,7 +101,6 @@ class Task:
 
     def privileged(self, data: SimData) -> Obs:
         """Return further observations for a critic, which policies must not use. (n_drones, k) each"""
-        del data
         return {}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
@@ -123,7 +123,6 @@ class Task:
 
     def info(self, data: SimData) -> dict[str, Array]:
         """Return further quantities for ``state.info``, by name. () or (n_drones, ...) each"""
-        del data
         return {}
 
     def target(self, data: SimData) -> Array | None:
@@ -132,7 +131,6 @@ class Task:
         Returns:
             (n_drones, 3) or (n_drones, n_marks, 3)
         """
-        del data
         return None
 
     def subjects(self, data: SimData) -> Array | None:
@@ -141,16 +139,15 @@ class Task:
         Returns:
             (n_points, 3)
         """
-        del data
         return None
 
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
         """Return lookat, distance, azimuth and elevation of the camera of films; None to frame all starts.
 
-        With the entry ``follow``, the index of a drone, the camera follows that drone at the distance.
+        With the entry ``follow``, the index of a drone, the camera follows that drone at the distance. By default it is
+        ``film_view``.
         """
-        del n_drones
-        return None
+        return self.film_view
 
     def policy_camera(self) -> ImageSensor | None:
         """Return the camera on every drone whose images the policy observes, which ``make`` adds; None for none."""
@@ -158,7 +155,6 @@ class Task:
 
     def succeeded(self, data: SimData) -> Array | None:
         """Return True where a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
-        del data
         return None
 
     def _undefined(self, method: str) -> str:

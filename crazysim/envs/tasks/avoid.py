@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,6 +90,7 @@ class Avoid(Task):
 
     name = "avoid"
     Record = Crossing
+    film_view = {"elevation": -35}
 
     n_poles: int = setting(default=8, low=0)
     """Number of poles."""
@@ -252,10 +252,6 @@ class Avoid(Task):
 
     def info(self, data: SimData) -> dict[str, Array]:
         return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -35}
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return with_record(data, crossing_of(data).replace(goal=pos))

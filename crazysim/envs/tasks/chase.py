@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +50,7 @@ class Chase(TouchDown):
     target_name = "roof"
     progress_reward = 6.0
     crash_cost = 4.0
+    film_view = {"elevation": -25}
 
     speed: float = setting(default=1.0, low=0.0, high=3.0)
     """Largest speed of a car, m/s; the smallest speed is 0.3 times that."""
@@ -78,7 +77,6 @@ class Chase(TouchDown):
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's roof, world frame. (..., 3) each"""
-        del steps_ahead
         car: CarData = data.plugins[CARS]
         roof_pos = jnp.asarray(roof_centre(), car.pos.dtype)
         arm = rotation.rotate(car.quat, jnp.broadcast_to(roof_pos, car.pos.shape))
@@ -102,10 +100,6 @@ class Chase(TouchDown):
             "heading": pick_entry(heading, drone),
             "yaw_rate": pick_entry(car.yaw_rate, drone),
         }
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -25}
 
 
 def rolling_car(car: CarData, yaw: Array, speed: Array, steer: Array) -> CarData:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,6 +71,7 @@ class Deliver(BringLoad):
 
     name = "deliver"
     Record = TrailerDelivery
+    film_view = {"elevation": -20}
 
     mass: float = setting(default=0.008, low=1e-4, high=1.0)
     """Mass of the load, kg."""
@@ -182,10 +182,6 @@ class Deliver(BringLoad):
 
     def subjects(self, data: SimData) -> Array:
         return data.plugins["load"].pos
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -20}
 
 
 def ring_positions(car: CarData) -> Array:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,6 +75,7 @@ class FollowCar(Task):
 
     name = "follow_car"
     Record = Manoeuvre
+    film_view = {"follow": 0, "distance": 3.0, "azimuth": 30.0, "elevation": -25.0}
 
     speed: float = setting(default=1.2, low=0.0, high=3.0)
     """Largest speed of a car, m/s."""
@@ -177,7 +176,3 @@ class FollowCar(Task):
         return TargetCamera(
             24, 18, fovy=80.0, max_depth=4.0, rpy=(0.0, 0.6, 0.0), outputs=("depth", "segmentation"), target=CARS
         )
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"follow": 0, "distance": 3.0, "azimuth": 30.0, "elevation": -25.0}

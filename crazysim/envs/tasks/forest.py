@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -82,6 +80,7 @@ class Forest(Task):
 
     name = "forest"
     Record = Passage
+    film_view = {"follow": 0, "distance": 8.0, "azimuth": 0.0, "elevation": -35.0}
 
     speed: float = setting(default=5.0, positive=True, high=20.0)
     """Speed above which flying faster costs reward, m/s."""
@@ -243,10 +242,6 @@ class Forest(Task):
 
     def policy_camera(self) -> Camera:
         return Camera(16, 12)
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"follow": 0, "distance": 8.0, "azimuth": 0.0, "elevation": -35.0}
 
     def target(self, data: SimData) -> Array:
         return passage_of(data).goal

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jax import Array
@@ -30,6 +28,7 @@ class Hover(GoalTask):
     """
 
     name = "hover"
+    film_view = {"elevation": -20}
     half_width, height = 3.0, 3.0
 
     reach: float = setting(default=1.0, low=0.0)
@@ -56,7 +55,3 @@ class Hover(GoalTask):
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "crash": -10.0 * self.crashed(data),
         }
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -20}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +61,7 @@ class Land(TouchDown):
     name = "land"
     Record = PadLanding
     target_name = "pad"
+    film_view = {"elevation": -20}
     # If a crash cost 10, as much as a landing earns, policies would hover next to the pad: few of their first contacts
     # are soft.
     crash_cost = 2.0
@@ -149,7 +149,3 @@ class Land(TouchDown):
         """Return four points on the rim of each pad, m. (4 n_drones, 3)"""
         rim = self.radius * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], data.states.pos.dtype)
         return (self.target(data)[:, None] + rim).reshape(-1, 3)
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -20}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +64,7 @@ class Race(Task):
 
     name = "race"
     Record = rules.RaceRecord
+    film_view = {"elevation": -50}
 
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3, as in the table above."""
@@ -192,10 +192,6 @@ class Race(Task):
     def info(self, data: SimData) -> dict[str, Array]:
         record = race_of(data)
         return {"gates_passed": record.passed, "finished": record.finished, "disabled": record.disabled}
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"elevation": -50}
 
     def target(self, data: SimData) -> Array:
         return rules.next_gate(data)[0]

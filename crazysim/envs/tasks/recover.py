@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jax import Array
@@ -29,6 +27,7 @@ class Recover(GoalTask):
     """
 
     name = "recover"
+    film_view = {"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15}
     half_width, height = 8.0, 8.0
 
     speed: float = setting(default=2.0, low=0.0)
@@ -56,7 +55,3 @@ class Recover(GoalTask):
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "crash": -20.0 * self.crashed(data),
         }
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15}

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +48,7 @@ class TrackTrajectory(Task):
 
     name = "track"
     Record = TrajectoryStart
+    film_view = {"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30}
 
     trajectory: Trajectory = field(default_factory=figure_eight)
     """The trajectory; by default a figure eight of 2 m by 1 m in 5 s, which repeats."""
@@ -127,10 +127,6 @@ class TrackTrajectory(Task):
     def error(self, data: SimData) -> Array:
         """Return the distance from the trajectory, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30}
 
     def target(self, data: SimData) -> Array:
         t = self.time(data)

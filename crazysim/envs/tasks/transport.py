@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,6 +64,7 @@ class Transport(BringLoad):
 
     name = "transport"
     Record = GateDelivery
+    film_view = {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
 
     mass: float = setting(default=0.01, positive=True)
     """Mass of the load, kg."""
@@ -206,10 +205,6 @@ class Transport(BringLoad):
     def info(self, data: SimData) -> dict[str, Array]:
         passed = is_behind(load_pos(data), *gate_of(data))
         return {"passed": passed & ~delivery_of(data).crashed} | super().info(data)
-
-    def camera(self, n_drones: int) -> Mapping[str, Any]:
-        del n_drones
-        return {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
 
 
 def corridor_centres(n_drones: int) -> np.ndarray:
