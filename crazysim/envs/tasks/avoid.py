@@ -12,13 +12,21 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import PyTree, device_array, leaf, static
+from crazysim.engine.pytree import device_array, leaf, static
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.envs.tasks.goals import install_rules, nearest_drones, nearest_entries, state_of, with_record
+from crazysim.envs.tasks.goals import (
+    Crossing,
+    CrossingTask,
+    crossing_of,
+    install_rules,
+    nearest_drones,
+    nearest_entries,
+    state_of,
+    with_record,
+)
 from crazysim.envs.tracks import ranks
 from crazysim.errors import require
 from crazysim.scene.objects import Handle
@@ -44,26 +52,13 @@ SPACING = 0.6
 """Distance between the mean positions of neighbouring starts, and of neighbouring goals, m."""
 
 
-class Crossing(PyTree):
+class FieldCrossing(Crossing):
     """Goal of each drone, and the outcome of its flight."""
 
-    goal: Array = leaf("drone", 1)
-    """Goal, m. (n_worlds, n_drones, 3)"""
-    reached: Array = leaf("drone", 0)
-    """True where the drone has reached its goal. (n_worlds, n_drones)"""
-    disabled: Array = leaf("drone", 0)
-    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
-    flight_over_before: Array = leaf("drone", 0)
-    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
     """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
     handles: tuple[Handle, ...] = static()
     """Handles of the poles, then of the boxes."""
-
-    @property
-    def flight_over(self) -> Array:
-        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
-        return self.reached | self.disabled
 
 
 class Field(NamedTuple):
@@ -80,7 +75,7 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Avoid(Task):
+class Avoid(CrossingTask):
     """Fly about 4.7 m through a field of obstacles, which have new positions in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches an obstacle,
@@ -89,7 +84,7 @@ class Avoid(Task):
     """
 
     name = "avoid"
-    Record = Crossing
+    Record = FieldCrossing
     film_view = {"elevation": -35}
 
     n_poles: int = setting(default=8, low=0)
@@ -143,12 +138,11 @@ class Avoid(Task):
             """Disable a drone that touches something or leaves the arena; mark one that reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
             has_left = jnp.any(jnp.abs(pos[:2]) > half_size.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
-            disabled = record.disabled | (~record.reached & (has_left | contacts(data).any))
             offset = pos - record.goal
-            reached = record.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
-            return with_record(data, record.replace(disabled=disabled, reached=reached))
+            has_arrived = rotation.dot(offset, offset)[0] < self.tolerance**2
+            return with_record(data, record.updated(has_left | contacts(data).any, has_arrived))
 
-        record = Crossing(zero, false, false, false, zero[..., 0], tuple(handles))
+        record = FieldCrossing(zero, false, false, false, zero[..., 0], tuple(handles))
         install_rules(sim, record, update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
@@ -178,10 +172,8 @@ class Avoid(Task):
         return with_record(data, record.replace(goal=goals + START_JITTER * goal_shift))
 
     def before_step(self, data: SimData) -> SimData:
-        record = crossing_of(data)
-        return with_record(
-            data, record.replace(flight_over_before=record.flight_over, remaining_way_before=self.error(data))
-        )
+        data = super().before_step(data)
+        return with_record(data, crossing_of(data).replace(remaining_way_before=self.error(data)))
 
     def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
         """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
@@ -243,26 +235,9 @@ class Avoid(Task):
         }
         return terms.only_where(~record.flight_over_before, reward_terms)
 
-    def terminated(self, data: SimData) -> Array:
-        return jnp.all(crossing_of(data).flight_over)
-
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""
         return rotation.safe_norm(crossing_of(data).goal - data.states.pos)[..., 0]
 
-    def info(self, data: SimData) -> dict[str, Array]:
-        return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
-
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return with_record(data, crossing_of(data).replace(goal=pos))
-
-    def target(self, data: SimData) -> Array:
-        return crossing_of(data).goal
-
-    def succeeded(self, data: SimData) -> Array:
-        return crossing_of(data).reached
-
-
-def crossing_of(data: SimData) -> Crossing:
-    """Return the task's record."""
-    return data.plugins[TASK_RECORD_NAME]

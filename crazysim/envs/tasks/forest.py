@@ -13,13 +13,22 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.envs.tasks.goals import install_rules, motion_of, nearest_entries, on_floor, to_heading, with_record
+from crazysim.envs.tasks.goals import (
+    Crossing,
+    CrossingTask,
+    crossing_of,
+    install_rules,
+    motion_of,
+    nearest_entries,
+    on_floor,
+    to_heading,
+    with_record,
+)
 from crazysim.plugins.scenery.forest import Forest as Trees
 from crazysim.plugins.sensors.camera import Camera
 from crazysim.sim.sim import Sim
@@ -51,26 +60,8 @@ N_PRIVILEGED_TREES = 4
 """Number of nearest trees in privileged observations."""
 
 
-class Passage(PyTree):
-    """Goal of each drone, and the outcome of its flight."""
-
-    goal: Array = leaf("drone", 1)
-    """Point beyond the goal line, m. (n_worlds, n_drones, 3)"""
-    reached: Array = leaf("drone", 0)
-    """True where the drone has crossed the goal line. (n_worlds, n_drones)"""
-    disabled: Array = leaf("drone", 0)
-    """True where the drone has touched something, or left the corridor. (n_worlds, n_drones)"""
-    flight_over_before: Array = leaf("drone", 0)
-    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
-
-    @property
-    def flight_over(self) -> Array:
-        """True where the drone has crossed the goal line or is disabled. (n_worlds, n_drones)"""
-        return self.reached | self.disabled
-
-
 @dataclass(frozen=True, kw_only=True)
-class Forest(Task):
+class Forest(CrossingTask):
     """Fly through a forest to a goal line at a set speed; every episode has a new random forest.
 
     A drone is disabled when it touches a tree, the ground or another drone, or leaves the corridor. The ceiling of the
@@ -79,7 +70,6 @@ class Forest(Task):
     """
 
     name = "forest"
-    Record = Passage
     film_view = {"follow": 0, "distance": 8.0, "azimuth": 0.0, "elevation": -35.0}
 
     speed: float = setting(default=5.0, positive=True, high=20.0)
@@ -133,15 +123,13 @@ class Forest(Task):
         @stage("drone", when=lambda data: (data.core.steps + 1) % period == 0)
         def update_record(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the corridor; mark one that crosses the goal line."""
-            record, pos = passage_of(data), data.states.pos
+            record, pos = crossing_of(data), data.states.pos
             has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE_DISTANCE) | on_floor(data)
             touches_tree = trees.clearance(data, pos) < radius
-            disabled = record.disabled | (~record.reached & (has_left | touches_tree))
-            reached = record.reached | (~disabled & (pos[0] >= self.length))
-            return with_record(data, record.replace(disabled=disabled, reached=reached))
+            return with_record(data, record.updated(has_left | touches_tree, pos[0] >= self.length))
 
         # ``checks_collisions`` also disables drones that touch each other.
-        install_rules(sim, Passage(zero, false, false, false), update_record, checks_collisions=True)
+        install_rules(sim, Crossing(zero, false, false, false), update_record, checks_collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight in front of a new forest."""
@@ -155,11 +143,7 @@ class Forest(Task):
         start_pos = (mean_pos + jitter * start_shift).astype(dtype)
         data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
         goal = (mean_pos + jitter * goal_shift + np.array([self.length + EDGE_DISTANCE, 0.0, 0.0])).astype(dtype)
-        return with_record(data, passage_of(data).replace(goal=goal))
-
-    def before_step(self, data: SimData) -> SimData:
-        record = passage_of(data)
-        return with_record(data, record.replace(flight_over_before=record.flight_over))
+        return with_record(data, crossing_of(data).replace(goal=goal))
 
     def nearest_trees(self, data: SimData, n: int) -> Array:
         """Return the nearest trees of each drone, the nearest first.
@@ -197,7 +181,7 @@ class Forest(Task):
         drone's distance to the left of the middle of the corridor, m. ``trees_near`` has the nearest ``trees_seen``
         trees.
         """
-        to_goal = passage_of(data).goal - data.states.pos
+        to_goal = crossing_of(data).goal - data.states.pos
         distance = rotation.safe_norm(to_goal)
         obs = motion_of(data) | {
             "goal_direction": to_heading(data, to_goal / jnp.maximum(distance, 1e-3)),
@@ -212,7 +196,7 @@ class Forest(Task):
         return {"trees_near": self.nearest_trees(data, N_PRIVILEGED_TREES).reshape(data.core.n_drones, -1)}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, s = passage_of(data), data.states
+        record, s = crossing_of(data), data.states
         to_goal, (_, left) = record.goal - s.pos, rotation.heading(s.quat)
         approach = jnp.sum(s.vel * to_goal, axis=-1) / jnp.maximum(rotation.safe_norm(to_goal)[..., 0], 1e-3)
         speed = rotation.safe_norm(s.vel)[..., 0]
@@ -230,26 +214,9 @@ class Forest(Task):
         }
         return terms.only_where(~record.flight_over_before, reward_terms)
 
-    def terminated(self, data: SimData) -> Array:
-        return jnp.all(passage_of(data).flight_over)
-
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal line, m."""
         return jnp.maximum(self.length - data.states.pos[..., 0], 0.0)
 
-    def info(self, data: SimData) -> dict[str, Array]:
-        return {"reached": passage_of(data).reached, "disabled": passage_of(data).disabled}
-
     def policy_camera(self) -> Camera:
         return Camera(16, 12)
-
-    def target(self, data: SimData) -> Array:
-        return passage_of(data).goal
-
-    def succeeded(self, data: SimData) -> Array:
-        return passage_of(data).reached
-
-
-def passage_of(data: SimData) -> Passage:
-    """Return the task's record."""
-    return data.plugins[TASK_RECORD_NAME]

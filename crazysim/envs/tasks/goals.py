@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,6 +65,59 @@ class GoalTask(Task):
 
     def target(self, data: SimData) -> Array:
         return goal_of(data).pos
+
+
+class Crossing(PyTree):
+    """Goal of each drone behind obstacles, and the outcome of its flight."""
+
+    goal: Array = leaf("drone", 1)
+    """Goal, m. (n_worlds, n_drones, 3)"""
+    reached: Array = leaf("drone", 0)
+    """True where the drone has reached its goal or the goal line. (n_worlds, n_drones)"""
+    disabled: Array = leaf("drone", 0)
+    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
+    flight_over_before: Array = leaf("drone", 0)
+    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
+
+    @property
+    def flight_over(self) -> Array:
+        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
+        return self.reached | self.disabled
+
+    def updated(self, must_end: Array, has_arrived: Array) -> Any:
+        """Return the record after a step in which drones must end, or else may have arrived. (n_worlds, n_drones)"""
+        disabled = self.disabled | (~self.reached & must_end)
+        return self.replace(disabled=disabled, reached=self.reached | (~disabled & has_arrived))
+
+
+class CrossingTask(Task):
+    """Base of tasks in which every drone flies past obstacles until it arrives or is disabled.
+
+    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``observe``, ``rewards`` and ``error``.
+    """
+
+    Record = Crossing
+
+    def before_step(self, data: SimData) -> SimData:
+        record = crossing_of(data)
+        return with_record(data, record.replace(flight_over_before=record.flight_over))
+
+    def terminated(self, data: SimData) -> Array:
+        return jnp.all(crossing_of(data).flight_over)
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
+
+    def target(self, data: SimData) -> Array:
+        return crossing_of(data).goal
+
+    def succeeded(self, data: SimData) -> Array:
+        return crossing_of(data).reached
+
+
+def crossing_of(data: SimData) -> Any:
+    """Return the task's record, a ``Crossing`` or a subclass."""
+    return data.plugins[TASK_RECORD_NAME]
 
 
 def install_goal(sim: Sim) -> None:
