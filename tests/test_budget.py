@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 576,
     "engine": 6745,
-    "envs": 3804,
+    "envs": 3739,
     "geometry": 1089,
     "lab": 9751,
     "media": 986,
