@@ -62,7 +62,7 @@ READERS = {
     "scenery": lambda: Pillars(density=0.3, size=(4.0, 4.0), free=((0, 0, 0.5), (0, 0.5, 0.5))),
     "ground_effect": GroundEffect,
 }
-EXAMPLES = settings().max_examples // 6
+EXAMPLES = settings().max_examples // 10
 
 
 def new_sim(**kwargs):
