@@ -20,11 +20,14 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(call tests_of,geometry,heightfield manifold rays shapes) \
   $(call tests_of,scene,build contact_report contacts sync) \
   tests/trajectories/test_formation.py
+# What depends neither on JAX nor on optimisation: messages, the scene, compilers and files of kernels.
+ANY_JAX = $(call tests_of,engine,arm kernel_cache native) \
+  $(call tests_of,laws,faults law_05_no_stale_scene law_09_any_input law_09_wrong_input law_09_wrong_numbers masks)
 # Tests start processes that import JAX: without bytecode each takes seconds more.
 unexport PYTHONDONTWRITEBYTECODE
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test test-rest test-all test-gpu check docs format benchmark release clean
+.PHONY: demo test test-rest test-newest test-all test-gpu check docs format benchmark release clean
 
 # The stamp of an extra of pyproject.toml that is installed; `test` includes `demo`.
 $(VENV)/installed-%: pyproject.toml
@@ -41,6 +44,11 @@ test: $(VENV)/installed-test
 # What `make test` leaves out, except for the slow ones: CI runs both.
 test-rest: $(VENV)/installed-test
 	$(PYTEST) -m "not slow" $(addprefix --ignore=,$(TESTS))
+
+# Laws, engine and first pages with all optimisations of XLA, as users have them; CI runs it on the newest JAX.
+test-newest: $(VENV)/installed-test
+	XLA_FLAGS=--xla_backend_optimization_level=3 $(PYTEST) -m "not slow" $(addprefix --ignore=,$(ANY_JAX)) \
+	  tests/laws tests/engine tests/docs/test_first_pages.py
 
 # Everything, with new examples for the tests of properties.
 test-all: $(VENV)/installed-test
