@@ -462,11 +462,12 @@ def test_the_gradient_of_the_reward_is_finite(env, start_state, random_flight):
 
     end = first_worlds(random_flight.end.replace(info=random_flight.end.info | {}, memory={}))
     end = end.replace(info={name: end.info[name] for name in start_state.info})
-    for state in (start_state, end):
-        by_action, by_states = slope((np.full(state.action.shape, 0.1, np.float32), state.data.states), state)
-        assert all(np.isfinite(g).all() for g in jax.tree.leaves((by_action, by_states)))
-        assert np.any(by_action)
-        assert any(np.any(g) for g in jax.tree.leaves(by_states))
+    by_action, by_states = zip(
+        *(slope((np.full(x.action.shape, 0.1, np.float32), x.data.states), x) for x in (start_state, end)), strict=True
+    )
+    for grads in (by_action, by_states):
+        assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
+        assert any(np.any(g) for g in jax.tree.leaves(grads))
 
 
 class AtRest(Hover):

@@ -73,18 +73,18 @@ def reverse_mode(losses, x, directions):
 
 CASES = [
     ("first_principles", "state", "plain", reverse_mode),
-    ("first_principles", "attitude", "plain", forward_mode),
     ("first_principles", "body_rate", "stages", forward_mode),
     ("first_principles", "force_torque", "stages", forward_mode),
     ("first_principles", "rotor_vel", "stages", forward_mode),
-    ("so_rpy", "state", "stages", forward_mode),
     ("so_rpy", "attitude", "stages", forward_mode),
     ("so_rpy_rotor_drag", "state", "stages", forward_mode),
-    ("so_rpy_rotor_drag", "attitude", "stages", forward_mode),
     ("first_principles", "attitude", "auto", reverse_mode),
 ]
-"""Dynamics, command level, engine and mode. Most cases run the stages without an engine in forward mode, which compiles
-fastest: derivatives of physics and controllers are defined in forward mode only, and JAX transposes them."""
+"""Dynamics, command level, engine and mode. At state level, controllers of lower levels are differentiated too.
+
+Most cases run the stages without an engine in forward mode, which compiles fastest: derivatives of physics and
+controllers are defined in forward mode only, and JAX transposes them.
+"""
 
 
 @pytest.mark.long("compiles gradients of every dynamics and engine")

@@ -55,13 +55,12 @@ def tilt_command(data):
 
 
 FITTED_CASE = ("so_rpy_rotor_drag", "attitude", "auto")
-SLOW_PAIR = pytest.mark.slow("the state controller commands attitudes, which the fits follow in other cases")
+SLOW_PAIRS = (("so_rpy", "state"), ("so_rpy_rotor", "state"), ("so_rpy_rotor", "attitude"))
+SLOW_PAIR = pytest.mark.slow("the state controller commands attitudes; other fits have fewer terms, and all terms")
 ENGINE_CASES = [
     *((*pair, "stages") for pair in PAIRS[1:5]),
     *(
-        pytest.param(
-            *pair, "stages", marks=[SLOW_PAIR] if pair in (("so_rpy", "state"), ("so_rpy_rotor", "state")) else []
-        )
+        pytest.param(*pair, "stages", marks=[SLOW_PAIR] if pair in SLOW_PAIRS else [])
         for pair in PAIRS[5:]
         if pair != FITTED_CASE[:2]
     ),

@@ -92,7 +92,7 @@ def test_four_devices_train_the_policy_of_one(algorithm, config):
     assert n_bytes < exchanged["all-reduce"] < 2 * n_bytes
 
 
-@pytest.mark.long("compiles the training of a student for one device and for two")
+@pytest.mark.slow("devices exchange the sums of the other algorithms in the same way")
 def test_two_devices_train_the_student_of_one():
     """DAgger: the same first episodes, and the same student within a hundredth of what its 24 updates change."""
     one, two = (Training(dagger, DAGGER_CONFIG, 1, 16, n) for n in (1, 2))
