@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import socket
 import sys
 import warnings
+from collections.abc import Iterator
 
 import jax
 
@@ -56,6 +58,15 @@ def not_installed(use: str, package: str, extra: str) -> str:
         extra: Extra of crazysim that installs it.
     """
     return f"{use} {package}, which is not installed. Run pip install 'crazysim[{extra}]'."
+
+
+@contextlib.contextmanager
+def optional_import(use: str, package: str, extra: str, error: type[Exception] = ImportError) -> Iterator[None]:
+    """Raise the message of ``not_installed`` for a package that is imported in the block."""
+    try:
+        yield
+    except ImportError as reason:
+        raise error(not_installed(use, package, extra)) from reason
 
 
 def address_message(host: str, port: int, error: Exception, prefix: str = "") -> str:

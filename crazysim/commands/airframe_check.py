@@ -20,7 +20,7 @@ from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics, supported_dynamics
 from crazysim.dynamics.models import require_freq
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, optional_import
 from crazysim.storage import open_replacement
 
 STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
@@ -66,10 +66,8 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
     """
     from crazysim.sim import Sim
 
-    try:
+    with optional_import("pictures need", "matplotlib", "demo"):
         from matplotlib.image import imsave
-    except ImportError as error:
-        raise ImportError(not_installed("pictures need", "matplotlib", "demo")) from error
 
     reach = float(np.max(np.linalg.norm(airframe.value("rotors.position")[:, :2], axis=-1)))
     sim = Sim(drone=airframe, dynamics=supported_dynamics(airframe)[0], control="attitude", controller="auto")

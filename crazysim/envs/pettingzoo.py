@@ -18,13 +18,11 @@ from crazysim.envs.random import as_seed, read_options
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import NO_EPISODE, EnvState, flatten
-from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
+from crazysim.errors import ConfigError, UnknownNameError, expect, optional_import, require
 from crazysim.tables import read_floats
 
-try:
+with optional_import("crazysim.envs.pettingzoo needs", "pettingzoo", "pettingzoo"):
     from pettingzoo import ParallelEnv
-except ImportError as error:
-    raise ImportError(not_installed("crazysim.envs.pettingzoo needs", "pettingzoo", "pettingzoo")) from error
 
 
 class DroneParallelEnv(ParallelEnv):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.arguments import check_arguments, check_flag
-from crazysim.errors import ConfigError, RenderError, not_installed, require
+from crazysim.errors import ConfigError, RenderError, optional_import, require
 from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, show_flight_at
 from crazysim.media.view import View
@@ -190,10 +190,8 @@ class Film:
             )
 
     def _ffmpeg_command(self, width: int, height: int) -> list[str]:
-        try:
+        with optional_import("films need", "imageio-ffmpeg", "demo"):
             from imageio_ffmpeg import get_ffmpeg_exe
-        except ImportError as error:
-            raise ImportError(not_installed("films need", "imageio-ffmpeg", "demo")) from error
         input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}"]
         input_options += ["-i", "-"]
         key_frame_options = ["-g", f"{math.ceil(self.fps)}"]  # a key frame every second

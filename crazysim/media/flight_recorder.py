@@ -17,7 +17,6 @@ from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, expect, require
 from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
-from crazysim.media.poses import mocap_poses
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.sim.sim import Sim
@@ -248,5 +247,5 @@ def _constant_fields(sim: Sim, worlds: NDArray) -> dict[str, Any]:
 def _body_poses(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
     """Return poses of bodies other than drones. (n_worlds, n_bodies, 3) and (n_worlds, n_bodies, 4), xyzw"""
     ids = _body_ids(sim)
-    pos, quat = mocap_poses(sim, worlds)
+    pos, quat = sim.scene.host_poses(sim.plugins.with_moved_objects(sim.data), worlds)
     return pos[:, ids], quat[:, ids]

@@ -97,8 +97,7 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
         OSError: If the file cannot be read.
     """
     with open_file(path) as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise ValueError(f"the first line is not {MAGIC.decode().strip()!r}")
+        require(file.read(len(MAGIC)) == MAGIC, f"the first line is not {MAGIC.decode().strip()!r}", ValueError)
         size = os.fstat(file.fileno()).st_size
         while (start := file.tell()) < size:
             head = file.read(CHUNK_HEADER.size)

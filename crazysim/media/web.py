@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.arguments import check_arguments
-from crazysim.errors import ConfigError, RenderError, address_message, not_installed
+from crazysim.errors import ConfigError, RenderError, address_message, optional_import
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, is_own_name, start_guarded_server, wrong_name_message
 from crazysim.media.flight import Flight
 from crazysim.media.trail import choose_drone_colors
@@ -281,10 +281,8 @@ def import_viser() -> Any:
     Raises:
         ImportError: If viser is not installed.
     """
-    try:
+    with optional_import("pages need", "viser", "web"):
         import viser
-    except ImportError as error:
-        raise ImportError(not_installed("pages need", "viser", "web")) from error
     return viser
 
 

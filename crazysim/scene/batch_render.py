@@ -44,8 +44,7 @@ class BatchRenderer:
         Raises:
             ImportError: If warp-lang is not installed.
         """
-        if not is_installed():
-            raise ImportError(INSTALL_MESSAGE)
+        require(is_installed(), INSTALL_MESSAGE, ImportError)
         check_image_size(width, height)
         camera_index = camera_id(model, camera)
         require(

@@ -24,7 +24,7 @@ from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData, require_states
 from crazysim.engine.pair_reductions import reduce_over_others
 from crazysim.engine.pytree import PyTree, static
-from crazysim.errors import ConfigError, expect, require
+from crazysim.errors import expect, require
 from crazysim.geometry import Shape, distance
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import SizedShapes
@@ -186,11 +186,10 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
     else:
         names = [name for x in selection for name in (x.bodies if isinstance(x, Handle) else (x,))]
     for name in names:
-        if name not in by_name:
-            raise ConfigError(
-                f"expected an object that drones can touch, {', '.join(by_name) or 'but the scene has none'}, got "
-                f"{name!r}"
-            )
+        require(
+            name in by_name,
+            f"expected an object that drones can touch, {', '.join(by_name) or 'but the scene has none'}, got {name!r}",
+        )
         require(
             not require_data or name not in model.mocap_bodies,
             f"expected objects whose poses are in the data, got body {name!r}, which is moved through "

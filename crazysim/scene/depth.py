@@ -22,6 +22,7 @@ from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays, cast_rays_in_worlds, raise_to_floor
+from crazysim.scene.sync import update_poses
 
 MAX_RAYS = 1 << 22
 """Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
@@ -116,9 +117,7 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
 
 def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> CarriedCamera:
     data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)
+    update_poses(model, data)
     fixed, track = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
     mode, root = int(model.cam_mode[i]), int(model.body_rootid[model.cam_bodyid[i]])
     name = body_name(model, root)

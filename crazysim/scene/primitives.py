@@ -57,8 +57,7 @@ def sphere(radius: float = 0.1) -> Geoms:
 def pole(height: float = 1.6, radius: float = 0.015) -> Geoms:
     """Return an upright pole with round ends, with its origin at its foot."""
     half = height / 2 - radius
-    if half <= 0:
-        raise ConfigError(f"expected a pole higher than it is thick, got height {height} m and radius {radius} m")
+    require(half > 0, f"expected a pole higher than it is thick, got height {height} m and radius {radius} m")
     return [{"type": "capsule", "size": (radius, half), "pos": (0, 0, height / 2)}]
 
 

@@ -30,7 +30,7 @@ from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
 from crazysim.scene.ray_casting import RayKernels
 from crazysim.scene.renderer import SceneRenderer
 from crazysim.scene.splats import SplatScene
-from crazysim.scene.sync import poses_of, sync_one_world, with_data_poses
+from crazysim.scene.sync import host_poses, poses_of, sync_one_world, with_data_poses
 
 LARGE_SWARM = 64
 """Smallest number of drones per world for which MJX checks two pairs per drone instead of all pairs."""
@@ -135,12 +135,12 @@ class Scene:
                 ``pos`` in all worlds.
             **options: Settings of a primitive: lengths, m, and ``rgba``; see ``crazysim.scene.primitives``.
         """
-        if self.environment is not None:
-            raise ConfigError(
-                f"expected objects before an environment is made, got {short_repr(source)} after one of the task "
-                f"{self.environment!r}, which would not see it. Use sim.scene.add before DroneEnv(sim, ...), in "
-                f"Task.install, or in a new simulation."
-            )
+        require(
+            self.environment is None,
+            f"expected objects before an environment is made, got {short_repr(source)} after one of the task "
+            f"{self.environment!r}, which would not see it. Use sim.scene.add before DroneEnv(sim, ...), in "
+            f"Task.install, or in a new simulation.",
+        )
         with self.restore_on_error():
             handle = self.added_objects.add(self.spec, source, name, count, pos, quat, mocap, options)
         self.revision += 1
@@ -456,6 +456,16 @@ class Scene:
         self.compile_if_edited()
         return self._mjx.poses()[:2]
 
+    def host_poses(self, data: SimData, worlds: NDArray) -> tuple[NDArray, NDArray]:
+        """Return poses of all mocap bodies in selected worlds as NumPy arrays, without a sync.
+
+        Returns:
+            Positions, m (n, n_mocap, 3), and attitudes, body to world, xyzw (n, n_mocap, 4).
+        """
+        self.compile_if_edited()
+        pos, quat = host_poses(data, worlds, self._mjx.poses(worlds))
+        return pos, np.roll(quat, -1, axis=-1)
+
     def shard(self, mesh: Mesh) -> None:
         """Distribute the scene of all worlds over devices."""
         self.mesh, self.ray_kernels = mesh, dataclasses.replace(self.ray_kernels, mesh=mesh)
@@ -478,7 +488,7 @@ class Scene:
             world,
         )
         self.compile_if_edited()
-        sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
+        sync_one_world(data, world, self._mjx.poses(np.array([world])), self._mj_model, self._mj_data)
 
     # Contact slots and images -----------------------------------------------------------------------------------------
 

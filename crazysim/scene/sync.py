@@ -106,6 +106,22 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
     return mocap_pos, mocap_quat, qpos
 
 
+def host_poses(data: SimData, worlds: NDArray, poses: tuple[ArrayLike, ...]) -> tuple[NDArray, NDArray]:
+    """Return mocap poses as ``with_data_poses``, in NumPy: m (n, n_mocap, 3), and wxyz (n, n_mocap, 4)."""
+    mocap_pos, mocap_quat = (np.array(x, float) for x in poses[:2])
+    for ids, pos, quat in poses_of(data):
+        new_pos, new_quat = (fetch_rows(x, worlds).reshape(len(worlds), len(ids), -1) for x in (pos, quat))
+        mocap_pos[:, np.asarray(ids)], mocap_quat[:, np.asarray(ids)] = new_pos, np.roll(new_quat, 1, axis=-1)
+    return mocap_pos, mocap_quat
+
+
+def update_poses(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
+    """Compute the poses of all bodies, geoms, cameras and lights from mocap poses and joint positions."""
+    mujoco.mj_kinematics(mj_model, mj_data)
+    mujoco.mj_comPos(mj_model, mj_data)
+    mujoco.mj_camlight(mj_model, mj_data)
+
+
 def sync_one_world(
     data: SimData,
     world: int,
@@ -118,19 +134,11 @@ def sync_one_world(
     Args:
         data: Simulation.
         world: Index of the world.
-        poses: Mocap positions, m (n_mocap, 3), attitudes, wxyz (n_mocap, 4), joint positions (n_qpos,). The
+        poses: Mocap positions, m (1, n_mocap, 3), attitudes, wxyz (1, n_mocap, 4), joint positions (1, n_qpos). The
             poses of drones and of objects with handles are replaced by their poses in the data.
         mj_model: Compiled scene.
         mj_data: State to write.
     """
-    mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
-    states, objects = data.states, data.objects
-    moved_poses = [(data.core.drone_mocap_ids, fetch_rows(states.pos, world), fetch_rows(states.quat, world))]
-    if objects is not None:
-        moved_poses.append((objects.mocap_ids, fetch_rows(objects.pos, world)[0], fetch_rows(objects.quat, world)[0]))
-    for ids, pos, quat in moved_poses:
-        mj_data.mocap_pos[np.asarray(ids)] = pos
-        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)
-    mujoco.mj_kinematics(mj_model, mj_data)
-    mujoco.mj_comPos(mj_model, mj_data)
-    mujoco.mj_camlight(mj_model, mj_data)
+    mj_data.mocap_pos[:], mj_data.mocap_quat[:] = (x[0] for x in host_poses(data, np.array([world]), poses))
+    mj_data.qpos[:] = poses[2][0]
+    update_poses(mj_model, mj_data)

@@ -20,7 +20,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 from crazysim.engine.stage import Axes, as_stages, stage
 from crazysim.engine.tools import symbolic
-from crazysim.errors import ConfigError, UnknownNameError, expect, not_installed, require
+from crazysim.errors import ConfigError, UnknownNameError, expect, optional_import, require
 from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
@@ -100,10 +100,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         ValueError: If the step cannot be exported; the message names the stage and the reason.
         ImportError: If CasADi is not installed.
     """
-    try:
+    with optional_import("the export needs", "casadi", "casadi"):
         import casadi
-    except ImportError as error:
-        raise ImportError(not_installed("the export needs", "casadi", "casadi")) from error
     data, stages = sim.data, as_stages(sim.step_pipeline)
     require(
         0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones,

@@ -26,7 +26,7 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import not_installed, require, require_type
+from crazysim.errors import optional_import, require, require_type
 from crazysim.storage import as_path, write_file
 from crazysim.train.convolution import KERNEL_SIZE, STRIDE, Image
 from crazysim.train.interface import Interface, describe_env, sizes_text
@@ -127,11 +127,9 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     Raises:
         ImportError: If onnx is not installed.
     """
-    try:
+    with optional_import("ONNX files need", "onnx", "onnx"):
         import onnx
         from onnx import TensorProto, helper, numpy_helper
-    except ImportError as error:
-        raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
     numbers = _policy_numbers(policy, meta)
     constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     constants["zero"] = np.float32(0.0)

@@ -72,8 +72,7 @@ def lissajous(
     """
     a, k, phi, c = (require_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
                                                   (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
-    if np.any(k != np.round(k)):
-        raise ConfigError(f"expected frequencies as whole numbers, got {frequencies!r}")
+    require(not np.any(k != np.round(k)), f"expected frequencies as whole numbers, got {frequencies!r}")
     w = 2 * np.pi / _resolve_period(period, speed, 2 * np.pi * float(np.linalg.norm(a * k)))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:

@@ -111,7 +111,7 @@ def test_a_world_to_draw_equals_that_of_c_mujoco(sim, world):
     """The sync of one world for an image gives the same poses, and the lights, without MJX."""
     expected = c_mujoco_state(sim, world)
     data = mujoco.MjData(sim.mj_model)
-    poses = tuple(np.asarray(getattr(sim.mjx_data, name))[world] for name in ("mocap_pos", "mocap_quat", "qpos"))
+    poses = tuple(np.asarray(getattr(sim.mjx_data, name))[[world]] for name in ("mocap_pos", "mocap_quat", "qpos"))
     sync_one_world(sim.data, world, poses, sim.mj_model, data)
     for name in (*DERIVED, "light_xpos", "light_xdir"):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.errors import ConfigError, not_installed, require
+from crazysim.errors import ConfigError, optional_import, require
 from crazysim.lab.identify.columns import Columns, without_huge_numbers
 from crazysim.lab.identify.readers import Stream, resample
 from crazysim.storage import check_file, read_text
@@ -91,11 +91,9 @@ def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None =
         ConfigError: If a topic or a field is missing, or topics are ambiguous.
         ImportError: If rosbags is not installed.
     """
-    try:
+    with optional_import("ROS bags need", "rosbags", "logs"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(not_installed("ROS bags need", "rosbags", "logs")) from error
     names = [] if requested_columns is None else [x for x in requested_columns.names if "/" in x]
     folder = path.parent if path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file() else path
     with AnyReader([_BagPath(folder)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:

@@ -133,12 +133,11 @@ def check_motion(
             remedy, n_faults = remedy_text, n_left
             if not n_left:
                 break
-    if remedy:
-        raise ConfigError(f"{name}: expected {fault}. {remedy}.")
-    raise ConfigError(
-        f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
-        "world, angular velocities in the body frame, rad/s."
+    advice = (
+        "Check units, signs and order of the columns: z up, quaternions xyzw and body to world, angular velocities in "
+        "the body frame, rad/s"
     )
+    raise ConfigError(f"{name}: expected {fault}. {remedy or advice}.")
 
 
 def check_turning(logs: Sequence[Log]) -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import optional_import, require
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import Model, Windows, attitude_error, cut_windows, predict
 from crazysim.plugins.effects.residual import Residual, residual_inputs
@@ -58,15 +58,13 @@ def fit_residual(
     Raises:
         ImportError: If optax is not installed.
     """
-    try:
+    with optional_import("networks need", "optax", "train"):
         import optax
-    except ImportError as error:
-        raise ImportError(not_installed("networks need", "optax", "train")) from error
-    if n_hidden < 0 or min(iterations, batch_size) < 1:
-        raise ConfigError(
-            f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
-            f"and {batch_size}. Leave them out for the defaults."
-        )
+    require(
+        n_hidden >= 0 and min(iterations, batch_size) >= 1,
+        f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
+        f"and {batch_size}. Leave them out for the defaults.",
+    )
     windows, dt, params = cut_windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
     validation_windows = cut_windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(

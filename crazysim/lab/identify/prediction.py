@@ -18,7 +18,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
 from crazysim.engine.pytree import PyTree
-from crazysim.errors import not_installed, require
+from crazysim.errors import optional_import, require
 from crazysim.lab.identify.logs import Log
 from crazysim.plugins.effects.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
 from crazysim.storage import write_figure
@@ -284,10 +284,8 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    try:
+    with optional_import("plots need", "matplotlib", "demo"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(not_installed("plots need", "matplotlib", "demo")) from error
     horizons = np.linspace(0, max(HORIZONS), 11)[1:].tolist()
     errors = {name: prediction_errors(logs, model, horizons) for name, model in models.items()}
     figure = Figure(figsize=(9, 3.6), layout="constrained")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError, require
 from crazysim.lab.identify.columns import Columns, unsigned_name, without_huge_numbers
 from crazysim.lab.identify.repairs import PERIOD_RANGE, align_signs, unwrap_angles
+from crazysim.lab.live.attitude import decompress_quat
 
 MAX_HOLD = 3.0
 """Longest pause of a stream that is interpolated, in intervals of the stream; a longer pause is a gap."""
@@ -72,8 +73,7 @@ def resample(
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIOD_RANGE[1] and not set(values) <= slow_columns:
             requirement = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
-            if required_columns & set(values):
-                raise ConfigError(f"{name}: expected {requirement}. Log it faster.")
+            require(not required_columns & set(values), f"{name}: expected {requirement}. Log it faster.")
             repairs.append(f"left out a slow stream: expected {requirement}")
             continue
         if quat and all(c in values for c in quat):
@@ -188,24 +188,6 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
 
 def _are_uint32(x: NDArray) -> bool:
     return bool(np.all((x >= 0) & (x < 2**32) & (np.floor(x) == x)))
-
-
-def decompress_quat(packed: NDArray) -> NDArray:
-    """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
-
-    The lowest 30 bits hold the three smaller components, the last of them in the lowest bits. Each component takes nine
-    bits for its magnitude, in units of 1 / (511 sqrt(2)), and above them a bit that is set if it is negative. The
-    highest two bits hold the index of the largest component.
-    """
-    largest, quat = packed >> 30, np.zeros((len(packed), 4))
-    for k in (3, 2, 1, 0):
-        is_small = largest != k
-        size = (packed & 511) / 511 * np.sqrt(0.5)
-        quat[:, k] = np.where(is_small, np.where(packed & 512, -size, size), 0.0)
-        packed = np.where(is_small, packed >> 10, packed)
-    largest_value = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
-    quat[np.arange(len(quat)), largest] = largest_value
-    return quat
 
 
 def _read_events(content: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:

@@ -69,3 +69,21 @@ def yaw_from_quat(quat: NDArray) -> float:
     """Return the yaw of a unit quaternion, xyzw, rad."""
     x, y, z, w = quat
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def decompress_quat(packed: NDArray) -> NDArray:
+    """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
+
+    The lowest 30 bits hold the three smaller components, the last of them in the lowest bits. Each component takes nine
+    bits for its magnitude, in units of 1 / (511 sqrt(2)), and above them a bit that is set if it is negative. The
+    highest two bits hold the index of the largest component.
+    """
+    largest, quat = packed >> 30, np.zeros((len(packed), 4))
+    for k in (3, 2, 1, 0):
+        is_small = largest != k
+        size = (packed & 511) / 511 * np.sqrt(0.5)
+        quat[:, k] = np.where(is_small, np.where(packed & 512, -size, size), 0.0)
+        packed = np.where(is_small, packed >> 10, packed)
+    largest_value = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
+    quat[np.arange(len(quat)), largest] = largest_value
+    return quat

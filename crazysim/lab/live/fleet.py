@@ -183,8 +183,7 @@ class Fleet:
             return list(range(self.sim.n_drones))
         if drone_id not in self.ids:
             free_drones = sorted(set(range(self.sim.n_drones)) - set(self.ids.values()))
-            if not free_drones:
-                raise ConfigError(f"expected one of the IDs {sorted(self.ids)}, got {drone_id}: no drone is free")
+            require(free_drones, f"expected one of the IDs {sorted(self.ids)}, got {drone_id}: no drone is free")
             self.ids[drone_id] = free_drones[0]
             log.info("ID %d is drone %d", drone_id, free_drones[0])
         return [self.ids[drone_id]]

@@ -31,6 +31,12 @@ class HostTrajectory(NamedTuple):
         ends, coefficients = (np.asarray(x, float) for x in (trajectory.ends, trajectory.coefficients))
         return HostTrajectory(ends, coefficients, bool(trajectory.repeats))
 
+    @staticmethod
+    def of_pieces(durations: NDArray, coefficients: NDArray) -> HostTrajectory:
+        """Return the trajectory of pieces whose coefficients are for the time in seconds."""
+        scaled_coefficients = coefficients * durations[:, None, None] ** np.arange(coefficients.shape[2])
+        return HostTrajectory(np.cumsum(durations), scaled_coefficients, False)
+
     @property
     def duration(self) -> float:
         """Time from the start to the end, s."""

@@ -15,7 +15,6 @@ from crazysim.engine.pytree import has_members, scopes
 from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.scene_bodies import SceneBodies
-from crazysim.media.poses import mocap_poses
 from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
 from crazysim.sim.sim import Sim
@@ -90,7 +89,7 @@ class PictureSource:
         """
         sim, worlds = self._sim, self._worlds
         data = sim.data
-        pos, quat = mocap_poses(sim, worlds)
+        pos, quat = sim.scene.host_poses(sim.plugins.with_moved_objects(sim.data), worlds)
         drone_pos = np.asarray(data.states.pos, float)[worlds]
         empty = np.zeros((len(worlds), 0, 3))
         state, setpoint, wind = data.controls.state, empty, empty

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control
 from crazysim.drones import load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.errors import ConfigError, not_installed, require
+from crazysim.errors import ConfigError, optional_import, require
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
 from crazysim.storage import Closeable
@@ -89,13 +89,11 @@ class Radio(Closeable):
 
     def _connect(self, uri: str, period_ms: int, crazyflie: Any, timeout: float) -> None:
         """Connect, start logging and arm."""
-        try:
+        with optional_import("real Crazyflies need", "cflib", "radio", ConfigError):
             import cflib.crtp
             from cflib.crazyflie import Crazyflie
             from cflib.crazyflie.log import LogConfig
             from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
-        except ImportError as error:
-            raise ConfigError(not_installed("real Crazyflies need", "cflib", "radio")) from error
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         self._sync_crazyflie = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())

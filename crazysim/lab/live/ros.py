@@ -98,8 +98,7 @@ class RosBridge:
         self.messages = m = import_message_classes() if messages is None else messages
         names = swarm.sim.data.objects.names if swarm.sim.data.objects is not None else ()
         for name in objects:
-            if name not in names:
-                raise ConfigError(f"expected one of the movable objects {list(names)}, got {name!r}")
+            require(name in names, f"expected one of the movable objects {list(names)}, got {name!r}")
         self._object_rows = {name: names.index(name) for name in objects}
         self._period, self._next_time = 1 / freq, 0.0
         self._clock_publisher = node.create_publisher(m.Clock, "/clock", QUEUE_LENGTH)

@@ -26,6 +26,7 @@ from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import SceneWindow
+from crazysim.scene.sync import update_poses
 
 IDLE_TIME = 0.005
 """Time between two checks for a new picture, s."""
@@ -156,9 +157,7 @@ class Program:
         """Return the state of the k-th shown world, and its overlays."""
         data, overlays, settings = self._data, self._overlays, self._settings
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
-        mujoco.mj_kinematics(self._model, data)
-        mujoco.mj_comPos(self._model, data)
-        mujoco.mj_camlight(self._model, data)
+        update_poses(self._model, data)
         overlays.clear()
         drones = picture.drone_pos[k]
         colors = choose_drone_colors(len(drones), None)

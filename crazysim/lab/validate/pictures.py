@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from crazysim.errors import not_installed
+from crazysim.errors import optional_import
 from crazysim.lab.validate.rows import Row, Section
 from crazysim.storage import open_replacement
 
@@ -25,10 +25,8 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    try:
+    with optional_import("pictures need", "matplotlib", "demo"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(not_installed("pictures need", "matplotlib", "demo")) from error
     from PIL import Image
 
     rows = [row for row in rows if row.series and not row.problem]

@@ -60,16 +60,16 @@ class Crazysim(Simulator):
     """crazysim itself, with its default controller."""
 
     def __init__(self, start: States) -> None:
-        self._sim = Sim(len(start["pos"]), drone=AIRFRAME, control="attitude")
+        self._sim: Any = Sim(len(start["pos"]), drone=AIRFRAME, control="attitude")
         self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(self._sim))
 
     def fly_period(self, commands: NDArray) -> States:
-        self._sim.attitude_control(commands[:, None])
+        self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
         self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
         return _read_states(self._sim.data)
 
 
-class Crazyflow(Simulator):
+class Crazyflow(Crazysim):
     """Crazyflow, with its controller."""
 
     module = "crazyflow"
@@ -79,11 +79,6 @@ class Crazyflow(Simulator):
         self._sim = package.Sim(n_worlds=len(start["pos"]), drone=AIRFRAME, control="attitude", freq=500)
         own_sim = Sim(drone=AIRFRAME, control="attitude")
         self._sim.data = with_states(self._sim.data, **_world_rows(start), rotor_vel=_hover_speed(own_sim))
-
-    def fly_period(self, commands: NDArray) -> States:
-        self._sim.attitude_control(np.asarray(commands[:, None], np.float32))
-        self._sim.step(round(COMMAND_PERIOD * self._sim.freq))
-        return _read_states(self._sim.data)
 
 
 class AttitudeController:

@@ -11,7 +11,7 @@ from crazysim.errors import require, short_repr
 from crazysim.storage import read_text, write_file
 from crazysim.tables import MAX_NUMBER, read_floats
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.polynomials import trajectory_from_rows, trajectory_rows
+from crazysim.trajectories.files.polynomials import check_rows, trajectory_rows
 from crazysim.trajectories.interpolation import unit_coefficients
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory
@@ -35,11 +35,11 @@ def load_csv(path: str | Path) -> Trajectory:
     Raises:
         ConfigError: If the file does not exist, or a row is invalid.
     """
-    rows = _parse_table(read_text(path, checks.MAX_FILE_BYTES).splitlines(), str(path))
-    return trajectory_from_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
+    rows = parse_table(read_text(path, checks.MAX_FILE_BYTES).splitlines(), str(path))
+    return Trajectory.of_pieces(*check_rows(rows, str(path))) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
 
 
-def _parse_table(lines: list[str], location: str) -> NDArray:
+def parse_table(lines: list[str], location: str) -> NDArray:
     """Return the numbers in the lines. (n_rows, n_columns)"""
     rows: list[list[float]] = []
     for i, line in enumerate(lines, start=1):

@@ -59,15 +59,21 @@ def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Traj
     Raises:
         ConfigError: If the size is wrong, or a number is out of range.
     """
+    return Trajectory.of_pieces(*read_poly4d(content, location))
+
+
+def read_poly4d(content: bytes, location: str) -> tuple[NDArray, NDArray]:
+    """Return the durations and coefficients of uncompressed polynomials, as ``check_rows`` does."""
     size = 4 * POLY4D_FLOATS
     if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
         checks.raise_error(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", location)
-    rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
-    return trajectory_from_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], location)
+    with np.errstate(invalid="ignore"):  # NaN is refused below
+        rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
+    return check_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], location)
 
 
-def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
-    """Return the trajectory of rows in the format of ``trajectory_rows``.
+def check_rows(rows: NDArray, location: str) -> tuple[NDArray, NDArray]:
+    """Return the durations, s, (n_pieces,), and the coefficients, (n_pieces, 3 or 4, 8), of rows, after a check.
 
     Args:
         rows: Duration, s, and coefficients of x, y, z, m, and yaw, rad, for the time in seconds. (n_pieces, 33), or
@@ -90,7 +96,7 @@ def trajectory_from_rows(rows: NDArray, location: str) -> Trajectory:
         checks.raise_error(
             f"coordinates up to {checks.MAX_COORDINATE:g}", f"{magnitudes[k].max():g}", f"{location}, piece {k}"
         )
-    return Trajectory.of_pieces(durations, c)
+    return durations, c
 
 
 def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
@@ -162,8 +168,19 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
     Raises:
         ConfigError: If the contents end within a piece, have no piece, or are too long.
     """
+    durations, pieces, _ = read_compressed(content, location)
+    if not len(pieces):
+        checks.raise_error(f"pieces of up to {checks.MAX_TIME:g} s in all", "none", location)
+    return trajectory_from_unit_pieces(durations, pieces)
+
+
+def read_compressed(content: bytes, location: str) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the pieces of compressed polynomials, and the point at which they start, m and rad. (4,)
+
+    The pieces are their durations, s, (n_pieces,), and coefficients for unit time, (n_pieces, 4, 8).
+    """
     try:
-        points = np.array(struct.unpack_from("<hhhh", content), float)
+        points = start = np.array(struct.unpack_from("<hhhh", content), float)
         offset, durations, pieces = 8, [], []
         while offset < len(content):
             header, duration = struct.unpack_from("<BH", content, offset)
@@ -186,11 +203,10 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
     except struct.error:
         checks.raise_error("complete pieces", f"{len(content)} bytes that end within one", location)
     ends = DURATION_UNIT * np.cumsum(durations)
-    if not pieces or ends[-1] > checks.MAX_TIME:
-        checks.raise_error(
-            f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", location
-        )
-    return trajectory_from_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * AXIS_UNITS[:, None])
+    if pieces and ends[-1] > checks.MAX_TIME:
+        checks.raise_error(f"pieces of up to {checks.MAX_TIME:g} s in all", "longer ones", location)
+    coefficients = np.reshape(pieces, (-1, 4, 8)) * AXIS_UNITS[:, None]
+    return np.diff(ends, prepend=0.0), coefficients, start * AXIS_UNITS
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:

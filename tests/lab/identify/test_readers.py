@@ -25,7 +25,8 @@ from log_files import (
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
-from crazysim.lab.identify.readers import Stream, decompress_quat, resample
+from crazysim.lab.identify.readers import Stream, resample
+from crazysim.lab.live.attitude import decompress_quat
 
 
 @pytest.mark.parametrize("version", [1, 2])

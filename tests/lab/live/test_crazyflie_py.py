@@ -212,9 +212,9 @@ def test_a_configuration_sets_names_and_positions(tmp_path):
 
 def test_wrong_files(tmp_path):
     (tmp_path / "a.csv").write_text("x\n1,2,3\n")
-    with pytest.raises(ConfigError, match="33 numbers"):
+    with pytest.raises(ConfigError, match="33 columns"):
         Trajectory().loadcsv(tmp_path / "a.csv")
-    with pytest.raises(ConfigError, match="positive durations"):
+    with pytest.raises(ConfigError, match="durations of at least"):
         Trajectory().loadcsv(write_csv(tmp_path / "b.csv", [0.0], [0.0]))
     with pytest.raises(ConfigError, match="got 0 pieces"):
         Trajectory().host_trajectory()

@@ -14,8 +14,8 @@ from waiting import wait_for
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
 from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import decompress_quat
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
-from crazysim.lab.live.crtp.setpoints import unpack_quat
 from crazysim.lab.live.crtp.tables import LOG_TYPES, LOG_VARIABLES, Table, Variable, pack_number
 from crazysim.lab.live.swarm import DroneState, Swarm
 from crazysim.plugins.estimators import Kalman
@@ -405,7 +405,7 @@ def test_quaternions_are_unpacked_as_cflib_packs_them():
     rng = np.random.default_rng(0)
     for quat in rng.normal(size=(50, 4)):
         quat = quat / np.linalg.norm(quat)
-        unpacked = unpack_quat(compress_quaternion(quat))
+        unpacked = decompress_quat(np.array([compress_quaternion(quat)]))[0]
         assert abs(unpacked @ quat) > 1 - 1e-5
 
 

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError, require
+from crazysim.errors import require
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.storage import MAX_TEXT_BYTES, read_text
+from crazysim.trajectories.files.csv import parse_table
+from crazysim.trajectories.files.polynomials import check_rows
 
 
 class Polynomial:
@@ -72,20 +74,14 @@ class Trajectory:
         Raises:
             ConfigError: If the file has another format.
         """
-        try:
-            lines = read_text(filename, MAX_TEXT_BYTES).splitlines()
-            rows = np.loadtxt(lines, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
-        except ValueError as error:
-            raise ConfigError(f"expected rows of 33 numbers in {str(filename)!r}, got: {error}") from error
-        require(
-            len(rows) and np.isfinite(rows).all() and (rows[:, 0] > 0).all(),
-            f"expected finite numbers and positive durations in {str(filename)!r}",
-        )
-        parts = [[Polynomial(row[1 + 8 * k : 9 + 8 * k]) for k in range(4)] for row in rows]
+        rows = parse_table(read_text(filename, MAX_TEXT_BYTES).splitlines()[int(skip_first_row) :], str(filename))
+        require(rows.shape[1] == 33, f"expected rows of 33 numbers in {str(filename)!r}, got {rows.shape[1]}")
+        durations, coefficients = check_rows(rows, str(filename))
         self.polynomials = [
-            Polynomial4D(float(row[0]), *polynomials) for row, polynomials in zip(rows, parts, strict=True)
+            Polynomial4D(float(duration), *map(Polynomial, piece))
+            for duration, piece in zip(durations, coefficients, strict=True)
         ]
-        self.duration = float(rows[:, 0].sum())
+        self.duration = float(durations.sum())
 
     def n_pieces(self) -> int:
         """Return the number of pieces."""
@@ -112,5 +108,4 @@ class Trajectory:
             n and np.isfinite(coefficients).all() and (durations > 0).all() and np.isfinite(durations).all(),
             f"expected pieces of finite coefficients and positive durations, got {len(pieces)} pieces",
         )
-        scaled_coefficients = coefficients * durations[:, None, None] ** np.arange(n)
-        return HostTrajectory(np.cumsum(durations), scaled_coefficients, repeats=False)
+        return HostTrajectory.of_pieces(durations, coefficients)

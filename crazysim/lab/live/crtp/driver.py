@@ -6,7 +6,7 @@ import queue
 from typing import Any
 from urllib.parse import urlparse
 
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError, optional_import
 from crazysim.lab.live.crtp.device import CrtpDevice
 from crazysim.lab.live.swarm import Swarm
 
@@ -22,10 +22,8 @@ def add_cflib_driver(swarm: Swarm) -> list[str]:
     Raises:
         ConfigError: If cflib is not installed.
     """
-    try:
+    with optional_import("links of cflib need", "cflib", "radio", ConfigError):
         import cflib.crtp
-    except ImportError as error:
-        raise ConfigError(not_installed("links of cflib need", "cflib", "radio")) from error
     remove_cflib_driver(swarm)
     _driver_classes[id(swarm)] = _create_driver(swarm)
     cflib.crtp.CLASSES.insert(0, _driver_classes[id(swarm)])

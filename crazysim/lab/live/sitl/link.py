@@ -85,6 +85,24 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
     read_numbers("port", port, range_between(min_port, MAX_PORT), ((),), whole=True)
 
 
+def bind_socket(kind: socket.SocketKind, host: str, port: int) -> socket.socket:
+    """Return a socket that is bound to a port of this machine.
+
+    Raises:
+        ConfigError: If the port has no valid number, or is in use.
+    """
+    check_address(host, port)
+    bound_socket = socket.socket(socket.AF_INET, kind)
+    if kind == socket.SOCK_STREAM:
+        bound_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound_socket.bind((host, port))
+    except OSError as error:
+        bound_socket.close()
+        raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
+    return bound_socket
+
+
 class Datagrams(Closeable):
     """UDP socket that sends to one address, and receives the newest packet."""
 
@@ -94,15 +112,9 @@ class Datagrams(Closeable):
         Raises:
             ConfigError: If the port has no valid number, or is in use.
         """
-        check_address(host, port)
+        self._socket = bind_socket(socket.SOCK_DGRAM, host, port)
         self._host = host
         self._sender: tuple[str, int] | None = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind((host, port))
-        except OSError as error:
-            self._socket.close()
-            raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
 
     def send(self, packet: bytes, port: int) -> None:
         """Send a packet, which is lost if no program listens."""

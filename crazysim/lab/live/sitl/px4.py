@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, not_installed
-from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, FirmwareLink, check_address
+from crazysim.errors import ConfigError, optional_import
+from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, FirmwareLink, bind_socket
 from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, check_origin, to_frd, to_ned, to_ned_quat
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
@@ -64,21 +64,12 @@ class Px4(FirmwareLink):
         Raises:
             ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
         """
-        try:
+        with optional_import("links to PX4 need", "pymavlink", "mavlink", ConfigError):
             from pymavlink.dialects.v20 import common
-        except ImportError as error:
-            raise ConfigError(not_installed("links to PX4 need", "pymavlink", "mavlink")) from error
         self._mavlink: Any = common
-        check_address(host, port)
         self.origin = check_origin(origin)
         self.connect_timeout = read_number("connect_timeout", connect_timeout, TIMEOUT_RANGE)
-        self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._server.bind((host, port))
-        except OSError as error:
-            self._server.close()
-            raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
+        self._server = bind_socket(socket.SOCK_STREAM, host, port)
         self._server.listen(1)
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)

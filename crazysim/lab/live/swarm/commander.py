@@ -409,8 +409,7 @@ def _check_numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COOR
 
 def _check_duration(value: float) -> float:
     (value,) = _check_numbers("duration", [value], 1, MAX_DURATION)
-    if value < MIN_DURATION:
-        raise ConfigError(f"expected a positive duration of at least {MIN_DURATION:g} s, got {value} s")
+    require(value >= MIN_DURATION, f"expected a positive duration of at least {MIN_DURATION:g} s, got {value} s")
     return value
 
 
