@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.eager import fetch_rows, jit_eager_calls
@@ -106,7 +106,7 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
     return mocap_pos, mocap_quat, qpos
 
 
-def host_poses(data: SimData, worlds: NDArray, poses: tuple[ArrayLike, ...]) -> tuple[NDArray, NDArray]:
+def host_poses(data: SimData, worlds: NDArray, poses: tuple[NDArray, ...]) -> tuple[NDArray, NDArray]:
     """Return mocap poses as ``with_data_poses``, in NumPy: m (n, n_mocap, 3), and wxyz (n, n_mocap, 4)."""
     mocap_pos, mocap_quat = (np.array(x, float) for x in poses[:2])
     for ids, pos, quat in poses_of(data):
@@ -125,7 +125,7 @@ def update_poses(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
 def sync_one_world(
     data: SimData,
     world: int,
-    poses: tuple[ArrayLike, ArrayLike, ArrayLike],
+    poses: tuple[NDArray, NDArray, NDArray],
     mj_model: mujoco.MjModel,
     mj_data: mujoco.MjData,
 ) -> None:

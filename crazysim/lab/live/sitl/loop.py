@@ -225,13 +225,13 @@ class SoftwareInTheLoop(Closeable):
         return np.where(rotor_commands > 0, speeds, 0.0)
 
 
-def _check_links(links: Any) -> tuple[FirmwareLink, ...]:
+def _check_links(links: object) -> tuple[FirmwareLink, ...]:
     """Check links to firmware, and return them as a tuple."""
     sequence = (links,) if isinstance(links, FirmwareLink) else links
-    require(
-        isinstance(sequence, Sequence) and all(isinstance(link, FirmwareLink) for link in sequence),
-        f"expected a link to firmware or a list of them, got {short_repr(links)}. Use ArduPilot(), say.",
-    )
+    if not isinstance(sequence, Sequence) or not all(isinstance(link, FirmwareLink) for link in sequence):
+        raise ConfigError(
+            f"expected a link to firmware or a list of them, got {short_repr(links)}. Use ArduPilot(), say."
+        )
     require(
         len(set(map(id, sequence))) == len(sequence),
         f"expected one link for each of {len(sequence)} drones, got one twice. Create each with its own ports.",
