@@ -10,21 +10,21 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 1165,
+    "commands": 1164,
     "control": 1987,
     "core": 1571,
     "crazysim": 828,
     "drones": 514,
     "dynamics": 576,
     "engine": 6745,
-    "envs": 3739,
+    "envs": 3738,
     "geometry": 1089,
-    "lab": 9751,
-    "media": 986,
+    "lab": 9697,
+    "media": 967,
     "plugins": 7345,
     "scene": 3089,
-    "sim": 1225,
-    "train": 2438,
+    "sim": 1224,
+    "train": 2437,
     "trajectories": 1385,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
