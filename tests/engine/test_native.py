@@ -397,7 +397,12 @@ def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
 
 @pytest.mark.parametrize(
     ("end_signal", "mode"),
-    [(signal.SIGKILL, "threads"), (signal.SIGTERM, "slow"), (signal.SIGINT, "slow"), (signal.SIGINT, "threads")],
+    [
+        (signal.SIGKILL, "threads"),
+        (signal.SIGTERM, "slow"),
+        (signal.SIGINT, "threads"),
+        pytest.param(signal.SIGINT, "slow", marks=pytest.mark.slow("the case of threads interrupts the compiler too")),
+    ],
 )
 def test_compilers_end_with_their_process(tmp_path, end_signal, mode):
     with compile_in_another_process(tmp_path, mode) as process:
