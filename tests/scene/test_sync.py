@@ -49,7 +49,10 @@ DERIVED = (
 """Fields of MuJoCo's data that a sync computes from the poses."""
 
 
-@pytest.fixture(scope="module", params=["", '<joint type="hinge"/>'], ids=["fixed", "joint"])
+JOINT = '<joint type="hinge"/>'
+
+
+@pytest.fixture(scope="module", params=["", JOINT], ids=["fixed", "joint"])
 def sim(request):
     """Return three worlds with two drones and a tower, all at random poses, and a shelf; mjx_data moves the tower."""
     sim = Sim(n_worlds=3, n_drones=2)
@@ -137,6 +140,7 @@ def test_a_sync_only_sets_the_flag_in_the_data(sim, synced_data):
 
 
 @pytest.mark.long("compiles MJX's kinematics and contacts in a scan")
+@pytest.mark.parametrize("sim", [JOINT], ids=["joint"], indirect=True)
 def test_a_sync_works_in_jit_and_scan(sim, synced_data):
     """In jit and scan a sync has the same result, so that rollouts may query contacts at every step."""
 
