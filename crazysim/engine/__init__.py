@@ -10,7 +10,7 @@ from crazysim.engine.pair_reductions import reduce_over_others
 from crazysim.engine.pytree import Members, PyTree, leaf, leaf_indices, scopes, static
 from crazysim.engine.record import Record, Roles
 from crazysim.engine.sharding import shard, world_mesh
-from crazysim.engine.stage import stage
+from crazysim.engine.stage import stage, vmap_drones
 from crazysim.startup import lazy_getattr
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ __all__ = [
     "shard",
     "stage",
     "static",
+    "vmap_drones",
     "world_mesh",
 ]
 
