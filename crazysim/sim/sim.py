@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Step, explain
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.jaxcompat import require_unforked_process
-from crazysim.engine.pytree import device_array
+from crazysim.engine.pytree import device_array, n_batch_axes, scopes
 from crazysim.engine.sharding import shard
 from crazysim.errors import ConfigError
 from crazysim.plugins.plugin_registry import P, PluginRegistry
@@ -348,9 +349,14 @@ class Sim:
                 self._seed, c.controller,
             )  # fmt: skip
 
-        world_bytes = tree_bytes(create(2)) - tree_bytes(create(1))  # without what all worlds share
-        what, n_devices = f"n_worlds={c.n_worlds}, before and after a step", getattr(self.mesh, "size", 1)
-        require_memory(what, 2 * c.n_worlds * world_bytes, "Use fewer worlds.", self.device, n_devices)
+        if c.n_worlds * c.n_drones > 2**20:  # fewer take less than a gigabyte
+            world_bytes = 0
+            with suppress(ConfigError):  # one number per drone of all worlds does not fit one world
+                one_world = create(1)
+                is_batched = jax.tree.map(n_batch_axes, scopes(one_world))
+                world_bytes = tree_bytes(jax.tree.map(lambda x, n: x if n else None, one_world, is_batched))
+            what, n_devices = f"n_worlds={c.n_worlds}, before and after a step", getattr(self.mesh, "size", 1)
+            require_memory(what, 2 * c.n_worlds * world_bytes, "Use fewer worlds.", self.device, n_devices)
         data = create(c.n_worlds)
         self._stepper.assign(data.replace(objects=self._scene.objects(None)))
         self.plugins.build_records()
