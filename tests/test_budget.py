@@ -23,7 +23,7 @@ BUDGET = {
     "media": 967,
     "plugins": 7345,
     "scene": 3090,
-    "sim": 1224,
+    "sim": 1230,
     "train": 2437,
     "trajectories": 1393,
 }
