@@ -392,7 +392,7 @@ def test_the_engine_runs_without_functions_that_jax_may_remove():
             " or commands_to_flattened")  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *tests, "-k", chosen, "-n", "0"],
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
         env={k: v for k, v in os.environ.items() if "PYTEST" not in k} | {"CRAZYSIM_JAX_FALLBACKS": "1"},
         capture_output=True,
         text=True,
