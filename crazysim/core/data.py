@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from crazysim.arguments import require_memory, tree_bytes
 from crazysim.control import Control, Controller, command_size
 from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, max_n_rotors
 from crazysim.core.controls import SimControls
@@ -27,6 +29,7 @@ from crazysim.engine.pytree import (
     host_array,
     leaf,
     leaf_indices,
+    n_batch_axes,
     scopes,
     static,
     watched_flags,
@@ -365,3 +368,18 @@ def grid_2d(n: int, spacing: float = 1.0, center: ArrayLike = (0.0, 0.0)) -> np.
     x, y = np.meshgrid(line, line)
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
     return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]] + np.asarray(center)
+
+
+def require_memory_of_worlds(
+    create: Callable[[int], SimData], n_worlds: int, n_drones: int, device: jax.Device, n_devices: int
+) -> None:
+    """Check that data before and after a step fits into the memory; ``create`` makes the data of some worlds."""
+    if n_worlds * n_drones <= 2**20:  # less than a gigabyte
+        return
+    world_bytes = 0
+    with suppress(ConfigError):  # one number per drone of all worlds does not fit one world
+        one_world = create(1)
+        is_batched = jax.tree.map(n_batch_axes, scopes(one_world))
+        world_bytes = tree_bytes(jax.tree.map(lambda x, n: x if n else None, one_world, is_batched))
+    what = f"n_worlds={n_worlds}, before and after a step"
+    require_memory(what, 2 * n_worlds * world_bytes, "Use fewer worlds.", device, n_devices)

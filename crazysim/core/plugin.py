@@ -471,7 +471,11 @@ class Plugin(PyTree):
         Args:
             sim: The simulation that the plugin is being added to.
         """
-        return self.bind(sim) if self.has_arrays() else None
+        if not self.has_arrays():
+            return None
+        remedy = "Return self.with_arrays(sim, ...) there."
+        expect((bound := self.bind(sim)) is not None, f"the plugin from {type(self).__name__}.bind", bound, remedy)
+        return bound
 
     def default_record(self, sim: Simulation) -> PyTree | None:
         """Return the record that resets restore; by default the result of ``record``."""

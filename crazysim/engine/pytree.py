@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, dataclass_transform, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, expect
 
 Scope = Literal["drone", "member", "world", "batch", "shared", "opaque", "parameter"]
 """Scope of a leaf as a field declares it; see ``leaf``."""
@@ -54,6 +54,7 @@ def leaf(
         airframe: Dotted path or function of the airframe that gives the value, in ``AirframeParams``.
         default: Default value of the field.
     """
+    expect(scope in get_args(Scope), f"a scope, one of {', '.join(get_args(Scope))}", scope)
     metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}
     return dataclasses.field(default=default, metadata=metadata | {"airframe": airframe})
 

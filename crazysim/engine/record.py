@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.engine.pytree import PyTree
+from crazysim.engine.pytree import PyTree, check_axes
 from crazysim.errors import ConfigError, short_repr
 
 MAX_STEPS = 2**31 - 1
@@ -38,11 +38,14 @@ class Record(PyTree):
 
     def roles(self) -> Roles:
         """Return the leaves with a role; leaves may be arrays, or their shapes and types."""
-        raise NotImplementedError
+        raise ConfigError(
+            f"expected the roles of leaves of {type(self).__name__}, got none. Define roles(self), as in 'The engine'."
+        )
 
     def check(self) -> None:
         """Raise an error for values that no step accepts. It is called once for each structure."""
         require_arrays(self)
+        check_axes(self, len(jax.tree.leaves(self)[self.roles().clock]), 0)
 
     def without_sizes(self) -> Self:
         """Return the record with equal static fields for any number of worlds and members.

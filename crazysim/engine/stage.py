@@ -179,6 +179,7 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     A function without a declared scope receives the full batch. The integration holds drones on the ground at which a
     stage of this pipeline stops them.
     """
+    expect(isinstance(pipeline, Mapping), "stages as a dict by name", pipeline, "Use {'swing': swing}, say.")
     ground = next((fn.ground for fn in pipeline.values() if isinstance(fn, Stage) and fn.ground is not None), None)
     return [
         Stage(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +14,12 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.arguments import check_arguments, check_flag, require_memory, tree_bytes
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
 from crazysim.core.airframes import AirframeSource, drone_names, find_common_airframe
-from crazysim.core.data import SimData, as_key, object_names
+from crazysim.core.data import SimData, as_key, object_names, require_memory_of_worlds
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import BuiltPipeline, Pipeline
 from crazysim.core.plugin import Plugin, check_plugin_list
@@ -33,7 +32,7 @@ from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Step, explain
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.jaxcompat import require_unforked_process
-from crazysim.engine.pytree import device_array, n_batch_axes, scopes
+from crazysim.engine.pytree import device_array
 from crazysim.engine.sharding import shard
 from crazysim.errors import ConfigError
 from crazysim.plugins.plugin_registry import P, PluginRegistry
@@ -349,14 +348,7 @@ class Sim:
                 self._seed, c.controller,
             )  # fmt: skip
 
-        if c.n_worlds * c.n_drones > 2**20:  # fewer take less than a gigabyte
-            world_bytes = 0
-            with suppress(ConfigError):  # one number per drone of all worlds does not fit one world
-                one_world = create(1)
-                is_batched = jax.tree.map(n_batch_axes, scopes(one_world))
-                world_bytes = tree_bytes(jax.tree.map(lambda x, n: x if n else None, one_world, is_batched))
-            what, n_devices = f"n_worlds={c.n_worlds}, before and after a step", getattr(self.mesh, "size", 1)
-            require_memory(what, 2 * c.n_worlds * world_bytes, "Use fewer worlds.", self.device, n_devices)
+        require_memory_of_worlds(create, c.n_worlds, c.n_drones, self.device, getattr(self.mesh, "size", 1))
         data = create(c.n_worlds)
         self._stepper.assign(data.replace(objects=self._scene.objects(None)))
         self.plugins.build_records()

@@ -655,3 +655,17 @@ def test_arrays_of_declared_settings_become_tuples_and_other_arrays_are_refused(
     assert record.table == ((1, 2),)
     with pytest.raises(ConfigError, match=r"table of Discs to be hashable.*param\("):
         sim.add(Discs(table=np.ones(2), name="others"))
+
+
+def test_law_09_a_bind_without_a_result_is_named():
+    class Forgetful(Plugin):
+        number: Param = param(default=0.1)
+        name: str = "forgetful"
+
+        def bind(self, sim):
+            self.with_arrays(sim)
+
+    with pytest.raises(
+        ConfigError, match=r"expected the plugin from Forgetful.bind, got None. Return self.with_arrays"
+    ):
+        Sim(plugins=[Forgetful()])

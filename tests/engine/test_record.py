@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim.engine import Step, explain
-from crazysim.engine.pytree import Members, check_axes, leaf, leaf_indices
+from crazysim.engine.pytree import Members, leaf, leaf_indices
 from crazysim.engine.record import Record, Roles, nonfinite_worlds
 from crazysim.engine.stage import stage
 from crazysim.errors import ConfigError
@@ -40,9 +40,6 @@ class Workshop(Record):
         indices = leaf_indices(self)
         watched = {indices.pendulums.angle: True, indices.pendulums.rate: True, indices.sparks.heat: False}
         return Roles("pendulums", indices.ticks, indices.is_broken, watched)
-
-    def check(self):
-        check_axes(self, len(self.ticks), 0)
 
 
 def make_workshop(n_worlds=3, n_pendulums=2, n_sparks=3):
@@ -147,3 +144,30 @@ def test_only_records_are_stepped():
     not_a_record: Any = (jnp.zeros(3),)
     with pytest.raises(ConfigError, match=r"Use sim\.data"):
         Step(PIPELINE)(not_a_record)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("angle", jnp.zeros((3, 1)), r"pendulums.angle has shape \(3, 1\)"),
+        ("angle", jnp.zeros((2, 2)), r"pendulums.angle has shape \(2, 2\)"),
+        ("length", jnp.ones((3, 1)), r"pendulums.length has shape \(3, 1\)"),
+        ("length", jnp.ones(2), r"pendulums.length has shape \(2,\)"),
+    ],
+)
+def test_law_02_shapes_that_kernels_would_misread_are_refused(name, value, message):
+    data = make_workshop()
+    with pytest.raises(ConfigError, match=message):
+        Step(PIPELINE)(data.replace(pendulums=data.pendulums.replace(**{name: value})), 1)
+
+
+def test_law_09_records_stages_and_scopes_that_are_incomplete_are_named():
+    class Bare(Record):
+        x: jax.Array = leaf("world")
+
+    with pytest.raises(ConfigError, match=r"expected the roles of leaves of Bare.*Define roles"):
+        Step({"tick": tick})(Bare(jnp.zeros((3, 1))), 1)
+    with pytest.raises(ConfigError, match="expected stages as a dict by name"):
+        Step([swing])
+    with pytest.raises(ConfigError, match=r"expected a scope, one of drone, member.*got 'membr'"):
+        leaf("membr")

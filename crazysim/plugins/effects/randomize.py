@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Param, Plugin, Simulation, check_parameter, derived, drone_array, param, state
 from crazysim.core.random import drone_key, uniform
+from crazysim.core.settings import Setting
 from crazysim.engine.pytree import CORE_NDIM_KEY, Members, PyTree
-from crazysim.errors import ConfigError, require, short_repr
+from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
-from crazysim.tables import NOT_NEGATIVE, range_between, read_number
+from crazysim.tables import NOT_NEGATIVE, range_between, read_number, read_numbers
 
 FACTOR_PATHS = {
     "mass": "params.mass",
@@ -235,6 +236,14 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
                 f"{'a state, a whole number, or one for all drones' if path in numbers else 'none'}. Near are "
                 f"{', '.join(dict.fromkeys(names)) or 'none'}."
             )
+        bound = sim.data.plugins[self.name]
+        for k, path in enumerate(bound.paths or ()):
+            (metadata, x), limits = numbers[path], np.asarray(bound.limits[..., k, :])
+            remedy = "Use another value there, or leave out the path."
+            expect(np.any(np.asarray(x)), f"a number other than zero at {path!r}, for factors", np.asarray(x), remedy)
+            declared = metadata.get("setting", Setting())
+            for factor in (limits[..., 0].min(), limits[..., 1].max()):
+                read_numbers(f"{path} times {factor:g}", factor * np.asarray(x), declared.range)
 
     @property
     def _max_delay(self) -> int:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.errors import expect
 
 Changes = dict[str, Any]
 """New values of fields of a sensor, by name."""
@@ -48,6 +49,13 @@ class White(Link):
     deviation: str
     """Standard deviation."""
     n_step = 1
+
+    def __post_init__(self) -> None:
+        """Check that fields are names, not the numbers themselves."""
+        for x in vars(self).values():
+            expect(
+                isinstance(x, str), f"names of the sensor's fields in {type(self).__name__}", x, "Use White('noise')."
+            )
 
     def step(self, sensor: Any, x: Array, noise: Array, dt: float) -> tuple[Array, Changes]:
         return x + getattr(sensor, self.deviation) * noise, {}

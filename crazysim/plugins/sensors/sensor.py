@@ -20,7 +20,7 @@ from crazysim.core.random import drone_key, normal, uniform
 from crazysim.core.settings import default_rates, dividing_rate, setting
 from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import is_tick
-from crazysim.errors import ConfigError, require
+from crazysim.errors import ConfigError, expect, require
 from crazysim.plugins.sensors.errors import Link
 from crazysim.tables import range_between
 
@@ -138,11 +138,22 @@ class Sensor(Plugin):
     def first_samples(self, sim: Simulation) -> Samples:
         """Return ``samples`` before the first measurement; check the common settings."""
         if not self.channels:
-            raise NotImplementedError(f"{type(self).__name__} needs channels, such as channels = {{'pos': 3}}")
+            raise ConfigError(
+                f"expected channels of {type(self).__name__}, got none. Use channels = {{'pos': 3}}, say."
+            )
         require(
             self.chains.keys() <= self.channels.keys(),
             f"expected chains of {self.name!r} for channels {', '.join(self.channels)}, got {', '.join(self.chains)}",
         )
+        for name, chain in self.chains.items():
+            is_chain = isinstance(chain, (list, tuple)) and all(isinstance(link, Link) for link in chain)
+            expect(is_chain, f"the chain of {name!r} as a tuple of errors", chain, "Use (White('noise'),), say.")
+            names = [x for link in chain for x in vars(link).values() if isinstance(x, str)]
+            missing = next((x for x in names if not hasattr(self, x)), None)
+            remedy = (
+                f"Add {missing}: Param = param(default=0.1) or {missing}: Array = state() to {type(self).__name__}."
+            )
+            expect(missing is None, f"a number or a state in the chain of {name!r}", missing, remedy)
         freq = self.rate(sim.data.core.freq)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * freq + 0.5) + 2 if max_delay > 0 else 0

@@ -430,7 +430,8 @@ def test_a_filter_assumes_nominal_numbers():
     ({"params.mass": None}, "params.mass"),
     ({3: 0.2}, "got '3'"),
     (("params.mass", 0.2), "paths of Randomize"),
+    ({"plugins.battery.efficiency": (1.5, 2.0)}, r"plugins\.battery\.efficiency times 1\.5 to be .*, got"),
 ])  # fmt: skip
 def test_law_09_paths_that_are_no_numbers_of_drones_are_errors(paths, message):
     with pytest.raises(ConfigError, match=message):
-        fly([Randomize(paths)]).step()
+        fly([Randomize(paths), *([Battery()] if "efficiency" in str(paths) else [])]).step()

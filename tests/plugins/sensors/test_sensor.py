@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim
-from crazysim.plugins.sensors import Barometer, Camera, Sensor
+from crazysim.plugins.sensors import Barometer, Camera, Sensor, White
 
 
 class Clock(Sensor):
@@ -126,7 +126,7 @@ def test_a_sensor_without_channels_is_an_error_that_names_it():
     class Incomplete(Sensor):
         """Defines nothing."""
 
-    with pytest.raises(NotImplementedError, match="Incomplete needs channels"):
+    with pytest.raises(ConfigError, match="expected channels of Incomplete, got none. Use channels"):
         Sim().add(Incomplete())
 
 
@@ -154,3 +154,20 @@ class Misspelt(Short):
 def test_law_09_truth_and_errors_fit_the_channels(kind, words):
     with pytest.raises(ConfigError, match=words):
         Sim(plugins=[kind()]).step()
+
+
+@pytest.mark.parametrize(
+    ("chain", "message"),
+    [
+        ([White("nois")], "expected a number or a state in the chain of 'step', got 'nois'. Add nois: Param"),
+        (White("delay"), r"expected the chain of 'step' as a tuple of errors.*Use \(White"),
+    ],
+)
+def test_law_09_a_chain_that_does_not_fit_its_sensor_is_named(chain, message):
+    class Noisy(Clock):
+        chains: ClassVar = {"step": chain}
+
+    with pytest.raises(ConfigError, match=message):
+        Sim(plugins=[Noisy()])
+    with pytest.raises(ConfigError, match=r"expected names of .*White, got 0\.1"):
+        White(0.1)
