@@ -126,7 +126,7 @@ def test_a_sensor_without_channels_is_an_error_that_names_it():
     class Incomplete(Sensor):
         """Defines nothing."""
 
-    with pytest.raises(ConfigError, match="expected channels of Incomplete, got none. Use channels"):
+    with pytest.raises(ConfigError, match="expected channels of Incomplete, got none"):
         Sim().add(Incomplete())
 
 
