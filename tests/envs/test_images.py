@@ -144,7 +144,7 @@ def test_law_09_wrong_images_are_refused():
         (lambda: make("hover", camera=["fpv_cam"], engine="interpret"), "expected camera as a list of plugins"),
         (lambda: CameraImages(base, Camera(freq=20)), "expected freq of 'camera' to divide freq = 50 Hz, got 20 Hz"),
         (lambda: CameraImages(CameraImages(base, Camera()), Camera(9, 7)), "got images 'camera.depth' twice"),
-        (lambda: CameraImages(base, Camera(200_000, 200_000)), "got 2 of 200000 x 200000 pixels, which need"),
+        (lambda: CameraImages(base, Camera(200_000, 200_000)), "got 2 images of 200000 x 200000 pixels, which need"),
     ]:
         with pytest.raises(ConfigError, match=message):
             call()
