@@ -18,8 +18,9 @@ from crazysim.engine.pair_reductions import reduce_over_others
 from crazysim.engine.pytree import Members, PyTree, leaf, static
 from crazysim.engine.stage import stage
 from crazysim.errors import ConfigError
+from crazysim.names import lazy_getattr
 from crazysim.sim.sim import Sim
-from crazysim.startup import __version__, lazy_getattr
+from crazysim.startup import __version__
 
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
@@ -125,51 +126,7 @@ __all__ = [
 
 set_xla_log_level()
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "Battery": "crazysim.plugins.effects",
-        "Bicycles": "crazysim.plugins.vehicles",
-        "Camera": "crazysim.plugins.sensors.camera",
-        "Cars": "crazysim.plugins.vehicles",
-        "Clutter": "crazysim.plugins.scenery",
-        "ContactLog": "crazysim.plugins.contacts.contact_log",
-        "ContactResponse": "crazysim.plugins.contacts.response",
-        "Downwash": "crazysim.plugins.effects",
-        "DroneCollisions": "crazysim.plugins.contacts.drone_collisions",
-        "ESKF": "crazysim.plugins.estimators.eskf",
-        "Follow": "crazysim.plugins.follow",
-        "Forest": "crazysim.plugins.scenery",
-        "FreeBodies": "crazysim.plugins.bodies",
-        "functional": "crazysim.core",
-        "Gates": "crazysim.plugins.scenery",
-        "GroundEffect": "crazysim.plugins.effects",
-        "Hook": "crazysim.plugins.payloads",
-        "IMU": "crazysim.plugins.sensors.imu",
-        "Kalman": "crazysim.plugins.estimators.kalman",
-        "Latency": "crazysim.plugins.effects",
-        "Lidar": "crazysim.plugins.sensors.lidar",
-        "make": "crazysim.envs",
-        "MotionCapture": "crazysim.plugins.sensors.motion_capture",
-        "MotorFailure": "crazysim.plugins.effects",
-        "MPPI": "crazysim.sim.mppi",
-        "Pillars": "crazysim.plugins.scenery",
-        "Radar": "crazysim.plugins.sensors.radar",
-        "Randomize": "crazysim.plugins.effects",
-        "RangeFinder": "crazysim.plugins.sensors.range_finder",
-        "Residual": "crazysim.plugins.effects",
-        "Rooms": "crazysim.plugins.scenery",
-        "RotorAerodynamics": "crazysim.plugins.effects",
-        "RotorJet": "crazysim.plugins.payloads",
-        "Sensor": "crazysim.plugins.sensors.sensor",
-        "SharedLoad": "crazysim.plugins.payloads",
-        "SlungLoad": "crazysim.plugins.payloads",
-        "SplatScene": "crazysim.scene.splats",
-        "Terrain": "crazysim.plugins.contacts.terrain",
-        "Wind": "crazysim.plugins.effects",
-        "WindField": "crazysim.plugins.effects",
-    },
-)
+__getattr__ = lazy_getattr(__name__)
 
 
 def __dir__() -> list[str]:

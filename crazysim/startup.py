@@ -1,4 +1,4 @@
-"""The import of crazysim: environment variables, JAX and MuJoCo, and names that are imported at their first use.
+"""The import of crazysim: environment variables, JAX and MuJoCo.
 
 JAX and MuJoCo read environment variables when they are imported, so these variables are set first.
 
@@ -18,8 +18,6 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any
 
 __version__ = "0.2.0"
 """The version of the package; ``pyproject.toml`` says the same."""
@@ -90,22 +88,6 @@ def import_required_packages() -> None:
                 print(f"crazysim: {text}", file=sys.stderr)
                 sys.exit(2)
             raise ImportError(text, name=name) from error
-
-
-def lazy_getattr(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a ``__getattr__`` for a package that imports some of its names at their first use.
-
-    Args:
-        module: Name of the package, ``__name__``.
-        names: Module that holds each name.
-    """
-
-    def import_name(name: str) -> Any:
-        if name not in names:
-            raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(names[name]), name)
-
-    return import_name
 
 
 set_variables()

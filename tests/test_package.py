@@ -16,6 +16,7 @@ import yaml
 from lower_bounds import UNBOUNDED_EXTRAS, lower_bounds
 
 import crazysim
+from crazysim.names import NAMES
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -62,54 +63,27 @@ def test_a_star_import_needs_no_optional_package(module, monkeypatch):
     assert names.keys() >= set(sys.modules[module].__all__)
 
 
-ALIASES = {
-    "cache": ["engine.cache"],
-    "core.pair_reductions": ["engine.pair_reductions"],
-    "core.record": ["engine.record"],
-    "core.sharding": ["engine.sharding"],
-    "core.stage": ["engine.stage"],
-    "dynamics.parameters": ["dynamics.parameter_tables"],
-    "exception": ["errors"],
-    "jaxcompat": ["engine.jaxcompat"],
-    "pytree": ["engine.pytree"],
-    "sim.data": ["control", "core.controls", "core.data", "sim.crazyflow"],
-    "sim.dynamics": ["core.stages"],
-    "sim.functional": ["core.functional"],
-    "sim.integration": ["core.integration"],
-    "sim.pipeline": ["core.pipeline"],
-    "sim.sensors.depth": ["sim.crazyflow"],
-    "sim.sensors.splat": ["sim.crazyflow_splats"],
-    "sim.sharding": ["engine.sharding"],
-    "sim.splat": ["sim.crazyflow_splats"],
-    "utils": ["core.data", "engine.cache", "engine.pytree", "sim.crazyflow"],
-}
-"""Import paths of Crazyflow and former ones that only name what other modules define, and these modules."""
+def exported(module):
+    return [name for names in NAMES[module].values() for name in names.split()]
 
 
-def is_alias(statement):
-    """Return True for a docstring, an import, or the list of public names."""
-    if isinstance(statement, ast.Assign):
-        return [ast.unparse(target) for target in statement.targets] == ["__all__"]
-    is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-    return is_text or isinstance(statement, ast.ImportFrom)
+def imported_for_types(module):
+    """Yield the names that a package imports below ``if TYPE_CHECKING``."""
+    for node in ast.parse(Path(importlib.import_module(module).__file__).read_text()).body:
+        if isinstance(node, ast.If):
+            yield from ((x.asname or x.name, child.module) for child in node.body for x in child.names)
 
 
-def public_names(module):
-    return getattr(module, "__all__", [name for name in vars(module) if not name.startswith("_")])
-
-
-def test_other_import_paths_are_aliases_without_logic():
-    aliases = {}
-    for source in SOURCES:
-        statements = ast.parse(source.read_text()).body
-        origins = {x.module.removeprefix("crazysim.") for x in statements if isinstance(x, ast.ImportFrom)}
-        if source.name != "__init__.py" and all(map(is_alias, statements)):
-            aliases[".".join(source.relative_to(ROOT / "crazysim").with_suffix("").parts)] = sorted(origins)
-    assert aliases == ALIASES
-    for path, origins in ALIASES.items():
-        module = importlib.import_module(f"crazysim.{path}")
-        defined = [x for origin in origins for x in vars(importlib.import_module(f"crazysim.{origin}")).values()]
-        assert all(any(getattr(module, name) is x for x in defined) for name in public_names(module)), path
+@pytest.mark.parametrize("module", NAMES)
+def test_names_of_the_table_exist(module):
+    """Static checkers read another list, ``if TYPE_CHECKING``, which agrees. Some names need optional packages."""
+    package = importlib.import_module(module)
+    assert all(getattr(package, name) is not None for name in exported(module) if name in package.__all__)
+    assert not hasattr(package, "nothing")
+    if package.__spec__.has_location:
+        assert dict(imported_for_types(module)).keys() == set(exported(module))
+    else:
+        assert package.__all__ == exported(module)
 
 
 @pytest.mark.parametrize(
@@ -119,6 +93,7 @@ def test_other_import_paths_are_aliases_without_logic():
              "sim.splat.attach_splats", "sim.dynamics.so_rpy_rotor_drag_dynamics",
              "control.Control", "control.parameters.load_params", "dynamics.Dynamics",
              "dynamics.parameters.load_fn_params", "drones.Drone", "utils.leaf_replace", "utils.enable_cache",
+             "utils.CORE_NDIM_KEY",
              "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.CrazyflowError"],
 )  # fmt: skip
 def test_import_paths_of_crazyflow_exist(path):

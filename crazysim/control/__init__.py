@@ -17,7 +17,7 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.control.switch import Switch
 from crazysim.dynamics.models import AirframeParams
-from crazysim.startup import lazy_getattr
+from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.control.auto import Auto
@@ -61,23 +61,7 @@ __all__ = [
     "tracking_lqr_control",
 ]
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "Auto": "crazysim.control.auto",
-        "CFirmware": "crazysim.control.firmware",
-        "Geometric": "crazysim.control.geometric",
-        "INDI": "crazysim.control.indi",
-        "LQR": "crazysim.control.lqr",
-        "LoadLQR": "crazysim.control.load_lqr",
-        "TrackingLQR": "crazysim.control.tracking_lqr",
-        "geometric_control": "crazysim.control.geometric",
-        "indi_control": "crazysim.control.indi",
-        "load_lqr_control": "crazysim.control.load_lqr",
-        "lqr_control": "crazysim.control.lqr",
-        "tracking_lqr_control": "crazysim.control.tracking_lqr",
-    },
-)
+__getattr__ = lazy_getattr(__name__)
 
 
 def __dir__() -> list[str]:

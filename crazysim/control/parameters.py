@@ -9,7 +9,7 @@ from typing import Any
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.keys import TABLES
 from crazysim.dynamics.models import GRAVITY
-from crazysim.dynamics.parameter_tables import convert_arrays
+from crazysim.dynamics.parameters import convert_arrays
 from crazysim.errors import UnknownNameError, require
 
 CASCADE_NAME = "mellinger"

@@ -3,7 +3,7 @@
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.first_principles import hover_rotor_vel
 from crazysim.dynamics.models import Dynamics, supported_drones, supported_dynamics
-from crazysim.dynamics.parameter_tables import load_fn_params, load_params
+from crazysim.dynamics.parameters import load_fn_params, load_params
 
 __all__ = [
     "Dynamics",

@@ -11,7 +11,7 @@ from crazysim.engine.pytree import Members, PyTree, leaf, leaf_indices, scopes, 
 from crazysim.engine.record import Record, Roles
 from crazysim.engine.sharding import shard, world_mesh
 from crazysim.engine.stage import stage, vmap_drones
-from crazysim.startup import lazy_getattr
+from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.engine.plan import ENGINES
@@ -37,11 +37,4 @@ __all__ = [
     "world_mesh",
 ]
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "ENGINES": "crazysim.engine.plan",
-        "Step": "crazysim.engine.step",
-        "explain": "crazysim.engine.tools.explain",
-    },
-)
+__getattr__ = lazy_getattr(__name__)

@@ -32,7 +32,7 @@ from crazysim.envs.wrappers import (
     RewardTerms,
     Wrapper,
 )
-from crazysim.startup import lazy_getattr
+from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv
@@ -75,11 +75,4 @@ __all__ = [
     "uniform",
 ]
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "BraxEnv": "crazysim.envs.brax",
-        "DroneVecEnv": "crazysim.envs.sb3",
-        "make_parallel": "crazysim.envs.pettingzoo",
-    },
-)
+__getattr__ = lazy_getattr(__name__)

@@ -1,4 +1,4 @@
-"""Functions of Crazyflow's API that crazysim itself does not use; modules with Crazyflow's import paths export them."""
+"""Names of Crazyflow's API that crazysim itself does not use; its modules in ``crazysim.names`` export them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jax import Array
 
 from crazysim.core.controls import AttitudeControlData, BodyRateControlData, ForceTorqueControlData, StateControlData
 from crazysim.core.settings import as_mask
+from crazysim.core.stages import first_principles_derivative, fitted_derivative
 from crazysim.engine.pytree import PyTree, n_batch_axes, scopes, select_worlds
 from crazysim.errors import ConfigError
 from crazysim.sim.sim import Sim
@@ -20,6 +21,9 @@ Tree = TypeVar("Tree")
 
 ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
 """Record of a command level."""
+CrazyflowError = ConfigError
+first_principles_dynamics = first_principles_derivative
+so_rpy_dynamics = so_rpy_rotor_dynamics = so_rpy_rotor_drag_dynamics = fitted_derivative
 
 
 def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) -> Record:

@@ -1,4 +1,4 @@
-"""Functions of Crazyflow's API for Gaussian splats; modules with Crazyflow's import paths export them."""
+"""Functions of Crazyflow's API for Gaussian splats; its modules in ``crazysim.names`` export them."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from crazysim.core.data import SimData, SimState, as_key
 from crazysim.core.functional import stage_command
 from crazysim.core.settings import largest_divisor, positive_integer
 from crazysim.dynamics.models import GRAVITY
-from crazysim.dynamics.parameter_tables import rotor_vel_limits
+from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
 from crazysim.engine.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes

@@ -28,7 +28,7 @@ from crazysim.core.settings import positive_integer
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
-from crazysim.dynamics.parameter_tables import rotor_vel_limits
+from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step, explain
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.jaxcompat import require_unforked_process

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.startup import lazy_getattr
+from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.train.config import TrainConfig
@@ -25,17 +25,4 @@ __all__ = [
     "run_many",
 ]
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "Network": "crazysim.train.networks",
-        "TrainConfig": "crazysim.train.config",
-        "evaluate": "crazysim.train.evaluation",
-        "film": "crazysim.train.show",
-        "imitate": "crazysim.train.dagger",
-        "load_policy": "crazysim.train.training",
-        "plot_episode": "crazysim.train.show",
-        "run": "crazysim.train.runs",
-        "run_many": "crazysim.train.runs",
-    },
-)
+__getattr__ = lazy_getattr(__name__)

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.core.data import SimData, controls_of
+from crazysim.core.functional import attitude_control
 from crazysim.drones import Airframe, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.envs.actions import hover_rotor_states
 from crazysim.lab.validate.closed_forms import with_states
-from crazysim.sim.functional import attitude_control
 from crazysim.sim.sim import Sim
 
 AIRFRAME = "cf21B_500"

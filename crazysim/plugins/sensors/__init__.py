@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.startup import lazy_getattr
+from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer
@@ -55,37 +55,4 @@ __all__ = [
     "White",
 ]
 
-__getattr__ = lazy_getattr(
-    __name__,
-    {
-        "White": f"{__name__}.errors",
-        "Turned": f"{__name__}.errors",
-        "Rounded": f"{__name__}.errors",
-        "Link": f"{__name__}.errors",
-        "GaussMarkov": f"{__name__}.errors",
-        "Constant": f"{__name__}.errors",
-        "GPS": f"{__name__}.gps",
-        "IMU": f"{__name__}.imu",
-        "Barometer": f"{__name__}.barometer",
-        "BatteryVoltage": f"{__name__}.onboard",
-        "Camera": f"{__name__}.camera",
-        "Distortion": f"{__name__}.depth_errors",
-        "Lidar": f"{__name__}.lidar",
-        "StereoNoise": f"{__name__}.depth_errors",
-        "ImageData": f"{__name__}.image_sensor",
-        "ImageSensor": f"{__name__}.image_sensor",
-        "Lighthouse": f"{__name__}.beacons",
-        "Magnetometer": f"{__name__}.magnetometer",
-        "MotionCapture": f"{__name__}.motion_capture",
-        "MultiRanger": f"{__name__}.onboard",
-        "OpticalFlow": f"{__name__}.flow_deck",
-        "Radar": f"{__name__}.radar",
-        "RangeFinder": f"{__name__}.range_finder",
-        "RotorSpeeds": f"{__name__}.onboard",
-        "Samples": f"{__name__}.sensor",
-        "Sensor": f"{__name__}.sensor",
-        "TimeOfFlight": f"{__name__}.flow_deck",
-        "Triad": f"{__name__}.triad",
-        "UWB": f"{__name__}.beacons",
-    },
-)
+__getattr__ = lazy_getattr(__name__)

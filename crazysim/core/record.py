@@ -1,3 +1,0 @@
-"""The former path of ``crazysim.engine.record``."""
-
-from crazysim.engine.record import *  # noqa: F403

@@ -1,3 +1,0 @@
-"""The former path of ``crazysim.engine.jaxcompat``."""
-
-from crazysim.engine.jaxcompat import *  # noqa: F403

@@ -1,0 +1,155 @@
+"""Public names that are imported at their first use, and the modules that define them.
+
+The packages below import their names from here, so that ``import crazysim`` loads a few modules only. Names of the
+laboratory are public in the simulator's packages too: this table is the only module of the simulator that leads there.
+A module of the table without a file exists for its names alone, such as the modules of Crazyflow. It is made by the
+finder at the end.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import sys
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+NAMES: dict[str, dict[str, str]] = {
+    "crazysim": {
+        "crazysim.core": "functional",
+        "crazysim.envs": "make",
+        "crazysim.plugins.bodies": "FreeBodies",
+        "crazysim.plugins.contacts.contact_log": "ContactLog",
+        "crazysim.plugins.contacts.drone_collisions": "DroneCollisions",
+        "crazysim.plugins.contacts.response": "ContactResponse",
+        "crazysim.plugins.contacts.terrain": "Terrain",
+        "crazysim.plugins.effects": "Battery Downwash GroundEffect Latency MotorFailure Randomize Residual "
+        "RotorAerodynamics Wind WindField",
+        "crazysim.plugins.estimators.eskf": "ESKF",
+        "crazysim.plugins.estimators.kalman": "Kalman",
+        "crazysim.plugins.follow": "Follow",
+        "crazysim.plugins.payloads": "Hook RotorJet SharedLoad SlungLoad",
+        "crazysim.plugins.scenery": "Clutter Forest Gates Pillars Rooms",
+        "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture Radar RangeFinder Sensor",
+        "crazysim.plugins.vehicles": "Bicycles Cars",
+        "crazysim.scene.splats": "SplatScene",
+        "crazysim.sim.mppi": "MPPI",
+    },
+    "crazysim.control": {
+        "crazysim.control.auto": "Auto",
+        "crazysim.control.firmware": "CFirmware",
+        "crazysim.control.geometric": "Geometric geometric_control",
+        "crazysim.control.indi": "INDI indi_control",
+        "crazysim.control.load_lqr": "LoadLQR load_lqr_control",
+        "crazysim.control.lqr": "LQR lqr_control",
+        "crazysim.control.tracking_lqr": "TrackingLQR tracking_lqr_control",
+    },
+    "crazysim.engine": {
+        "crazysim.engine.plan": "ENGINES",
+        "crazysim.engine.step": "Step",
+        "crazysim.engine.tools.explain": "explain",
+    },
+    "crazysim.envs": {
+        "crazysim.envs.brax": "BraxEnv",
+        "crazysim.envs.pettingzoo": "make_parallel",
+        "crazysim.envs.sb3": "DroneVecEnv",
+    },
+    "crazysim.plugins.sensors": {
+        "crazysim.plugins.sensors.barometer": "Barometer",
+        "crazysim.plugins.sensors.beacons": "Lighthouse UWB",
+        "crazysim.plugins.sensors.camera": "Camera",
+        "crazysim.plugins.sensors.depth_errors": "Distortion StereoNoise",
+        "crazysim.plugins.sensors.errors": "Constant GaussMarkov Link Rounded Turned White",
+        "crazysim.plugins.sensors.flow_deck": "OpticalFlow TimeOfFlight",
+        "crazysim.plugins.sensors.gps": "GPS",
+        "crazysim.plugins.sensors.image_sensor": "ImageData ImageSensor",
+        "crazysim.plugins.sensors.imu": "IMU",
+        "crazysim.plugins.sensors.lidar": "Lidar",
+        "crazysim.plugins.sensors.magnetometer": "Magnetometer",
+        "crazysim.plugins.sensors.motion_capture": "MotionCapture",
+        "crazysim.plugins.sensors.onboard": "BatteryVoltage MultiRanger RotorSpeeds",
+        "crazysim.plugins.sensors.radar": "Radar",
+        "crazysim.plugins.sensors.range_finder": "RangeFinder",
+        "crazysim.plugins.sensors.sensor": "Samples Sensor",
+        "crazysim.plugins.sensors.triad": "Triad",
+    },
+    "crazysim.train": {
+        "crazysim.train.config": "TrainConfig",
+        "crazysim.train.dagger": "imitate",
+        "crazysim.train.evaluation": "evaluate",
+        "crazysim.train.networks": "Network",
+        "crazysim.train.runs": "run run_many",
+        "crazysim.train.show": "film plot_episode",
+        "crazysim.train.training": "load_policy",
+    },
+    # Modules of Crazyflow.
+    "crazysim.exception": {
+        "crazysim.errors": "ConfigError RenderError UnknownNameError",
+        "crazysim.sim.crazyflow": "CrazyflowError",
+    },
+    "crazysim.sim.data": {
+        "crazysim.control": "Control",
+        "crazysim.core.controls": "AttitudeControlData BodyRateControlData ForceTorqueControlData SimControls "
+        "StateControlData",
+        "crazysim.core.data": "SimCore SimData SimParams SimState SimStateDeriv",
+        "crazysim.sim.crazyflow": "ControlData",
+    },
+    "crazysim.sim.dynamics": {
+        "crazysim.sim.crazyflow": "first_principles_dynamics so_rpy_dynamics so_rpy_rotor_drag_dynamics "
+        "so_rpy_rotor_dynamics",
+    },
+    "crazysim.sim.functional": {
+        "crazysim.core.functional": "attitude_control body_rate_control controllable force_torque_control "
+        "rotor_vel_control state_control",
+    },
+    "crazysim.sim.integration": {"crazysim.core.integration": "Integrator euler rk4 symplectic_euler"},
+    "crazysim.sim.pipeline": {
+        "crazysim.core.pipeline": "Pipeline append_fn insert_fn_after insert_fn_before prepend_fn remove_fn replace_fn",
+    },
+    "crazysim.sim.sensors": {},
+    "crazysim.sim.sensors.depth": {"crazysim.sim.crazyflow": "render_depth"},
+    "crazysim.sim.sensors.splat": {
+        "crazysim.sim.crazyflow_splats": "build_render_splat_fn build_render_splat_rgbd_fn camera_intrinsics "
+        "render_splat_rgb render_splat_rgbd viewmats",
+    },
+    "crazysim.sim.sharding": {"crazysim.engine.sharding": "shard shardings_of world_mesh"},
+    "crazysim.sim.splat": {"crazysim.sim.crazyflow_splats": "attach_splats"},
+    "crazysim.utils": {
+        "crazysim.core.data": "grid_2d",
+        "crazysim.engine.cache": "enable_cache",
+        "crazysim.engine.pytree": "CORE_NDIM_KEY",
+        "crazysim.sim.crazyflow": "leaf_replace pytree_replace world_mask",
+    },
+}
+"""Names by package or module, and by the module that defines them."""
+
+
+def lazy_getattr(module: str) -> Callable[[str], Any]:
+    """Make the ``__getattr__`` of a package, which imports its names of the table at their first use."""
+    origins = {name: origin for origin, names in NAMES[module].items() for name in names.split()}
+
+    def import_name(name: str) -> Any:
+        if name not in origins:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(origins[name]), name)
+
+    return import_name
+
+
+class _ModuleFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finder of the modules of the table that have no file."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        del path, target
+        return importlib.machinery.ModuleSpec(fullname, self, is_package=True) if fullname in NAMES else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__dict__["__getattr__"] = lazy_getattr(module.__name__)
+        module.__dict__["__all__"] = " ".join(NAMES[module.__name__].values()).split()
+
+
+sys.meta_path.append(_ModuleFinder())

@@ -1,3 +1,0 @@
-"""The former path of ``crazysim.engine.pytree``."""
-
-from crazysim.engine.pytree import *  # noqa: F403

@@ -1,1 +1,0 @@
-"""Sensors, under Crazyflow's import paths."""
