@@ -12,10 +12,10 @@ SLACK = 40
 BUDGET = {
     "commands": 1164,
     "control": 1987,
-    "core": 1587,
-    "crazysim": 834,
+    "core": 1583,
+    "crazysim": 840,
     "drones": 514,
-    "dynamics": 576,
+    "dynamics": 574,
     "engine": 6748,
     "envs": 3738,
     "geometry": 1089,
@@ -23,7 +23,7 @@ BUDGET = {
     "media": 967,
     "plugins": 7365,
     "scene": 3090,
-    "sim": 1222,
+    "sim": 1202,
     "train": 2437,
     "trajectories": 1393,
 }
