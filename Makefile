@@ -83,7 +83,6 @@ benchmark: $(VENV)/installed-demo
 # Builds and tries the distribution in empty environments, and uploads it to PyPI; CONTRIBUTING.md says what comes before.
 release: $(VENV)/installed-test
 	git diff --quiet HEAD
-	$(RUN) benchmarks/figures.py --stale
 	.ci/dist $(PYTHON) out/dist
 	$(RUN) -m pip install --quiet --disable-pip-version-check --no-compile twine
 	$(RUN) -m twine upload out/dist/*

@@ -332,6 +332,46 @@ def trainers(lines: list[Line]) -> str:
     )(lines)
 
 
+def figure_text(line: Line) -> str:
+    """Return a figure of ``validation.py`` with its unit."""
+    return f"{line['figure']:.3g} {line.get('unit', '')}".strip()
+
+
+def validation(lines: list[Line]) -> str:
+    """Return a section of ``validation.py``, without empty columns."""
+    cells = {
+        "Quantity": [line["quantity"] for line in lines],
+        "Reference": [line["reference"] for line in lines],
+        "Figure": [figure_text(line) for line in lines],
+        "Passes": [line.get("passes", "") for line in lines],
+        "For comparison": [line.get("remark", "") for line in lines],
+    }
+    cells = {name: column for name, column in cells.items() if any(column)}
+    return markdown_table(cells, zip(*cells.values(), strict=True))
+
+
+def validation_by(separator: str) -> Callable[[list[Line]], str]:
+    """Return a function that makes a table with a column for each end of the quantities, after a separator."""
+    return lambda lines: pivot(
+        lines,
+        lambda x: x["quantity"].rpartition(separator)[0],
+        lambda x: x["quantity"].rpartition(separator)[2],
+        figure_text,
+        "Quantity",
+    )
+
+
+def transfers(lines: list[Line]) -> str:
+    """Return the success of policies by simulator."""
+    return pivot(
+        lines,
+        lambda x: x["quantity"].rpartition(": ")[0],
+        lambda x: "C header and ONNX file, difference" if x["reference"] == "ONNX file" else x["reference"],
+        figure_text,
+        "Policy",
+    )
+
+
 def readme(records: list[Line]) -> str:
     """Return the table of README.md: two cores without AVX-512, and one H100."""
     kinds = {"cpu": "AVX2", "gpu": "H100"}

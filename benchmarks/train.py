@@ -17,7 +17,7 @@ that has this file. A process that was interrupted continues from its last check
 failed training is reported at the end, and the other trainings continue.
 
 ``--write`` puts the rows of tasks with all seeds finished into the committed table,
-docs/concepts/training-results.json, and into the page next to it. ``--check`` trains one seed of each task. It fails if
+docs/results/training.json, and into the page docs/results.md. ``--check`` trains one seed of each task. It fails if
 the success of a seed is lower than the least success in the table by more than two standard errors of 1,000 starts.
 Arguments after ``--`` are passed to ``crazysim train``.
 """
@@ -50,9 +50,9 @@ from crazysim.train.training import CHECKPOINT_FILE, TEACHER_FOLDER, kept_point,
 from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
 
 PACKAGE = Path(crazysim.__file__).parent
-TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json"
+TABLE = Path(__file__).parents[1] / "docs" / "results" / "training.json"
 """The committed table, a row for each task."""
-PAGE = TABLE.with_suffix(".md")
+PAGE = TABLE.parents[1] / "results.md"
 """The page that shows the table, between two comments."""
 TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
 N_STARTS = 1000

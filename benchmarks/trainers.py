@@ -13,7 +13,7 @@ compiled call a step, and shares arrays with Torch.
 There is a JSON line for each trainer and number of worlds. It has the environment steps per second, the median over the
 seeds, and the success of each seed on 1,000 held-out starts after the same number of steps. The rate is measured over
 the last three quarters of a training, because the first quarter includes the compilation. No quarter includes
-evaluations. ``benchmarks/figures.py --write --only trainers`` puts the table into docs/concepts/training-results.md.
+evaluations. ``benchmarks/figures.py --write --only trainers`` puts the table into docs/results.md.
 
 ``pip install brax==0.14.2`` installs Brax, and ``pip install rsl-rl-lib==5.5.1`` installs RSL-RL with PyTorch. A
 trainer that is not installed is left out, and a printed line says so.

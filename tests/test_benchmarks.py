@@ -313,7 +313,7 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
     with pytest.raises(SystemExit, match=r"hover: expected at least 99\.0% .*, got 98\.3% with seed 0"):
         run(*check, "--out", tmp_path / "bad")
     train.TABLE.write_text("[]")
-    with pytest.raises(SystemExit, match=r"hover has no row in training-results\.json.*--write"):
+    with pytest.raises(SystemExit, match=r"hover has no row in training\.json.*--write"):
         run(*check, "--out", tmp_path / "good")
     capsys.readouterr()
     write_results(train, tmp_path / "old", [1.0], sources="others")

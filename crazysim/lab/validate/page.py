@@ -16,7 +16,7 @@ figures are kept. In a checkout of the sources, these commands write this page:
 
 ```sh
 pip install -e {packages}
-crazysim validate --data FOLDER --out docs/validation.md
+crazysim validate --data FOLDER
 ```
 
 Each section names the command that measures it again and writes it to `validation.md`. Sections whose package is not
