@@ -272,9 +272,9 @@ def _as_command(
     try:
         array = np.asarray(command) if is_on_host else command
     except ValueError as error:
-        raise ValueError(f"expected the {name} command as a regular array, got {command!r}") from error
+        raise ConfigError(f"expected the {name} command as a regular array, got {command!r}") from error
     if array.shape != shape:
-        raise ValueError(
+        raise ConfigError(
             f"{name} command has shape {array.shape}; expected {shape} = "
             f"(n_worlds, n_drones, {shape[-1]}): {fields}. "
             f"For one command to all drones use np.broadcast_to(cmd, {shape})."
@@ -287,12 +287,12 @@ def _as_command(
         with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
             array = array.astype(dtype)
     else:
-        raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
+        raise ConfigError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     is_tracer = isinstance(array, jax.core.Tracer)
     check_finite = check_flag("check_finite", check_finite)
     if (is_on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
-        raise ValueError(
+        raise ConfigError(
             f"expected a finite {name} command, got one that is NaN or infinite in world(s) {worlds.tolist()}, as "
             f"{dtype}, which would last until their next reset. Check the computation that returns it."
         )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from operator import is_
 from typing import Any, Generic, TypeVar
 
-from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 
 Pipeline = dict[str, Callable[..., Any]]
 """Functions of the stages by name, in order."""
@@ -24,15 +24,16 @@ def check_pipeline(name: str, pipeline: object) -> Pipeline:
         name: Name of the pipeline, for messages.
         pipeline: The pipeline.
     """
-    if not isinstance(pipeline, dict) or not pipeline:
-        raise ConfigError(
-            f"expected {name} as a dict with a function for each name of a stage, got {short_repr(pipeline)}. Use "
-            f"insert_fn_before or remove_fn of crazysim.core.pipeline to edit the present one."
-        )
-    for stage, fn in pipeline.items():
+    expect(
+        isinstance(pipeline, dict) and pipeline,
+        f"{name} as a dict with a function for each name of a stage",
+        pipeline,
+        "Use insert_fn_before or remove_fn of crazysim.core.pipeline to edit the present one.",
+    )
+    for stage, fn in pipeline.items():  # type: ignore[attr-defined]  # checked
         if not isinstance(stage, str) or not callable(fn):
             raise ConfigError(f"expected names and functions in {name}, got {short_repr(stage)}: {short_repr(fn)}")
-    return pipeline
+    return pipeline  # type: ignore[return-value]  # checked
 
 
 def append_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:
@@ -106,20 +107,24 @@ class BuiltPipeline(Generic[F]):
 
 
 def _index(pipeline: Pipeline, name: str) -> int:
-    if name not in pipeline:
-        raise UnknownNameError(f"No stage named {name!r} exists in the pipeline. Use one of {', '.join(pipeline)}.")
+    require(
+        name in pipeline,
+        f"No stage named {name!r} exists in the pipeline. Use one of {', '.join(pipeline)}.",
+        UnknownNameError,
+    )
     return list(pipeline).index(name)
 
 
 def _insert(pipeline: Pipeline, index: int, fn: Callable[..., Any], name: str | None) -> None:
-    if not callable(fn):
-        raise ValueError(f"expected a function as a stage, got {fn!r}. Use a function from SimData to SimData.")
+    expect(callable(fn), "a function as a stage", fn, "Use a function from SimData to SimData.")
     name = name if name is not None else getattr(fn, "__name__", None)
-    if name is None or name == "<lambda>":
-        raise ValueError(f"expected a named function, got {fn!r}, which needs an explicit name. Use name=...")
-    if name in pipeline:
-        raise UnknownNameError(f"a stage named {name!r} already exists. Use another name=, or replace_fn.")
+    expect(name not in (None, "<lambda>"), "a name of a stage that is not a named function", fn, "Use name='...'.")
+    require(
+        name not in pipeline,
+        f"a stage named {name!r} already exists. Use another name=, or replace_fn.",
+        UnknownNameError,
+    )
     items = list(pipeline.items())
-    items.insert(index, (name, fn))
+    items.insert(index, (name, fn))  # type: ignore[arg-type]  # checked
     pipeline.clear()
     pipeline.update(items)

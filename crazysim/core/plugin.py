@@ -428,6 +428,9 @@ class Plugin(PyTree):
             when: As in ``crazysim.stage``.
             details: Further arguments of ``Stage``.
         """
+        expect(
+            hasattr(method, "__func__"), "a method of the plugin as its stage", method, "Use self.stage(self.act), say."
+        )
         return Stage(BoundMethod(self, method.__func__), scope or self.scope, when, **details)  # type: ignore[attr-defined]
 
     @property
@@ -454,6 +457,10 @@ class Plugin(PyTree):
         If one of them is replaced, both are called again.
         """
         return {}
+
+    def with_companions(self, plugins: Mapping[str, Plugin]) -> Self:
+        """Return the plugin for the companions of a simulation, by name, if its settings hold any."""
+        return self
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import dividing_rate
 from crazysim.engine.pytree import Members, PyTree, float_dtype
 from crazysim.engine.stage import RESERVED_SCOPES, Stage, is_tick
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 MAX_MEMBERS = 100_000
 """Largest number of members of a population in a world."""
@@ -64,8 +64,10 @@ class Population(Plugin):
         """Names of the members, in order."""
         members, class_name = self.members, type(self).__name__
         if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
-            if members > MAX_MEMBERS:
-                raise ConfigError(f"expected at most {MAX_MEMBERS} members of {class_name} in a world, got {members}")
+            require(
+                members <= MAX_MEMBERS,
+                f"expected at most {MAX_MEMBERS} members of {class_name} in a world, got {members}",
+            )
             names = tuple([f"{self.prefix}_{k}" for k in range(members)])
         else:
             names = tuple(members) if isinstance(members, Sequence) and not isinstance(members, str) else ()
@@ -115,8 +117,10 @@ class Population(Plugin):
 
     def check(self, sim: Simulation) -> None:
         """Check the name of the population and the rate of its controller."""
-        if self.name in (*RESERVED_SCOPES, "drone", "world"):
-            raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
+        require(
+            self.name not in (*RESERVED_SCOPES, "drone", "world"),
+            f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.",
+        )
         if self.control_freq is not None:
             dividing_rate(f"control_freq of {self.name!r}", self.control_freq, sim.data.core.freq)
 
@@ -237,13 +241,15 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
     """Return a command as an array of the given shape and dtype."""
     is_on_host = not isinstance(command, jax.Array)
     array = np.asarray(command, dtype) if is_on_host else command
-    if array.shape != shape:
-        raise ValueError(
-            f"expected a command of shape {shape} for {name!r}, got {array.shape}. For one command to all use "
-            f"np.broadcast_to(command, {shape})."
-        )
+    require(
+        array.shape == shape,
+        f"expected a command of shape {shape} for {name!r}, got {array.shape}. For one command to all use "
+        f"np.broadcast_to(command, {shape}).",
+    )
     if is_on_host and not np.all(np.isfinite(array)):
-        raise ValueError(f"expected finite numbers as command of {name!r}, got NaN or infinity. Check its computation.")
+        raise ConfigError(
+            f"expected finite numbers as command of {name!r}, got NaN or infinity. Check its computation."
+        )
     return array.astype(dtype)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError, expect
+from crazysim.errors import ConfigError, expect, require
 
 Scope = Literal["drone", "member", "world", "batch", "shared", "opaque", "parameter"]
 """Scope of a leaf as a field declares it; see ``leaf``."""
@@ -225,8 +225,8 @@ def watched_flags(tree: Any) -> Any:
     )
 
 
-def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
-    """Check that every leaf has the axes of its scope."""
+def check_axes(tree: Any, n_worlds: int, n_drones: int | None = None) -> None:
+    """Check that every leaf has the axes of its scope; ``n_drones`` is None for a tree without drones."""
     batches = {"world": (n_worlds, 1), "shared": ()}
 
     def check_leaf(x: Any, metadata: Any, name: str, members: Members | None) -> None:
@@ -234,12 +234,17 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         if scope == "opaque":
             return
         if scope == "batch":
-            if jnp.shape(x)[0] != n_worlds:
-                raise ConfigError(
-                    f"expected {name} to have a first axis over {n_worlds} worlds, got shape {jnp.shape(x)}. Without "
-                    f"batch axes it would have {metadata[CORE_NDIM_KEY]} dimensions, as its field declares."
-                )
+            require(
+                jnp.shape(x)[0] == n_worlds,
+                f"expected {name} to have a first axis over {n_worlds} worlds, got shape {jnp.shape(x)}. Without "
+                f"batch axes it would have {metadata[CORE_NDIM_KEY]} dimensions, as its field declares.",
+            )
             return
+        require(
+            scope != "drone" or n_drones is not None,
+            f"expected {name} in a record of a population, got a leaf of drones, which these data lack. Declare it "
+            f'with leaf("member") in a subclass of Members.',
+        )
         n, kind, kinds = n_drones, "drone", "drones"
         if members is not None and scope != "drone":
             n, kind, kinds = members.n_members, "member", members.population
@@ -256,8 +261,8 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
             n_axes = len(batch) + (core_ndim or 0)
             raise ConfigError(
                 f"{name} has shape {shape}; expected {n_axes} dimensions that begin with {batch}{ending}, for "
-                f"{n_worlds} worlds of {n} {kinds}{shared_text}. For one value per world, repeat it for every {kind} "
-                f"with jnp.broadcast_to."
+                f"{n_worlds} worlds{'' if n is None else f' of {n} {kinds}'}{shared_text}. For one value per world, "
+                f"repeat it for every {kind} with jnp.broadcast_to."
             )
 
     _map_leaves(check_leaf, tree, {}, "data", None)

@@ -45,7 +45,7 @@ class Record(PyTree):
     def check(self) -> None:
         """Raise an error for values that no step accepts. It is called once for each structure."""
         require_arrays(self)
-        check_axes(self, len(jax.tree.leaves(self)[self.roles().clock]), 0)
+        check_axes(self, len(jax.tree.leaves(self)[self.roles().clock]))
 
     def without_sizes(self) -> Self:
         """Return the record with equal static fields for any number of worlds and members.

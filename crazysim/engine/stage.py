@@ -116,7 +116,7 @@ class Stage:
         )
 
     def __repr__(self) -> str:
-        return f"<stage {self.__name__} of one {self.scope}>"
+        return f"<stage {self.__name__} of one {_unit(self.scope)}>"
 
 
 @check_arguments
@@ -149,8 +149,7 @@ def stage(
             f"expected scope 'drone', 'world' or the name of a population, got {scope!r}. A stage of the full batch is "
             f"left undeclared."
         )
-    if phase not in PHASES:
-        raise ConfigError(f"expected a phase of {', '.join(map(repr, PHASES))}, got {phase!r}.")
+    expect(phase in PHASES, f"a phase of {', '.join(map(repr, PHASES))}", phase)
     return lambda fn: Stage(fn, scope, when, phase=phase)
 
 
@@ -240,9 +239,9 @@ class Axes:
                 )
             if writable_scopes is not None and self.scopes[i] not in writable_scopes:
                 raise ConfigError(
-                    f"stage {name!r} is declared for one {stage.scope} and writes {self.names[i]}, which is "
+                    f"stage {name!r} is declared for one {_unit(stage.scope)} and writes {self.names[i]}, which is "
                     f"{self.scopes[i]}; it may write leaves of scope {' or '.join(writable_scopes)}. Give every "
-                    f"{stage.scope} a leaf of its own first, or leave the stage undeclared."
+                    f"{_unit(stage.scope)} a leaf of its own first, or leave the stage undeclared."
                 )
         return written_indices
 
@@ -254,11 +253,9 @@ class Axes:
         if stage.scope == "world":
             return [*populations, "world"]
         if stage.scope not in (*populations, "drone"):
-            other_names = ", ".join(repr(name) for name in populations if name != "drone")
             raise ConfigError(
-                f"stage {stage.__name__!r} is declared for one {stage.scope!r}, and there is no population of that "
-                f"name; there {'are ' + other_names if other_names else 'is none'}. Add it with sim.add first, or "
-                f"declare the stage for 'drone' or 'world'."
+                f"stage {stage.__name__!r} is declared for one {_unit(stage.scope)}, and there is no population of "
+                f"that name. Use one of {', '.join(map(repr, populations))} or 'world', or add the population first."
             )
         return [stage.scope]
 
@@ -272,6 +269,10 @@ class Axes:
         if scope != "batch" and leaf_scope != "batch":
             n_leading = n_batch_axes(leaf_scope) if leaf_scope == scope else n_world_axes(leaf_scope)
         return jax.ShapeDtypeStruct(jnp.shape(x)[n_leading:], x.dtype)
+
+
+def _unit(scope: StageScope) -> str:
+    return scope if scope in ("drone", "world") else f"member of {scope!r}"
 
 
 def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[..., Any]:

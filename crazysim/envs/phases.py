@@ -26,6 +26,7 @@ from crazysim.envs.actions import Actions
 from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
+from crazysim.envs.references import GUIDE
 from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, EnvState, Obs
 from crazysim.envs.task import Task, sum_terms
@@ -191,7 +192,7 @@ class Phases:
         """
         for wrapper in reversed(self.wrappers):
             state, action = vectorize(wrapper.before_step, wrapper.batched)(state, action)
-        data = vectorize(self.task.before_step, self.task.batched)(state.data)
+        data = self._apply(self.task, "before_step", vectorize)(state.data)
         return state.replace(data=stage_command(data, self.actions.command(action))), action
 
     def observe(self, state: EnvState, action: Array, vectorize: Vectorize) -> EnvState:
@@ -239,14 +240,9 @@ class Phases:
         task, shape = self.task, (self.n_drones, self.actions.size)
         reset_data = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
         key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(reset_data)
-        # Checked and broadcast before worlds are joined: a leaf without the axis of drones is of its own world.
-        data = vectorize(lambda data, key: _check_spawn(task, task.batched, data, task.spawn(data, key)), task.batched)(
-            reset_data, key
-        )
+        data = self._apply(task, "spawn", vectorize)(reset_data, key)
         for wrapper in self.wrappers:
-            data = vectorize(
-                lambda data, x=wrapper: _check_spawn(task, x.batched, data, x.after_spawn(data)), wrapper.batched
-            )(data)
+            data = self._apply(wrapper, "after_spawn", vectorize)(data)
 
         def fill_state(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
@@ -265,6 +261,17 @@ class Phases:
         for wrapper in self.wrappers:
             state = vectorize(wrapper.after_reset, wrapper.batched)(state)
         return state
+
+    @staticmethod
+    def _apply(owner: Task | Hooks, method: str, vectorize: Vectorize) -> Callable[..., SimData]:
+        """Return a method of the task or of a wrapper that returns data, with a check of its result."""
+        title = f"{'task' if isinstance(owner, Task) else 'wrapper'} {owner.name!r}: expected {method}"
+
+        # Checked and broadcast before worlds are joined: a leaf without the axis of drones is of its own world.
+        def apply(data: SimData, *args: Array) -> SimData:
+            return _check_data(title, owner.batched, data, getattr(owner, method)(data, *args))
+
+        return vectorize(apply, owner.batched)
 
     def _observe_task(self, data: SimData) -> Obs:
         """Return the observations of the task, from measured states if ``measure_states`` is set."""
@@ -318,34 +325,48 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
     return {"error": task.error(data)} | task.info(data)
 
 
-def _check_spawn(task: Task, batched: bool, reset_data: SimData, spawned: Any) -> SimData:
-    """Return the data from ``spawn`` or ``after_spawn`` with the shapes and dtypes before it.
+def _check_data(title: str, batched: bool, before: SimData, after: Any) -> SimData:
+    """Return the data from a method of a task or a wrapper with the shapes and dtypes before it.
 
     No step is compiled again then. Arrays of fewer axes are those of all drones, unless ``batched`` is True.
+
+    Args:
+        title: Owner and name of the method, such as ``"task 'hover': expected spawn"``.
+        batched: Whether the data is of all worlds.
+        before: Data that the method got.
+        after: Its result.
     """
-    if jax.tree.structure(spawned) != jax.tree.structure(reset_data):
-        old_paths, new_paths = (
-            {keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (reset_data, spawned)
-        )
+    require(
+        isinstance(after, SimData),
+        f"{title} to return the data that it gets with other values, got a {type(after).__name__}. End it with return "
+        f"data.replace(...); {GUIDE} has an example.",
+    )
+    if jax.tree.structure(after) != jax.tree.structure(before):
+        old_paths, new_paths = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (before, after))
         changes = ", ".join(
             [f"without {x}" for x in sorted(old_paths - new_paths)]
             + [f"with {x}" for x in sorted(new_paths - old_paths)]
         )
         raise ConfigError(
-            f"task {task.name!r}: expected spawn to return the data that it gets with other values, got a "
-            f"{type(spawned).__name__} {changes or 'of another structure'}. The task's record is data.plugins['task']; "
-            f"docs/guides/tasks.md has an example."
+            f"{title} to return the data that it gets with other values, got a SimData "
+            f"{changes or 'of another structure'}. The task's record is data.plugins['task'], which install adds; "
+            f"{GUIDE} has an example."
         )
 
     def fit(path: Any, x: Array, y: Any) -> Array:
         y = y if y is x else jnp.asarray(y, x.dtype)
-        ends = zip(reversed(jnp.shape(y)), reversed(x.shape), strict=False)
+        shape = jnp.shape(y)
+        ends = zip(reversed(shape), reversed(x.shape), strict=False)
+        remedy = (
+            "Use x[..., None] for one number of each drone."
+            if shape and shape == x.shape[:-1]
+            else "A number that all drones share cannot differ between them there: add its plugin with one value for "
+            "each drone."
+        )
         require(
-            (jnp.ndim(y) in (0, x.ndim) if batched else jnp.ndim(y) <= x.ndim) and all(m in (1, n) for m, n in ends),
-            f"task {task.name!r}: expected spawn or after_spawn to return {keystr(path)} of shape {x.shape}, got shape "
-            f"{jnp.shape(y)}. A number that all drones share cannot differ between them there: add its plugin with one "
-            f"value for each drone.",
+            (len(shape) in (0, x.ndim) if batched else len(shape) <= x.ndim) and all(m in (1, n) for m, n in ends),
+            f"{title} to return {keystr(path)} of shape {x.shape}, got shape {shape}. {remedy}",
         )
         return y if y is x else jnp.broadcast_to(y, x.shape)
 
-    return tree_map_with_path(fit, reset_data, spawned)
+    return tree_map_with_path(fit, before, after)

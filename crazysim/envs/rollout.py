@@ -20,6 +20,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.state import EnvState, Obs
 from crazysim.errors import ConfigError, expect, require
+from crazysim.sim.rollout import require_memory_of_records
 
 Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
 """``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once. ``memory`` is the state that the
@@ -124,6 +125,8 @@ def rollout(
             memory = jax.tree.map(lambda initial, x: select_worlds(must_reset, initial, x), initial_memory, memory)
         return flat_after, memory, keep(Transition(state.obs, action, extras, new_state))
 
+    if n_steps > 100_000:  # a step is traced once more for it
+        require_memory_of_records(env.step_fn, n_steps, (key, jax.eval_shape(step, flat, memory, key)[2]))
     split_key = partial(jax.random.split, num=n_steps)
     keys = jax.vmap(split_key, out_axes=1)(key) if is_key(key) and key.ndim else split_key(key)
     flat, memory, outputs = scan(step, flat, memory, keys)

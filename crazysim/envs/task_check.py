@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +17,12 @@ from crazysim.core.settings import check_settings
 from crazysim.eager import explain_traced_values
 from crazysim.engine.pytree import n_world_axes, scopes, watched_flags
 from crazysim.engine.sharding import fetch_arrays
+from crazysim.envs.references import GUIDE
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.errors import ConfigError, expect, require
 from crazysim.sim.sim import Sim
 
-GUIDE = "docs/guides/tasks.md"
 REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 """Methods that every task defines."""
 
@@ -116,7 +117,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     batch, batch_name = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
-    with explain_traced_values(title):
+    with explain_traced_values(title), _name_missing_record(title, data):
         obs, rewards, terminated, error, info = jax.eval_shape(
             lambda data, action: (
                 task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data),
@@ -124,9 +125,9 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
             ), world, action,
         )  # fmt: skip
 
-    for method, result in (("observe", obs), ("rewards", rewards)):
+    for method, result in (("observe", obs), ("rewards", rewards), ("info", info)):
         require(
-            isinstance(result, Mapping) and result,
+            isinstance(result, Mapping) and (result or method == "info"),
             f"{title}: expected {method} to return a dict of names to arrays, got {_describe(result)}. {GUIDE} "
             f"has an example.",
         )
@@ -157,6 +158,18 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         f"{title}: expected terminated of type bool and shape ({batch_name.removesuffix(', ')}), got "
         f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over the drones.",
     )
+
+
+@contextlib.contextmanager
+def _name_missing_record(title: str, data: SimData) -> Iterator[None]:
+    try:
+        yield
+    except KeyError as error:
+        error.add_note(
+            f"in {title}: data.plugins has {', '.join(map(repr, data.plugins)) or 'no records'}. Use sim.add for a "
+            f"plugin, and self.add_record(sim, ...) in install for the record of the task, {TASK_RECORD_NAME!r}."
+        )
+        raise
 
 
 def _world_shape(scope: str, x: Array) -> jax.ShapeDtypeStruct:

@@ -21,7 +21,7 @@ from crazysim.eager import jit_eager_calls
 from crazysim.engine.cache import keep_programs
 from crazysim.engine.pytree import PyTree, n_batch_axes, watched_flags
 from crazysim.engine.stage import Axes, vmap_drones, vmap_worlds
-from crazysim.errors import ConfigError, UnknownNameError, expect, short_repr
+from crazysim.errors import ConfigError, UnknownNameError, expect, require
 from crazysim.plugins.plugin_stages import PluginStages
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -51,10 +51,11 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin."""
-        if name not in self._stages.plugins:
-            raise UnknownNameError(
-                f"expected the name of an added plugin, got {name!r}. Added are: {', '.join(self) or 'none'}."
-            )
+        require(
+            name in self._stages.plugins,
+            f"expected the name of an added plugin, got {name!r}. Added are: {', '.join(self) or 'none'}.",
+            UnknownNameError,
+        )
         return self._stages.plugins[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -68,19 +69,19 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add a plugin; see ``Sim.add``."""
-        if not isinstance(plugin, Plugin):
-            raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or your subclass of Plugin.")
+        expect(isinstance(plugin, Plugin), "a plugin", plugin, "Use sim.add(Wind(...)), or your subclass of Plugin.")
         plugin = plugin if name is None else dataclasses.replace(plugin, name=name)  # type: ignore[type-var]
         name, kind = plugin.name, type(plugin).__name__
-        if not isinstance(name, str) or not name:
-            raise ConfigError(f"expected a non-empty string as name of a {kind}, got {name!r}")
-        if name in self:
-            raise ConfigError(
-                f"{name} is already enabled. Use sim.replace({kind}(...)) to change it, or "
-                f"sim.add({kind}(...), name=...) to add another one."
-            )
-        if name in self._sim.data.plugins:
-            raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
+        expect(isinstance(name, str) and name, f"a non-empty string as name of a {kind}", name)
+        require(
+            name not in self,
+            f"{name} is already enabled. Use sim.replace({kind}(...)) to change it, or "
+            f"sim.add({kind}(...), name=...) to add another one.",
+        )
+        require(
+            name not in self._sim.data.plugins,
+            f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).",
+        )
         self._require_unused_names(plugin, self._sim.names)
         self._require_unique_terms(plugin, self.values())
         with self._restore_on_error():
@@ -171,18 +172,20 @@ class PluginRegistry(Mapping[str, Plugin]):
                 data = _with_record(data, name, _carry_over(self[name], present, record, ()))
         return data
 
-    def scene_check(self, reference: SimData) -> Callable[[SimData], None] | None:
-        """Return a function that raises an error for data of another scene; None if no plugin reads the scene.
+    def data_check(self, reference: SimData) -> Callable[[SimData], None]:
+        """Return a function that checks the plugins, and raises an error for data of another scene if they read it.
 
         Args:
             reference: Data of the present scene.
         """
+        check_plugins = self.plugin_check()
         if not self._scene_readers:
-            return None
+            return check_plugins
         scene, revision, names = self._sim.scene, self._sim.scene.revision, object_names(reference)
         layouts = {name: _layout(reference.plugins[name]) for name in self._record_readers if name in reference.plugins}
 
         def check(data: SimData) -> None:
+            check_plugins(data)
             is_same = scene.revision == revision and object_names(data) == names
             if is_same and all(_layout(data.plugins.get(name)) == layout for name, layout in layouts.items()):
                 return
@@ -211,14 +214,13 @@ class PluginRegistry(Mapping[str, Plugin]):
             return self._replace_plugin(plugin)
 
     def _replace_plugin(self, plugin: P) -> P:
-        if not isinstance(plugin, Plugin):
-            raise ConfigError(f"expected a plugin, got {short_repr(plugin)}. Use sim.replace(Wind(...)), for example.")
+        expect(isinstance(plugin, Plugin), "a plugin", plugin, "Use sim.replace(Wind(...)), for example.")
         old_plugin = self[plugin.name]
-        if type(old_plugin) is not type(plugin):
-            raise ConfigError(
-                f"expected a {type(old_plugin).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. "
-                f"Use sim.remove({plugin.name!r}) first, or another name=."
-            )
+        require(
+            type(old_plugin) is type(plugin),
+            f"expected a {type(old_plugin).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. "
+            f"Use sim.remove({plugin.name!r}) first, or another name=.",
+        )
         sim, name = self._sim, plugin.name
         self._require_unused_names(plugin, [other for other in sim.names if other not in self.members_of(old_plugin)])
         self._require_unique_terms(plugin, [other for other in self.values() if other is not old_plugin])
@@ -230,6 +232,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         changed = [name]
         for other in self.values():  # companions come before the plugins that read them
             if other.companions.keys() & changed:
+                self._stages.set_plugin(other.name, other)
                 self._remake_records(other.name)
                 changed.append(other.name)
         remake = changed[0 if is_new else 1 :]
@@ -294,10 +297,17 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def check(self) -> None:
         """Check the plugins that each plugin requires, if the plugins have changed since the last check."""
-        if not self._is_checked:
+        if self._is_checked or self._is_changing:
+            return
+        with jax.ensure_compile_time_eval():  # inside a user's trace, too
             for plugin in self.values():
                 plugin.check_plugins(self._sim)
-            self._is_checked = True
+        self._is_checked = True
+
+    def plugin_check(self) -> Callable[[SimData], None]:
+        """Return ``check`` for a step or reset with the present plugins, which later ones do not concern."""
+        names = [*self]
+        return lambda _: self.check() if names == [*self] else None
 
     def build_records(self) -> None:
         """Put a new record of every plugin into the simulation's data."""
@@ -362,11 +372,11 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._set_record(name, record)
 
     def _set_record(self, name: str, record: PyTree | None) -> None:
-        if record is not None and not isinstance(record, PyTree):
-            raise ConfigError(
-                f"expected record of plugin {name!r} to return a PyTree or None, got {type(record).__name__}. Use a "
-                f"subclass of PyTree that declares its arrays with leaf(...)."
-            )
+        require(
+            record is None or isinstance(record, PyTree),
+            f"expected record of plugin {name!r} to return a PyTree or None, got {type(record).__name__}. Use a "
+            f"subclass of PyTree that declares its arrays with leaf(...).",
+        )
         self._sim.data = _with_record(self._sim.data, name, record)
 
     def _build(self, changed: Plugin | None = None, remake: Collection[str] = ()) -> None:

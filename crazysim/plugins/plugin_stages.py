@@ -62,7 +62,7 @@ class PluginStages:
             return
         if name not in self.plugins:
             self._history.append(name)
-        self.plugins[name] = plugin
+        self.plugins[name] = plugin.with_companions(self.plugins)
 
     def build(self, remake: Collection[str] = (), changed: Plugin | None = None) -> None:
         """Set the simulation's pipelines, after ``begin_change``; the dicts stay, because a user may hold them to edit.
@@ -206,11 +206,12 @@ def _make_stages(plugin: Plugin, sim: Simulation) -> MadeStages:
     """Return the stages of a plugin for ``sim.step_pipeline``, a pipeline without them."""
     pipeline, n_reads = sim.step_pipeline, sim.scene.n_reads
     placements = plugin.stages(sim)
-    if not isinstance(placements, (list, tuple)) or not all(isinstance(x, StagePlacement) for x in placements):
-        raise ConfigError(
-            f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
-            f"[StagePlacement(stage, before='increment_steps')]."
-        )
+    expect(
+        isinstance(placements, (list, tuple)) and all(isinstance(x, StagePlacement) for x in placements),
+        f"stages of plugin {plugin.name!r} to return a list of StagePlacement",
+        placements,
+        "Use [StagePlacement(stage, before='increment_steps')].",
+    )
     for placement in placements:
         expect(
             not isinstance(getattr(placement.stage, "__self__", None), Plugin),
@@ -245,11 +246,11 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
     """Return the pipeline whose integration applies the influences and derivatives of plugins."""
     dynamic_plugins = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
     constraining_names = [p.name for p in dynamic_plugins if p.constrains]
-    if len(constraining_names) > 1:
-        raise ConfigError(
-            f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining_names)}. Use "
-            f"one plugin for all drones; its parameters can differ between them."
-        )
+    require(
+        len(constraining_names) <= 1,
+        f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining_names)}. Use "
+        f"one plugin for all drones; its parameters can differ between them.",
+    )
     integration = getattr(pipeline.get("integration"), "fn", None)
     if isinstance(integration, Integration):
         return pipeline | {"integration": dataclasses.replace(integration, plugins=dynamic_plugins).stage()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,8 +24,8 @@ class Reset:
     for use inside another compiled function.
     """
 
-    def __init__(self, pipeline: Pipeline):
-        self._stages = tuple(pipeline.items())
+    def __init__(self, pipeline: Pipeline, check_data: Callable[[SimData], None] | None = None):
+        self._stages, self._check_data = tuple(pipeline.items()), check_data
         self._compiled = jax.jit(self.plain)
 
     def __call__(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
@@ -60,6 +61,8 @@ class Reset:
         for x in (data, default_data):
             require_data(x)
             x.check()
+        if self._check_data is not None:
+            self._check_data(data)
         for name, fn in self._stages:
             with jax.named_scope(name):
                 data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)

@@ -81,6 +81,7 @@ def rollout(
         n_control_steps % every == 0,
         f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it",
     )
+    require_memory_of_records(step, n_control_steps // every, jax.eval_shape(keep, data))
     staged = F.staged_leaves(leaf_indices(data))
     flat = step.flatten(data, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
     if wait and n_substeps > 1:
@@ -100,6 +101,13 @@ def rollout(
     return flat.data(), recordings
 
 
+def require_memory_of_records(step: Step, n_records: int, record: Any) -> None:
+    """Check that a number of records, given one or its shapes, fits into the memory of a step's devices."""
+    devices = step.location.devices or jax.devices(step.platform)[:1]
+    n_bytes, remedy = n_records * tree_bytes(record), "Keep less, or use several rollouts."
+    require_memory("the records of all steps", n_bytes, remedy, devices[0], len(devices))
+
+
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "wait")
 
 
@@ -107,10 +115,7 @@ STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "
 @functools.wraps(rollout)
 def compiled_rollout(step: Step, *args: Any, **settings: Any) -> tuple[SimData, Any]:
     """Return the results of ``rollout`` in one compiled call, which does not donate the buffers of its arguments."""
-    data, recordings = rollout(step, *args, **settings)
-    remedy, n_bytes = "Keep less, or use several rollouts.", tree_bytes(recordings)
-    require_memory("the records of all steps", n_bytes, remedy, jax.devices(step.platform)[0], jax.device_count())
-    return data, recordings
+    return rollout(step, *args, **settings)
 
 
 def run_rollout(

@@ -188,11 +188,12 @@ class Sim:
         self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        # The step refuses data of another scene if one of its plugins has read the scene.
         self._built_step = BuiltPipeline(
-            "step_pipeline", stages, lambda p: self._stepper.build(p, self.plugins.scene_check(self._default_data))
+            "step_pipeline", stages, lambda p: self._stepper.build(p, self.plugins.data_check(self._default_data))
         )
-        self._built_reset = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
+        self._built_reset = BuiltPipeline(
+            "reset_pipeline", {"reset": reset}, lambda p: Reset(p, self.plugins.plugin_check())
+        )
         for plugin in first_plugins:
             self.add(plugin)
 
@@ -509,6 +510,7 @@ class Sim:
     def reset_fn(self) -> Reset:
         """The reset of the pipeline as it is now, ``reset(data, default_data, mask=None) -> data``, pure."""
         self._adopt_scene()
+        self.plugins.check()
         return self._built_reset.fn()
 
     @locked

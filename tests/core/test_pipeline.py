@@ -89,8 +89,8 @@ def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
             UnknownNameError,
             "No stage named 'third' exists in the pipeline. Use one of first, second",
         ),
-        (lambda p: append_fn(p, partial(third)), ValueError, "needs an explicit name. Use name="),
-        (lambda p: append_fn(p, lambda x: x), ValueError, "needs an explicit name. Use name="),
+        (lambda p: append_fn(p, partial(third)), ValueError, "a name of a stage that is not a named function, got"),
+        (lambda p: append_fn(p, lambda x: x), ValueError, "a name of a stage that is not a named function, got"),
         (lambda p: append_fn(p, 3), ValueError, "expected a function as a stage, got 3"),
     ],
 )

@@ -555,6 +555,15 @@ class Unstaged(Plugin):
         return [StagePlacement(self.add_one)]
 
 
+class Functional(Plugin):
+    """A plugin whose stage is not a method."""
+
+    name: str = "functional"
+
+    def stages(self, sim):
+        return [StagePlacement(self.stage(lambda data: data))]
+
+
 class Undeclared(Plugin):
     """A plugin whose record declares nothing."""
 
@@ -572,9 +581,14 @@ class Sail(Plugin, requires=Wind):
 
 def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
     sim = Sim(engine="interpret")
+    earlier_step, earlier_data = sim.build_step_fn(), sim.data
     sim.add(Sail())
-    with pytest.raises(ConfigError, match="expected a simulation with a Wind, which Sail 'sail' needs, got 'sail'"):
-        sim.step()
+    earlier_step(earlier_data)
+    step, reset = sim.build_step_fn(), sim.build_reset_fn()
+    for act in (sim.step, sim.reset, lambda: step(sim.data), lambda: jax.eval_shape(step, sim.data),
+                lambda: reset(sim.data, sim.default_data)):  # fmt: skip
+        with pytest.raises(ConfigError, match="expected a simulation with a Wind, which Sail 'sail' needs, got 'sail'"):
+            act()
     sim.add(Wind())
     sim.step()
     with pytest.raises(ConfigError, match="expected no plugin that needs 'wind', got Sail 'sail'"):
@@ -591,6 +605,7 @@ def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
      UnknownNameError, "No stage named 'lunch'"),
     (lambda sim: sim.add(Unlisted()), ConfigError, "expected stages of plugin 'unlisted' to return a list"),
     (lambda sim: sim.add(Unstaged()), ConfigError, r"'unstaged' .*Use StagePlacement\(self.stage\(self.add_one\)\)"),
+    (lambda sim: sim.add(Functional()), ConfigError, r"a method of the plugin as its stage, got .*Use self.stage\("),
     (lambda sim: sim.add(Undeclared()), ConfigError, "expected record of plugin 'undeclared' to return a PyTree or"),
     (lambda sim: sim.remove("wake"), UnknownNameError, "got 'wake'. Added are: wind, latency"),
     (lambda sim: sim.replace(Wake()), UnknownNameError, "got 'wake'"),

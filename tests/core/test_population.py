@@ -319,10 +319,10 @@ def test_a_stage_of_a_population_that_does_not_exist_is_refused():
         return data
 
     insert_fn_before(sim.step_pipeline, "integration", drive)
-    with pytest.raises(ConfigError, match="'drive' is declared for one 'cars', and there is no population"):
+    with pytest.raises(ConfigError, match="'drive' is declared for one member of 'cars', and there is no population"):
         sim.step()
     sim.add(Springs(2))
-    with pytest.raises(ConfigError, match="there are 'springs'"):
+    with pytest.raises(ConfigError, match="Use one of 'drone', 'springs' or 'world'"):
         sim.step()
 
 
@@ -334,7 +334,7 @@ def test_a_stage_may_write_its_own_population_only():
         return data.replace(states=data.states.replace(pos=data.states.pos + 1))
 
     insert_fn_before(sim.step_pipeline, "integration", greedy)
-    with pytest.raises(ConfigError, match=r"'greedy' is declared for one springs and writes states\.pos"):
+    with pytest.raises(ConfigError, match=r"'greedy' is declared for one member of 'springs' and writes states\.pos"):
         sim.step()
 
 

@@ -167,6 +167,12 @@ def test_law_09_records_stages_and_scopes_that_are_incomplete_are_named():
 
     with pytest.raises(ConfigError, match=r"expected the roles of leaves of Bare.*Define roles"):
         Step({"tick": tick})(Bare(jnp.zeros((3, 1))), 1)
+
+    class Lost(Workshop):
+        height: jax.Array = leaf("drone")
+
+    with pytest.raises(ConfigError, match=r"expected data.height in a record of a population.*leaf\(.member.\)"):
+        Lost(**vars(make_workshop()), height=jnp.zeros((3, 2))).check()
     with pytest.raises(ConfigError, match="expected stages as a dict by name"):
         Step([swing])
     with pytest.raises(ConfigError, match=r"expected a scope, one of drone, member.*got 'membr'"):

@@ -167,6 +167,7 @@ WRONG_METHODS = {
     "info of the world": ("info", lambda s, d: {"wind": d.states.pos[0]},
                           r"info 'wind' of shape \(\) or \(n_drones, ...\) = \(2, ...\), got shape \(3,\)"),
     "of actions": ("rewards", lambda s, d, a, b: {"a": a}, r"reward term 'a' of .* got shape \(2, 4\)"),
+    "no info": ("info", lambda s, d: None, "info to return a dict .*, got a NoneType"),
     "error": ("error", lambda s, d: d.states.pos, r"error of shape \(n_drones,\) = \(2,\), got shape \(2, 3\)"),
     "ends for each": ("terminated", lambda s, d: d.states.pos[:, 2] < 0,
                       r"terminated of type bool and shape \(\), got shape \(2,\) .*jnp.any"),
@@ -261,6 +262,33 @@ def test_law_09_a_start_with_other_leaves_is_refused(two_drones):
 
     with pytest.raises(ConfigError, match=r"task 'still': expected spawn .*with \.plugins\['tsk'\].*plugins\['task'\]"):
         jax.eval_shape(DroneEnv(two_drones, Misspelt()).reset, jax.random.key(0))
+
+    class Flat(Still):
+        """One number of each drone in a record with an axis for it."""
+
+        def spawn(self, data, key):
+            return data.replace(params=data.params.replace(mass=jnp.zeros(2)))
+
+    sim = Sim(n_worlds=3, drone=["cf21B_500", "cf2x_L250"], control="attitude")
+    with pytest.raises(ConfigError, match=r"spawn to return \.params\.mass of shape \(2, 1\), got.*\[\.\.\., None\]"):
+        jax.eval_shape(DroneEnv(sim, Flat()).reset, jax.random.key(0))
+
+
+@pytest.mark.parametrize("method", ["spawn", "before_step", "after_spawn"])
+def test_law_09_a_method_that_returns_no_data_is_named(two_drones, method):
+    in_wrapper = method == "after_spawn"
+    returned = {method: lambda *args: None}
+    env = DroneEnv(two_drones, Still() if in_wrapper else type("Empty", (Still,), returned)())
+    env = type("Empty", (Wrapper,), returned)(env) if in_wrapper else env
+    with pytest.raises(ConfigError, match=f"expected {method} to return the data .* got a NoneType. .*return data"):
+        jax.eval_shape(env.reset, jax.random.key(0))
+
+
+def test_a_record_that_was_not_added_is_named(two_drones):
+    reads_goal = type("Goals", (Still,), {"observe": lambda self, data: {"goal": data.plugins["task"].goal}})
+    with pytest.raises(KeyError) as error:
+        DroneEnv(two_drones, reads_goal())
+    assert "self.add_record(sim, ...) in install" in "".join(error.value.__notes__)
 
 
 def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):

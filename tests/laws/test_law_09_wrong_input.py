@@ -13,7 +13,7 @@ from crazysim.core.data import command_shape
 from crazysim.envs.task_check import require_installed
 from crazysim.envs.tasks.race import Race
 from crazysim.media import View
-from crazysim.sim import use_box_collision
+from crazysim.sim import rollout, use_box_collision
 from crazysim.sim.visualize import change_material, draw_capsule, draw_points
 
 # Arguments, and parts of the message: the given value, then the expected one or the remedy.
@@ -119,6 +119,7 @@ def test_wrong_commands_leave_the_simulation_as_it_was(level_sim):
             assert level in str(error.value)
             for fragment in fragments:
                 assert fragment in str(error.value)
+            assert isinstance(error.value, ConfigError)
             assert sim.data is before
         tried += 1
     assert tried == 21
@@ -192,6 +193,11 @@ WRONG_CALLS = [
         lambda sim: sim.rollout(lambda params, data: jnp.zeros((*data.states.pos.shape[:2], 4)), None, 2 * 10**9),
         "expected arrays that fit into the ",
         "got the records of all steps",
+        "Keep less",
+    ),
+    (
+        lambda sim: rollout(sim.step_fn, sim.data, lambda params, data: None, None, 2 * 10**9, 1),  # outside of jit
+        "expected arrays that fit into the ",
         "Keep less",
     ),
     (lambda sim: sim.rollout(None, None, 4), "expected policy as a function, got None"),

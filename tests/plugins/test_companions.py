@@ -130,4 +130,6 @@ def test_plugins_follow_what_they_read(drawn):
         sim.replace(plugin)
     expected = build(dependant, [*others, later[-1]])
     assert list(sim.step_pipeline) == list(expected.step_pipeline)
+    for plugin in sim.plugins.values():
+        assert all(sensor is sim.plugins[sensor.name] for sensor in getattr(plugin, "sensors", ()))
     assert trees_equal(fly(sim), fly(expected))

@@ -19,7 +19,7 @@ from crazysim.core.plugin import Param, Plugin, Simulation, check_parameter, der
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import Setting
 from crazysim.engine.pytree import CORE_NDIM_KEY, Members, PyTree
-from crazysim.errors import ConfigError, expect, require, short_repr
+from crazysim.errors import ConfigError, expect, require
 from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
@@ -102,13 +102,9 @@ class Randomize(MovingAir, Plugin, requires=needs_rotors):
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
         super().__post_init__()
-        if self.is_bound:
-            return
-        if not isinstance(self.optional, (list, tuple)) or not all(name in RANGE_SETTINGS for name in self.optional):
-            raise ConfigError(
-                f"expected optional as a list of {', '.join(RANGE_SETTINGS)}, got {short_repr(self.optional)}. Use "
-                f"optional=('wind',), say."
-            )
+        is_list = isinstance(self.optional, (list, tuple)) and all(name in RANGE_SETTINGS for name in self.optional)
+        names = ", ".join(RANGE_SETTINGS)
+        expect(is_list, f"optional as a list of {names}", self.optional, "Use optional=('wind',), say.")
 
     @classmethod
     def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:

@@ -16,7 +16,9 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array, state
 from crazysim.core.settings import setting
-from crazysim.engine.stage import Stage
+from crazysim.engine.jaxcompat import Literal
+from crazysim.engine.stage import Stage, vmap_drones, vmap_worlds
+from crazysim.errors import require
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
@@ -52,6 +54,9 @@ sensors that are used by derivatives it is what an error of a state by 1e-3 m, m
 is an assumption, for sensors without noise and for float32."""
 NO_SLOPE = 1e-6
 """Change of a measurement per unit of a state below which it says nothing about the state, in their units."""
+
+MEASURED_STATES = ("pos", "vel", "quat", "ang_vel")
+"""States by whose derivatives the filter uses measurements of any sensor."""
 
 
 class ESKF(ErrorStateFilter):
@@ -94,6 +99,16 @@ class ESKF(ErrorStateFilter):
         links = [link for chain in sensor.chains.values() for link in chain]
         has_variance = all(type(x).variance is not Link.variance and not isinstance(x, Turned) for x in links)
         return super().can_fuse(sensor) or (sensor.measures_motion and bool(links) and has_variance)
+
+    def check_simulation(self, sim: Simulation) -> None:
+        super().check_simulation(sim)
+        for sensor in self.aiding_sensors(sim.data):
+            require(
+                type(sensor) in UPDATE_FNS or _has_slope(sensor, sim.data),
+                f"expected a measurement by {type(sensor).__name__} {sensor.name!r} that varies smoothly with "
+                f"{', '.join(MEASURED_STATES)}, by whose derivatives ESKF fuses it, got one without derivatives. Leave "
+                f"it out of the filter, or calculate ideal from data.states without steps and rounding.",
+            )
 
     def bind(self, sim: Simulation) -> ESKF:
         quat, zero = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
@@ -289,6 +304,23 @@ def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate)
             error = innovation - jnp.dot(slope, correction)
             estimate = error_state.update(estimate, [*POS, *VEL, *ATT, *GYRO], slope, error, std)
     return estimate
+
+
+def _has_slope(sensor: Sensor, data: SimData) -> bool:
+    """Whether the measurement of a sensor without errors has a derivative by a state that ``update_by_ideal`` uses."""
+    states = {name: getattr(data.states, name) for name in MEASURED_STATES}
+
+    ideal = vmap_worlds(vmap_drones(lambda drone: sensor.bound(drone).ideal(drone)))
+
+    def truth(states: dict[str, Array]) -> Array:
+        return ideal(data.replace(states=data.states.replace(**states)))
+
+    jaxpr = jax.make_jaxpr(lambda tangents: jax.jvp(truth, (states,), (tangents,))[1])(states).jaxpr
+    dependent = set(jaxpr.invars)
+    for eqn in jaxpr.eqns:
+        if any(x in dependent for x in eqn.invars if not isinstance(x, Literal)):
+            dependent.update(eqn.outvars)
+    return any(x in dependent for x in jaxpr.outvars if not isinstance(x, Literal))
 
 
 def _update_by_gps(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
 from crazysim.engine.stage import Stage, as_stages
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, expect
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -43,11 +43,9 @@ class Estimator(Plugin):
     def __post_init__(self) -> None:
         """Check that ``sensors`` is a list of sensors."""
         super().__post_init__()
-        if self.is_bound:
-            return
-        if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
-            example = f"{type(self).__name__}([IMU(), MotionCapture()])"
-            raise ConfigError(f"expected sensors as a list, got {short_repr(self.sensors)}. Use {example}, say.")
+        is_list = isinstance(self.sensors, (list, tuple)) and all(isinstance(x, Sensor) for x in self.sensors)
+        example = f"{type(self).__name__}([IMU(), MotionCapture()])"
+        expect(self.is_bound or is_list, "sensors as a list", self.sensors, f"Use {example}, say.")
 
     @classmethod
     def default(cls) -> Estimator:
@@ -81,6 +79,10 @@ class Estimator(Plugin):
     @property
     def companions(self) -> Mapping[str, type]:
         return {} if self.is_bound else {sensor.name: type(sensor) for sensor in self.sensors}
+
+    def with_companions(self, plugins: Mapping[str, Plugin]) -> Self:
+        sensors = [plugins.get(sensor.name, sensor) for sensor in self.sensors]
+        return self if sensors == [*self.sensors] else self.replace(sensors=sensors)
 
     def bound_sensors(self, data: SimData) -> list[Sensor]:
         """Return all sensors as they are in ``data.plugins``."""
@@ -141,7 +143,10 @@ class Estimator(Plugin):
             present: Any = sim.plugins.get(sensor.name)
             sensor = present if isinstance(present, type(sensor)) else sensor
             if not isinstance(sensor, IMU) and not self.can_fuse(sensor):
-                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
+                raise ConfigError(
+                    f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}. Leave it out, or "
+                    f"use ESKF with chains of errors that have a variance, such as {{'pos': (White('noise'),)}}."
+                )
         super().check_simulation(sim)
 
     def _estimate_controller(self, controller: Stage) -> Stage:

@@ -20,7 +20,7 @@ from crazysim.core.random import drone_key, normal, uniform
 from crazysim.core.settings import default_rates, dividing_rate, setting
 from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import is_tick
-from crazysim.errors import ConfigError, expect, require
+from crazysim.errors import expect, require
 from crazysim.plugins.sensors.errors import Link
 from crazysim.tables import range_between
 
@@ -137,10 +137,9 @@ class Sensor(Plugin):
 
     def first_samples(self, sim: Simulation) -> Samples:
         """Return ``samples`` before the first measurement; check the common settings."""
-        if not self.channels:
-            raise ConfigError(
-                f"expected channels of {type(self).__name__}, got none. Use channels = {{'pos': 3}}, say."
-            )
+        require(
+            self.channels, f"expected channels of {type(self).__name__}, got none. Use channels = {{'pos': 3}}, say."
+        )
         require(
             self.chains.keys() <= self.channels.keys(),
             f"expected chains of {self.name!r} for channels {', '.join(self.channels)}, got {', '.join(self.chains)}",
@@ -157,11 +156,11 @@ class Sensor(Plugin):
         freq = self.rate(sim.data.core.freq)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * freq + 0.5) + 2 if max_delay > 0 else 0
-        if n_rows > MAX_ROWS:
-            raise ConfigError(
-                f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
-                f"{max_delay} s. Use a shorter delay or a lower freq=."
-            )
+        require(
+            n_rows <= MAX_ROWS,
+            f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
+            f"{max_delay} s. Use a shorter delay or a lower freq=.",
+        )
         delay, jitter = (
             check_parameter(sim, name, getattr(self, name), allowed=range_between(0.0, max_delay))
             for name in ("delay", "jitter")
@@ -190,6 +189,13 @@ class Sensor(Plugin):
     def latest(self, data: SimData) -> Array:
         """Return the latest measurement of one drone; before the first arrives, one without errors. (k,)"""
         self = self.read(data)
+        expect(
+            data.states.pos.ndim == 1,
+            f"the data of one drone in {type(self).__name__}.latest",
+            data.states.pos.shape,
+            "Use vmap_drones(sensor.latest)(data) of crazysim.engine in one world, as in a task, and "
+            "sim.plugins.observations(sim.data) for all worlds.",
+        )
         return jnp.where(self.samples.taken_step >= 0, self.samples.value, self.ideal(data))
 
     def part(self, data: SimData, channel: str) -> Array:

@@ -413,7 +413,30 @@ class UnknownProbe(BodyVelocity):
     chains: ClassVar = {"vel": [OwnError()]}
 
 
-@pytest.mark.parametrize("kind", [TurnedProbe, UnknownProbe])
-def test_law_09_sensors_without_a_variance_are_refused(kind):
-    with pytest.raises(ConfigError, match=f"expected sensors of the kinds .* got {kind.__name__}"):
+class Clicks(BodyVelocity):
+    """A probe of whole metres per second, which have no derivative."""
+
+    name: str = "clicks"
+
+    def ideal(self, data):
+        return jnp.round(super().ideal(data))
+
+
+class RotorProbe(BodyVelocity):
+    """A probe of states that the filter does not estimate."""
+
+    name: str = "rotor_probe"
+
+    def ideal(self, data):
+        return data.states.rotor_vel[:3]
+
+
+@pytest.mark.parametrize("kind, words", [
+    (TurnedProbe, "sensors of the kinds .* got TurnedProbe. .*chains"),
+    (UnknownProbe, "sensors of the kinds .* got UnknownProbe. .*chains"),
+    (Clicks, "a measurement by Clicks 'clicks' .*pos, vel, quat, ang_vel.* without derivatives. .*ideal"),
+    (RotorProbe, "a measurement by RotorProbe 'rotor_probe' .* without derivatives. .*ideal"),
+])  # fmt: skip
+def test_law_09_sensors_without_a_variance_or_a_slope_are_refused(kind, words):
+    with pytest.raises(ConfigError, match=f"expected {words}"):
         Sim(estimator=ESKF([IMU(), kind()]))
