@@ -243,16 +243,9 @@ def entry_of(task: str | Task, is_named: bool = True) -> Entry:
 
 
 def _check_class(task: object) -> type[Task]:
-    """Return a task class, after checking that its settings are dataclass fields."""
+    """Return a task class after checking that it is one."""
     if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
-    fields = {f.name for f in dataclasses.fields(task)}
-    annotations = inspect.get_annotations(task).items()
-    if non_fields := [name for name, kind in annotations if name not in fields and "ClassVar" not in str(kind)]:
-        raise ConfigError(
-            f"expected {', '.join(non_fields)} as a setting of a dataclass, got the class {task.__name__} without the "
-            f"decorator. Write @dataclass(frozen=True, kw_only=True) above it."
-        )
     return task
 
 

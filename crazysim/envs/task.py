@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, dataclass_transform
 
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, StagePlacement
+from crazysim.core.plugin import FunctionPlugin, StagePlacement, state
 from crazysim.core.settings import check_settings, setting
-from crazysim.engine.pytree import PyTree
+from crazysim.engine.pytree import PyTree, device_array, static
+from crazysim.engine.stage import Stage
 from crazysim.envs.state import Obs
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, expect
 from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.sim.sim import Sim
 
@@ -23,20 +26,23 @@ TASK_RECORD_NAME = "task"
 """Name of a task's record in ``data.plugins``."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(setting, state, static, dataclasses.field)
+)
 class Task:
-    """A task: settings in a frozen dataclass, and methods that are pure functions of one world.
+    """A task: settings, states and methods that are pure functions of one world.
 
-    Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
-    ``error``, and whatever else they need. In the data that they receive, arrays per drone are (n_drones, ...), and
-    arrays per world have no batch axes. A task keeps state between steps in a record ``data.plugins["task"]``, which
-    ``install`` adds.
+    Subclasses define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and ``error``, and whatever else
+    they need; each becomes a frozen dataclass of its settings. A state between steps is declared with
+    ``crazysim.state``, as in a plugin: ``self.read(data).passed`` reads it, and ``self.write(data, passed=...)``
+    returns data with another value. In the data that methods receive, arrays per drone are (n_drones, ...), and arrays
+    per world have no batch axes.
     """
 
     name: ClassVar[str] = ""
     """Name in messages and files; also the name of its random stream."""
     Record: ClassVar[type[PyTree] | None] = None
-    """Type of the record in ``data.plugins["task"]``; None if there is none."""
+    """Type of ``data.plugins["task"]``, which has the states; None if there are none."""
     batched: ClassVar[bool] = False
     """True for a task that needs all worlds at once. Its methods then receive the data of all worlds, with all batch
     axes, and one key per world. The phases of an environment step are then not fused."""
@@ -53,22 +59,52 @@ class Task:
     hold: float = setting(default=1.0, low=0.0)
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        _move_states_to_record(cls)
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
         check_settings(self)
 
     def install(self, sim: Sim) -> None:
-        """Add the objects, the record and the stages of the task to a simulation. Call it once, before ``DroneEnv``."""
+        """Add states and stages of the task to a simulation, once, before ``DroneEnv``.
 
-    def add_record(self, sim: Sim, record: PyTree, placements: Sequence[StagePlacement] = ()) -> None:
-        """Add the task's record, for all worlds, and stages that update it; for use in ``install``.
+        Override it for objects, plugins, and stages that need them; end with ``self.add_states(sim, ...)``.
+        """
+        self.add_states(sim)
+
+    def add_states(self, sim: Sim, placements: Sequence[StagePlacement] = (), **initial: Any) -> None:
+        """Add the states and stages of the task to a simulation; for use in ``install``.
 
         Args:
             sim: The simulation.
-            record: The record, for ``data.plugins["task"]``.
             placements: Stages with their positions, such as ``StagePlacement(stage, before="increment_steps")``.
+            initial: First values of states, and values of ``static`` fields; other states are zero at first.
         """
+        record = None if self.Record is None else self.Record(**_initial_states(sim, self.Record, initial))
+        if type(self).after_substep is not Task.after_substep:
+            judge = Stage(self.after_substep, "drone", name=TASK_RECORD_NAME)
+            placements = [*placements, StagePlacement(judge, before="increment_steps")]
         sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
+
+    @property
+    def has_states(self) -> bool:
+        """Whether the task has states, or a stage in every physics step, which ``install`` must add."""
+        return self.Record is not None or type(self).after_substep is not Task.after_substep
+
+    def read(self, data: SimData) -> Any:
+        """Return the states of the task in data of any scope, as attributes."""
+        return data.plugins[TASK_RECORD_NAME]
+
+    def write(self, data: SimData, **changes: Any) -> SimData:
+        """Return data of any scope with other values of some states."""
+        return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: self.read(data).replace(**changes)})
+
+    def after_substep(self, data: SimData) -> SimData:
+        """Return the data of one drone after a physics step; count, measure or judge here what must not be missed."""
+        return data
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return the data at the start of an episode, goals included.
@@ -159,6 +195,53 @@ class Task:
 
     def _undefined(self, method: str) -> str:
         return f"task {self.name!r}: expected class {type(self).__name__} to define {method}; see docs/guides/tasks.md"
+
+
+class _State:
+    """Attribute of a task's class in place of a state, whose values are in the data."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __get__(self, task: Task | None, owner: type[Task]) -> Any:
+        raise AttributeError(
+            f"expected data from which to read {self._name!r}, a state of {owner.__name__}. Use "
+            f"self.read(data).{self._name}, and self.write(data, {self._name}=...)."
+        )
+
+
+def _move_states_to_record(cls: type[Task]) -> None:
+    """Make ``cls.Record`` of the states and static fields that a class declares, which are no settings of the task."""
+    fields = {name: f for name, f in vars(cls).items() if isinstance(f, dataclasses.Field)}
+    states = {name: f for name, f in fields.items() if "scope" in f.metadata or f.metadata.keys() == {"static"}}
+    if not states:
+        return
+    hints = inspect.get_annotations(cls)
+    cls.__annotations__ = {name: hint for name, hint in hints.items() if name not in states}
+    for name in states:
+        setattr(cls, name, _State(name))
+    namespace = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.Record"}  # where pickles look
+    hints = {"__annotations__": {name: hints[name] for name in states}}
+    cls.Record = type("Record", (cls.Record or PyTree,), {**namespace, **hints, **states})
+
+
+def _initial_states(sim: Sim, record: type[PyTree], initial: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a record for all worlds."""
+    fields = {f.name: f.metadata for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+    expect(
+        initial.keys() <= fields.keys(), f"states among {', '.join(fields)}", ", ".join(initial.keys() - fields.keys())
+    )
+    values = dict(initial)
+    for name, metadata in fields.items():
+        value = values.get(name)
+        if "scope" not in metadata or (value is None and metadata["optional"]):
+            values.setdefault(name, None)
+            continue
+        batch = (sim.n_worlds, 1) if metadata["scope"] == "world" else (sim.n_worlds, sim.n_drones)
+        core = np.shape(value) if any(isinstance(n, str) for n in metadata["shape"]) else metadata["shape"]
+        dtype = metadata["dtype"] or sim.data.states.pos.dtype
+        values[name] = device_array(np.broadcast_to(0 if value is None else value, (*batch, *core)), dtype)
+    return values
 
 
 def sum_terms(terms: Mapping[str, Array]) -> Array:

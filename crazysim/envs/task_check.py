@@ -33,9 +33,13 @@ def require_installed(sim: Sim, task: object) -> None:
     require(isinstance(task, Task), f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
     require(
-        task.Record is None or isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record),
-        f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
-        f"task.install(sim) first, or use crazysim.envs.make.",
+        not task.has_states
+        or (
+            TASK_RECORD_NAME in sim.plugins
+            and isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record or object)
+        ),
+        f"expected a simulation in which task {task.name!r} is installed, got one without its states. Call "
+        f"task.install(sim) first, or use crazysim.envs.make; an install of your own ends with self.add_states(sim).",
     )
 
 

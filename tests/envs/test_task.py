@@ -123,7 +123,6 @@ def test_keys_depend_on_seed_world_episode_and_name_only():
     np.testing.assert_array_equal(words(later_step), first)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Still(Task):
     """A task of two drones that does nothing."""
 
@@ -320,7 +319,6 @@ def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):
 
 
 def test_law_09_missing_methods_are_named(two_drones):
-    @dataclasses.dataclass(frozen=True, kw_only=True)
     class Incomplete(Task):
         """A task without observations and an error."""
 

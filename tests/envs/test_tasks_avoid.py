@@ -106,7 +106,7 @@ def test_hits_disable_and_arriving_is_a_success(start_state):
     pos[8, 0] = pos[8, 1] + [0.1, 0, 0]  # a drone that is disabled
     disabled = np.zeros((N_WORLDS, 2), bool)
     disabled[8, 0] = True
-    after = step(place_drones(state, pos, disabled=disabled), state.action)
+    after = step(place_drones(state, pos, failure=disabled), state.action)
     expected = np.zeros((N_WORLDS, 2), bool)
     expected[2:9, 0] = True
     expected[7, 1] = True

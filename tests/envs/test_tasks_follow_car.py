@@ -50,7 +50,7 @@ def test_every_car_drives_in_its_own_way(env, start_state):
         speeds.append(np.asarray(car.body_vel)[:, 0, 0])
         yaws.append(np.asarray(car.yaw)[:, 0, 0])
     speeds, yaws = np.array(speeds), np.array(yaws)
-    expected = vmap_worlds(lambda d: d.plugins["task"].command(d.core.steps / d.core.freq))(data)
+    expected = vmap_worlds(lambda d: env.task.command(d, d.core.steps / d.core.freq))(data)
     np.testing.assert_allclose(speeds[-1], np.asarray(expected)[:, 0, 0], atol=0.1)
     assert speeds.min() > -0.05
     assert speeds.max() < 1.25

@@ -142,7 +142,6 @@ def test_a_policy_flies_its_task_a_derived_one_and_functions_fly_any(env, loaded
     state = env.reset(jax.random.key(0))
     np.testing.assert_array_equal(policy(state.obs), policy.replace(interface=None)(state.obs))
 
-    @dataclasses.dataclass(frozen=True, kw_only=True)
     class Derived(Hover):
         """Hover under another name; its code is longer."""
 
@@ -181,7 +180,6 @@ def scaled(x):
     """Return velocities in the unit."""
     return UNIT * x
 
-@dataclass(frozen=True, kw_only=True)
 class Mine(Hover):
     """Hover."""
 

@@ -1,6 +1,5 @@
 """Policies with memory, custom networks, and critics with more inputs than the policy."""
 
-import dataclasses
 import functools
 import re
 from pathlib import Path
@@ -105,12 +104,11 @@ def test_gradients_flow_back_in_time_to_the_start_of_an_episode(rng):
     np.testing.assert_array_equal(grads[:, 1] > 0, [False, False, False, True, True, True])
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Recall(Hover):
     """A cue is observed only in the first step of an episode, and determines the reward of all steps."""
 
     def _cue(self, data):
-        return jnp.where(data.plugins["task"].pos[..., :1] > data.states.pos[..., :1], 1.0, -1.0)
+        return jnp.where(data.plugins["task"].goal[..., :1] > data.states.pos[..., :1], 1.0, -1.0)
 
     def observe(self, data):
         """Return the cue in the first step, and zero later."""

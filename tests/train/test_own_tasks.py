@@ -4,7 +4,6 @@ import importlib.metadata
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 
 import gymnasium
 import jax
@@ -29,7 +28,6 @@ import crazysim.envs as envs
 from crazysim.envs.tasks.hover import Hover
 
 
-@dataclass(frozen=True, kw_only=True)
 class High(Hover):
     'Hover high.'
 
@@ -138,7 +136,6 @@ def test_a_list_that_others_can_write_is_not_used(file, own_list, monkeypatch):
         TrainConfig(f"{file}:High", "ppo", 0, 4, {}, {}).make_env(1)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Low(Hover):
     """Hover low."""
 

@@ -600,7 +600,6 @@ def test_values_stay_when_the_returns_that_scale_them_change(rng):
 def test_ppo_finds_the_action_that_pays():
     """With a reward that is largest at 0.5, thirty iterations move the action from 0 to 0.5."""
 
-    @dataclasses.dataclass(frozen=True, kw_only=True)
     class RewardedAction(Hover):
         """Hovering with a reward for the action only."""
 

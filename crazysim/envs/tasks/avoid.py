@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,22 +10,14 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import device_array, leaf, static
+from crazysim.engine.pytree import static
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.goals import (
-    Crossing,
-    CrossingTask,
-    crossing_of,
-    install_rules,
-    nearest_drones,
-    nearest_entries,
-    state_of,
-    with_record,
-)
+from crazysim.envs.tasks.goals import OutcomeTask, collision_placements, nearest_drones, nearest_entries, state_of
 from crazysim.envs.tracks import ranks
 from crazysim.errors import require
 from crazysim.scene.objects import Handle
@@ -52,15 +43,6 @@ SPACING = 0.6
 """Distance between the mean positions of neighbouring starts, and of neighbouring goals, m."""
 
 
-class FieldCrossing(Crossing):
-    """Goal of each drone, and the outcome of its flight."""
-
-    remaining_way_before: Array = leaf("drone", 0)
-    """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
-    handles: tuple[Handle, ...] = static()
-    """Handles of the poles, then of the boxes."""
-
-
 class Field(NamedTuple):
     """Dimensions of the field and the arena for a number of drones."""
 
@@ -74,8 +56,7 @@ class Field(NamedTuple):
     """Mean positions of the goals, m; mean positions of the starts have the opposite x. (n_drones, 3)"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Avoid(CrossingTask):
+class Avoid(OutcomeTask):
     """Fly about 4.7 m through a field of obstacles, which have new positions in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches an obstacle,
@@ -84,7 +65,7 @@ class Avoid(CrossingTask):
     """
 
     name = "avoid"
-    Record = FieldCrossing
+    outcomes = ("reached", "disabled")
     film_view = {"elevation": -35}
 
     n_poles: int = setting(default=8, low=0)
@@ -97,6 +78,12 @@ class Avoid(CrossingTask):
     """Length of an episode, s."""
     tolerance: float = 0.2
     """Distance within which a drone has reached its goal, m."""
+    goal: Array = state((3,))
+    """Goal of the drone, m."""
+    remaining_way_before: Array = state(())
+    """Distance from the goal before this environment step, m."""
+    handles: tuple[Handle, ...] = static()
+    """Handles of the poles, then of the boxes."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,22 +115,18 @@ class Avoid(CrossingTask):
                 sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX_WIDTH, BOX_WIDTH, BOX_WIDTH))
             )
         contacts = sim.scene.contact_fn(handles, drones=False)
-        shape = (sim.n_worlds, sim.n_drones)
-        zero = device_array(np.zeros((*shape, 3)), sim.data.states.pos.dtype)
-        false = device_array(np.zeros(shape), bool)
         half_size = self.field(sim.n_drones).arena_half_size
 
         @stage("drone")
-        def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the arena; mark one that reaches its goal."""
-            record, pos = crossing_of(data), data.states.pos
+        def judge(data: SimData) -> SimData:
+            pos = data.states.pos
             has_left = jnp.any(jnp.abs(pos[:2]) > half_size.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
-            offset = pos - record.goal
+            offset = pos - self.read(data).goal
             has_arrived = rotation.dot(offset, offset)[0] < self.tolerance**2
-            return with_record(data, record.updated(has_left | contacts(data).any, has_arrived))
+            return self.judge(data, has_arrived, has_left | contacts(data).any)
 
-        record = FieldCrossing(zero, false, false, false, zero[..., 0], tuple(handles))
-        install_rules(sim, record, update_record, checks_collisions=True)
+        placements = [*collision_placements(sim), StagePlacement(judge, before="increment_steps")]
+        self.add_states(sim, placements, handles=tuple(handles))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight before the field, and obstacles in different cells."""
@@ -161,19 +144,19 @@ class Avoid(CrossingTask):
         angle = jnp.pi * shift[:, 3:] / 2
         pos = jnp.concatenate([cell_pos, height[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
-        first_row, record = 0, crossing_of(data)
-        for handle in record.handles:
+        first_row = 0
+        for handle in self.read(data).handles:
             rows = slice(first_row, first_row + len(handle))
             data, first_row = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
         offset, goal_shift, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
         start = goals * np.array([-1, 1, 1], dtype) + START_JITTER * offset
         data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        return with_record(data, record.replace(goal=goals + START_JITTER * goal_shift))
+        return self.write(data, goal=goals + START_JITTER * goal_shift)
 
     def before_step(self, data: SimData) -> SimData:
         data = super().before_step(data)
-        return with_record(data, crossing_of(data).replace(remaining_way_before=self.error(data)))
+        return self.write(data, remaining_way_before=self.error(data))
 
     def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
         """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
@@ -182,7 +165,7 @@ class Avoid(CrossingTask):
             Vectors to the nearest point of each obstacle, m, and vectors from that point to the middle of a box, m,
             which are zero for poles. (n_drones, n, 3) each, with n at most ``n_seen``
         """
-        dtype, handles = data.states.pos.dtype, crossing_of(data).handles
+        dtype, handles = data.states.pos.dtype, self.read(data).handles
         rows = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
         n_poles, n_boxes = self.n_poles, self.n_boxes
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
@@ -211,17 +194,17 @@ class Avoid(CrossingTask):
         n_drones = data.core.n_drones
         to_nearest, to_middle = self.nearest_obstacles(data)
         obs = state_of(data) | {
-            "difference_to_goal": crossing_of(data).goal - data.states.pos,
+            "difference_to_goal": self.read(data).goal - data.states.pos,
             "obstacles_near": to_nearest.reshape(n_drones, -1),
             "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
-            relative_pos, _ = nearest_drones(data, 2, ~crossing_of(data).flight_over)
+            relative_pos, _ = nearest_drones(data, 2, ~self.flight_over(data))
             obs["drones_near"] = relative_pos.reshape(n_drones, -1)
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record = crossing_of(data)
+        record = self.read(data)
         gap = rotation.safe_norm(self.nearest_obstacles(data)[0][..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
         reward_terms = {
@@ -230,14 +213,17 @@ class Avoid(CrossingTask):
             "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "reached": 10.0 * record.reached,
-            "disabled": -10.0 * record.disabled,
+            "reached": 10.0 * record.success,
+            "disabled": -10.0 * record.failure,
         }
         return terms.only_where(~record.flight_over_before, reward_terms)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""
-        return rotation.safe_norm(crossing_of(data).goal - data.states.pos)[..., 0]
+        return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
-        return with_record(data, crossing_of(data).replace(goal=pos))
+        return self.write(data, goal=pos)
+
+    def target(self, data: SimData) -> Array:
+        return self.read(data).goal

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -15,7 +13,7 @@ from crazysim.core.settings import setting
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry
-from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome
+from crazysim.envs.tasks.touch_down import TouchDown
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
@@ -35,7 +33,6 @@ TOUCH_DOWN_RADIUS = 0.12
 """Largest horizontal distance of a drone from the middle of the roof at touch-down, m."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Chase(TouchDown):
     """Chase a car and land on its roof.
 
@@ -60,7 +57,7 @@ class Chase(TouchDown):
         sim.add(cars)
         contacts = sim.scene.contact_fn([f"{CARS}:{k}" for k in range(sim.n_drones)], drones=False)
         touch = StagePlacement(self.touch_down_stage(contacts, TOUCH_DOWN_RADIUS, "world"), before="increment_steps")
-        self.add_record(sim, Landing(**initial_outcome(sim.data)), [touch])
+        self.add_states(sim, [touch])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight around them."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,14 +11,13 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
+from crazysim.core.plugin import state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import device_array, leaf
-from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
-from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
+from crazysim.envs.tasks.bring_load import BringLoad
+from crazysim.envs.tasks.goals import pick_entry, state_of
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
@@ -50,14 +48,6 @@ DROP_HEIGHT = 0.15
 """Height of a ring below which a load that was taken is dropped, m; rings on trailers are higher."""
 
 
-class TrailerDelivery(Delivery):
-    """Goal of each load, whether the hook has taken the load, and the outcome of its flight."""
-
-    taken: Array = leaf("drone", 0)
-    """True where the hook has taken the load off the trailer. (n_worlds, n_drones)"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Deliver(BringLoad):
     """Pick up a load from a moving trailer with a hook, and hold it at a goal.
 
@@ -70,7 +60,6 @@ class Deliver(BringLoad):
     """
 
     name = "deliver"
-    Record = TrailerDelivery
     film_view = {"elevation": -20}
 
     mass: float = setting(default=0.008, low=1e-4, high=1.0)
@@ -81,6 +70,8 @@ class Deliver(BringLoad):
     """Largest speed of a car, m/s; the smallest speed is 0.3 times that."""
     seconds: float = 8.0
     """Length of an episode, s."""
+    taken: Array = state((), dtype=bool)
+    """True where the hook has taken the load off the trailer."""
 
     def install(self, sim: Sim) -> None:
         car_positions = SPACING * grid_2d(sim.n_drones)
@@ -95,19 +86,17 @@ class Deliver(BringLoad):
         }
         sim.add(Hook(self.mass, length=self.length, size=LOAD_SIZE, ring=RING_HEIGHT, load_at=rings, **hook))
 
-        @stage("drone")
-        def update_record(data: SimData) -> SimData:
-            """Move each load that was not taken along with its trailer; record pick-ups, deliveries and crashes."""
-            load = data.plugins["load"]
-            taken = delivery_of(data).taken | load.attached
-            ring, vel = (pick_entry(x, data.core.drone_id) for x in ring_motion(data.plugins[CARS]))
-            load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=jnp.where(taken, load.vel, vel))
-            data = data.replace(plugins=data.plugins | {"load": load})
-            crashed = has_left_arena(data) | (taken & (load.pos[2] < DROP_HEIGHT))
-            return with_record(data, self.update_outcome(data, crashed).replace(taken=taken))
+        self.add_states(sim)
 
-        not_taken = device_array(np.zeros((sim.n_worlds, sim.n_drones)), bool)
-        install_rules(sim, TrailerDelivery(**initial_outcome(sim.data), taken=not_taken), update_record)
+    def after_substep(self, data: SimData) -> SimData:
+        """Move a load that was not taken along with its trailer; record pick-up, delivery and crash."""
+        load = data.plugins["load"]
+        taken = self.read(data).taken | load.attached
+        ring, vel = (pick_entry(x, data.core.drone_id) for x in ring_motion(data.plugins[CARS]))
+        load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=jnp.where(taken, load.vel, vel))
+        data = data.replace(plugins=data.plugins | {"load": load})
+        crashed = has_left_arena(data) | (taken & (load.pos[2] < DROP_HEIGHT))
+        return self.write(self.update_outcome(data, crashed), taken=taken)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, loads on their trailers, drones in flight above the loads, and goals."""
@@ -139,7 +128,7 @@ class Deliver(BringLoad):
         )
         data = data.replace(plugins=data.plugins | {CARS: car, "load": load})
         goal = scale_to(x["goal"], *np.array(GOAL_BOX)) + initial_car_pos(data)
-        return with_record(data, delivery_of(data).replace(goal=goal))
+        return self.write(data, goal=goal)
 
     def remaining_way(self, data: SimData) -> Array:
         """Return the distance of the hook from the ring plus the task error, m. (...)"""
@@ -154,7 +143,7 @@ class Deliver(BringLoad):
         ``difference_to_goal``, m, is the vector from the ring to its goal. ``taken`` is 1 after the hook has taken the
         load, and 0 before.
         """
-        s, load, record = data.states, data.plugins["load"], delivery_of(data)
+        s, load, record = data.states, data.plugins["load"], self.read(data)
         return state_of(data) | {
             "hook_pos": load.tip_pos - s.pos,
             "hook_vel": load.tip_vel - s.vel,
@@ -165,7 +154,7 @@ class Deliver(BringLoad):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, load, way = delivery_of(data), data.plugins["load"], self.remaining_way(data)
+        record, load, way = self.read(data), data.plugins["load"], self.remaining_way(data)
         distance = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         relative_speed = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
@@ -174,11 +163,11 @@ class Deliver(BringLoad):
             "proximity": 2.0 * record.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -5.0 * record.crashed,
+            "crash": -5.0 * record.failure,
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
-        return {"taken": delivery_of(data).taken} | super().info(data)
+        return {"taken": self.read(data).taken} | super().info(data)
 
     def subjects(self, data: SimData) -> Array:
         return data.plugins["load"].pos

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import TASK_RECORD_NAME, Task
+from crazysim.envs.task import Task
 from crazysim.envs.tasks.chase import CARS, VEHICLE, rolling_car
-from crazysim.envs.tasks.goals import motion_of, with_record
+from crazysim.envs.tasks.goals import motion_of
 from crazysim.envs.tasks.target_camera import TargetCamera
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
@@ -42,25 +40,6 @@ MAX_YAW = 0.3
 """Largest angle between a car's mean heading at the start and the x axis, rad."""
 
 
-class Manoeuvre(PyTree):
-    """Commands of each drone's car: the speed oscillates about a mean, and the steering angle about zero."""
-
-    speed: Array = leaf("drone", 1)
-    """Mean speed, m/s. (n_worlds, n_drones, 1)"""
-    amplitude: Array = leaf("drone", 1)
-    """Amplitude of speed, m/s, and steering angle, rad. (n_worlds, n_drones, 2)"""
-    ang_freq: Array = leaf("drone", 1)
-    """Angular frequency of speed and steering angle, rad/s. (n_worlds, n_drones, 2)"""
-    phase: Array = leaf("drone", 1)
-    """Phase of speed and steering angle at the start of the episode, rad. (n_worlds, n_drones, 2)"""
-
-    def command(self, time: Array) -> Array:
-        """Return speed, m/s, and steering angle, rad, at a time since the start of the episode, s. (..., 2)"""
-        oscillation = self.amplitude * jnp.sin(self.ang_freq * time + self.phase)
-        return jnp.concatenate([self.speed + oscillation[..., :1], oscillation[..., 1:]], axis=-1)
-
-
-@dataclass(frozen=True, kw_only=True)
 class FollowCar(Task):
     """Stay behind and above a car that the drone observes with a camera.
 
@@ -74,7 +53,6 @@ class FollowCar(Task):
     """
 
     name = "follow_car"
-    Record = Manoeuvre
     film_view = {"follow": 0, "distance": 3.0, "azimuth": 30.0, "elevation": -25.0}
 
     speed: float = setting(default=1.2, low=0.0, high=3.0)
@@ -84,32 +62,41 @@ class FollowCar(Task):
     tolerance: float = 0.3
     """Distance from the point behind and above the car below which the drone follows the car, m."""
 
+    car_speed: Array = state()
+    """Mean speed of the car, m/s."""
+    amplitude: Array = state((2,))
+    """Amplitude of its speed, m/s, and steering angle, rad; the steering angle oscillates about zero."""
+    ang_freq: Array = state((2,))
+    """Angular frequency of speed and steering angle, rad/s."""
+    phase: Array = state((2,))
+    """Phase of speed and steering angle at the start of the episode, rad."""
+
     def install(self, sim: Sim) -> None:
         y = SPACING * (np.arange(sim.n_drones) - (sim.n_drones - 1) / 2)
         pos = np.stack([0 * y, y], axis=-1)
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, pos=pos, level="speed", name=CARS))
-        shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
-        scalars, pairs = (device_array(np.zeros((*shape, n)), dtype) for n in (1, 2))
-        self.add_record(sim, Manoeuvre(scalars, pairs, pairs, pairs))
+        self.add_states(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight behind them."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, ang_freq=2, phase=2)
         low, high = np.array(ANG_FREQ_RANGES).T
         steer = scale_to(x["steer"], *STEER_RANGE)
-        manoeuvre = Manoeuvre(
-            speed=self.speed * scale_to(x["speed"], *SPEED_RANGE),
+        data = self.write(
+            data,
+            car_speed=self.speed * scale_to(x["speed"], *SPEED_RANGE),
             amplitude=jnp.concatenate([jnp.full_like(steer, self.speed * SPEED_AMPLITUDE), steer], axis=-1),
             ang_freq=scale_to(x["ang_freq"], low, high),
             phase=2 * np.pi * x["phase"],
         )
-        speed, steer = jnp.split(manoeuvre.command(jnp.zeros_like(steer)), 2, axis=-1)
+        speed, steer = jnp.split(self.command(data, jnp.zeros_like(steer)), 2, axis=-1)
+        drive = self.read(data)
         # The heading oscillates about its mean with this amplitude, rad.
-        yaw_amplitude = manoeuvre.speed * jnp.tan(manoeuvre.amplitude[..., 1:]) / load_vehicle(VEHICLE).wheelbase
-        yaw_amplitude = yaw_amplitude / manoeuvre.ang_freq[..., 1:]
-        yaw = scale_symmetric(x["yaw"], MAX_YAW) - yaw_amplitude * jnp.cos(manoeuvre.phase[..., 1:])
+        yaw_amplitude = drive.car_speed * jnp.tan(drive.amplitude[..., 1:]) / load_vehicle(VEHICLE).wheelbase
+        yaw_amplitude = yaw_amplitude / drive.ang_freq[..., 1:]
+        yaw = scale_symmetric(x["yaw"], MAX_YAW) - yaw_amplitude * jnp.cos(drive.phase[..., 1:])
         car = rolling_car(data.plugins[CARS], yaw, speed, steer)
-        data = with_record(data.replace(plugins=data.plugins | {CARS: car}), manoeuvre)
+        data = data.replace(plugins=data.plugins | {CARS: car})
         pos, vel = self.target_motion(data)
         rpy = scale_symmetric(x["rpy"], 0.2) + jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1)
         return flying(
@@ -119,10 +106,16 @@ class FollowCar(Task):
             vel + scale_symmetric(x["vel"], 0.3),
         )
 
+    def command(self, data: SimData, time: Array) -> Array:
+        """Return speed, m/s, and steering angle, rad, of cars at a time since the start of the episode, s. (..., 2)"""
+        drive = self.read(data)
+        oscillation = drive.amplitude * jnp.sin(drive.ang_freq * time + drive.phase)
+        return jnp.concatenate([drive.car_speed + oscillation[..., :1], oscillation[..., 1:]], axis=-1)
+
     def before_step(self, data: SimData) -> SimData:
         """Return the data with the commands of the cars for this environment step."""
         car = data.plugins[CARS]
-        command = data.plugins[TASK_RECORD_NAME].command(data.core.steps / data.core.freq)
+        command = self.command(data, data.core.steps / data.core.freq)
         return data.replace(plugins=data.plugins | {CARS: car.replace(command=command)})
 
     def target_motion(self, data: SimData) -> tuple[Array, Array]:

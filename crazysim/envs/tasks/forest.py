@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,22 +10,19 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import (
-    Crossing,
-    CrossingTask,
-    crossing_of,
-    install_rules,
+    OutcomeTask,
+    collision_placements,
     motion_of,
     nearest_entries,
     on_floor,
     to_heading,
-    with_record,
 )
 from crazysim.plugins.scenery.forest import Forest as Trees
 from crazysim.plugins.sensors.camera import Camera
@@ -60,8 +55,7 @@ N_PRIVILEGED_TREES = 4
 """Number of nearest trees in privileged observations."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Forest(CrossingTask):
+class Forest(OutcomeTask):
     """Fly through a forest to a goal line at a set speed; every episode has a new random forest.
 
     A drone is disabled when it touches a tree, the ground or another drone, or leaves the corridor. The ceiling of the
@@ -70,6 +64,7 @@ class Forest(CrossingTask):
     """
 
     name = "forest"
+    outcomes = ("reached", "disabled")
     film_view = {"follow": 0, "distance": 8.0, "azimuth": 0.0, "elevation": -35.0}
 
     speed: float = setting(default=5.0, positive=True, high=20.0)
@@ -87,6 +82,8 @@ class Forest(CrossingTask):
     """Number of nearest trees among the observations; zero for policies that use the depth image."""
     seconds: float = 12.0
     """Length of an episode, s."""
+    goal: Array = state((3,))
+    """Goal of the drone, behind the goal line, m."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,21 +112,17 @@ class Forest(CrossingTask):
     def install(self, sim: Sim) -> None:
         trees, half_width = self.trees(sim.n_drones), self.half_width(sim.n_drones)
         sim.add(trees)
-        shape, dtype = (sim.n_worlds, sim.n_drones), sim.data.states.pos.dtype
-        zero, false = device_array(np.zeros((*shape, 3)), dtype), device_array(np.zeros(shape), bool)
         radius = max(float(airframe.value("shape.collision_sphere")[3]) for airframe in sim.airframes)
         period = max(sim.freq // CHECK_FREQ, 1)
 
         @stage("drone", when=lambda data: (data.core.steps + 1) % period == 0)
-        def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the corridor; mark one that crosses the goal line."""
-            record, pos = crossing_of(data), data.states.pos
+        def judge(data: SimData) -> SimData:
+            pos = data.states.pos
             has_left = (jnp.abs(pos[1]) > half_width) | (pos[2] > CEILING) | (pos[0] < -EDGE_DISTANCE) | on_floor(data)
             touches_tree = trees.clearance(data, pos) < radius
-            return with_record(data, record.updated(has_left | touches_tree, pos[0] >= self.length))
+            return self.judge(data, pos[0] >= self.length, has_left | touches_tree)
 
-        # ``checks_collisions`` also disables drones that touch each other.
-        install_rules(sim, Crossing(zero, false, false, false), update_record, checks_collisions=True)
+        self.add_states(sim, [*collision_placements(sim), StagePlacement(judge, before="increment_steps")])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight in front of a new forest."""
@@ -143,7 +136,7 @@ class Forest(CrossingTask):
         start_pos = (mean_pos + jitter * start_shift).astype(dtype)
         data = flying(data, start_pos, rotation.from_rpy(0.1 * rpy), 0.3 * vel)
         goal = (mean_pos + jitter * goal_shift + np.array([self.length + EDGE_DISTANCE, 0.0, 0.0])).astype(dtype)
-        return with_record(data, crossing_of(data).replace(goal=goal))
+        return self.write(data, goal=goal)
 
     def nearest_trees(self, data: SimData, n: int) -> Array:
         """Return the nearest trees of each drone, the nearest first.
@@ -181,7 +174,7 @@ class Forest(CrossingTask):
         drone's distance to the left of the middle of the corridor, m. ``trees_near`` has the nearest ``trees_seen``
         trees.
         """
-        to_goal = crossing_of(data).goal - data.states.pos
+        to_goal = self.read(data).goal - data.states.pos
         distance = rotation.safe_norm(to_goal)
         obs = motion_of(data) | {
             "goal_direction": to_heading(data, to_goal / jnp.maximum(distance, 1e-3)),
@@ -196,7 +189,7 @@ class Forest(CrossingTask):
         return {"trees_near": self.nearest_trees(data, N_PRIVILEGED_TREES).reshape(data.core.n_drones, -1)}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, s = crossing_of(data), data.states
+        record, s = self.read(data), data.states
         to_goal, (_, left) = record.goal - s.pos, rotation.heading(s.quat)
         approach = jnp.sum(s.vel * to_goal, axis=-1) / jnp.maximum(rotation.safe_norm(to_goal)[..., 0], 1e-3)
         speed = rotation.safe_norm(s.vel)[..., 0]
@@ -209,14 +202,17 @@ class Forest(CrossingTask):
             "height": -0.05 * jnp.abs(s.pos[..., 2] - HEIGHT),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "reached": 10.0 * record.reached,
-            "disabled": -10.0 * record.disabled,
+            "reached": 10.0 * record.success,
+            "disabled": -10.0 * record.failure,
         }
         return terms.only_where(~record.flight_over_before, reward_terms)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal line, m."""
         return jnp.maximum(self.length - data.states.pos[..., 0], 0.0)
+
+    def target(self, data: SimData) -> Array:
+        return self.read(data).goal
 
     def policy_camera(self) -> Camera:
         return Camera(16, 12)

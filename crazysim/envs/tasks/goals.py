@@ -7,13 +7,11 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, StagePlacement
-from crazysim.engine.pytree import PyTree, device_array, leaf
-from crazysim.engine.stage import Stage, stage
+from crazysim.core.plugin import StagePlacement, state
+from crazysim.engine.stage import stage
 from crazysim.envs.task import TASK_RECORD_NAME, Task
 from crazysim.sim.sim import Sim
 
@@ -21,36 +19,26 @@ FLOOR = 0.02
 """Height of the centre of mass below which a drone has crashed, m."""
 
 
-class Goal(PyTree):
-    """Goal of every drone."""
-
-    pos: Array = leaf("drone", 1)
-    """Position, world frame, m. (n_worlds, n_drones, 3)"""
-    vel: Array = leaf("drone", 1)
-    """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
-
-
 class GoalTask(Task):
     """Base of tasks in which every drone flies to its own goal, within an arena around the z axis.
 
-    Subclasses are frozen dataclasses that define ``spawn`` and ``rewards``.
+    Subclasses define ``spawn`` and ``rewards``.
     """
 
-    Record = Goal
     half_width: ClassVar[float]
     """Largest distance from the z axis along x and y, m."""
     height: ClassVar[float]
     """Height of the arena, m."""
 
-    def install(self, sim: Sim) -> None:
-        install_goal(sim)
+    goal: Array = state((3,))
+    """Goal of the drone, world frame, m."""
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
-        return with_goal(data, pos)
+        return self.write(data, goal=pos)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state and the vector to its goal, m."""
-        return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
+        return state_of(data) | {"difference_to_goal": self.read(data).goal - data.states.pos}
 
     def crashed(self, data: SimData) -> Array:
         """Return True where a drone has left the arena. (..., n_drones)"""
@@ -61,86 +49,55 @@ class GoalTask(Task):
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""
-        return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
+        return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:
-        return goal_of(data).pos
+        return self.read(data).goal
 
 
-class Crossing(PyTree):
-    """Goal of each drone behind obstacles, and the outcome of its flight."""
+class OutcomeTask(Task):
+    """Base of tasks in which the flight of each drone ends by success or failure, and the episode when all have ended.
 
-    goal: Array = leaf("drone", 1)
-    """Goal, m. (n_worlds, n_drones, 3)"""
-    reached: Array = leaf("drone", 0)
-    """True where the drone has reached its goal or the goal line. (n_worlds, n_drones)"""
-    disabled: Array = leaf("drone", 0)
-    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
-    flight_over_before: Array = leaf("drone", 0)
-    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
-
-    @property
-    def flight_over(self) -> Array:
-        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
-        return self.reached | self.disabled
-
-    def updated(self, must_end: Array, has_arrived: Array) -> Any:
-        """Return the record after a step in which drones must end, or else may have arrived. (n_worlds, n_drones)"""
-        disabled = self.disabled | (~self.reached & must_end)
-        return self.replace(disabled=disabled, reached=self.reached | (~disabled & has_arrived))
-
-
-class CrossingTask(Task):
-    """Base of tasks in which every drone flies past obstacles until it arrives or is disabled.
-
-    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``observe``, ``rewards`` and ``error``.
+    Subclasses define ``install``, ``spawn``, ``observe``, ``rewards`` and ``error``, and call ``judge`` after every
+    physics step.
     """
 
-    Record = Crossing
+    outcomes: ClassVar[tuple[str, str]]
+    """Names of success and failure in ``info``."""
+
+    success: Array = state((), dtype=bool)
+    """True where the drone has done its task."""
+    failure: Array = state((), dtype=bool)
+    """True where the drone has failed."""
+    flight_over_before: Array = state((), dtype=bool)
+    """Value of ``flight_over`` before this environment step."""
+
+    def judge(self, data: SimData, succeeds: Array, fails: Array) -> SimData:
+        """Return data in which flights that succeed or fail in a physics step have ended; failing counts first."""
+        record = self.read(data)
+        failure = record.failure | (~record.success & fails)
+        return self.write(data, failure=failure, success=record.success | (~failure & succeeds))
+
+    def flight_over(self, data: SimData) -> Array:
+        """Return True where the flight has ended. (..., n_drones)"""
+        return flight_over(self.read(data))
 
     def before_step(self, data: SimData) -> SimData:
-        record = crossing_of(data)
-        return with_record(data, record.replace(flight_over_before=record.flight_over))
+        return self.write(data, flight_over_before=self.flight_over(data))
 
     def terminated(self, data: SimData) -> Array:
-        return jnp.all(crossing_of(data).flight_over)
+        return jnp.all(self.flight_over(data))
 
     def info(self, data: SimData) -> dict[str, Array]:
-        return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
-
-    def target(self, data: SimData) -> Array:
-        return crossing_of(data).goal
+        return dict(zip(self.outcomes, (self.read(data).success, self.read(data).failure), strict=True))
 
     def succeeded(self, data: SimData) -> Array:
-        return crossing_of(data).reached
+        return self.read(data).success
 
 
-def crossing_of(data: SimData) -> Any:
-    """Return the task's record, a ``Crossing`` or a subclass."""
-    return data.plugins[TASK_RECORD_NAME]
-
-
-def install_goal(sim: Sim) -> None:
-    """Add the record of goals, ``data.plugins["task"]``, with all goals at the origin and at rest."""
-    pos = sim.data.states.pos
-    zero = device_array(np.zeros(pos.shape), pos.dtype)
-    sim.add(FunctionPlugin(TASK_RECORD_NAME, Goal(zero, zero)))
-
-
-def goal_of(data: SimData) -> Goal:
-    """Return the task's record of goals."""
-    return data.plugins[TASK_RECORD_NAME]
-
-
-def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
-    """Return the data with new goals: positions, m, and velocities, m/s. (..., n_drones, 3) each"""
-    pos = jnp.broadcast_to(pos, data.states.pos.shape)
-    return with_record(data, Goal(pos, jnp.broadcast_to(vel, pos.shape)))
-
-
-def with_record(data: SimData, record: PyTree) -> SimData:
-    """Return the data with a new record of the task."""
-    return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: record})
+def flight_over(record: Any) -> Array:
+    """Return True where a drone has succeeded or failed, by the states of an ``OutcomeTask``."""
+    return record.success | record.failure
 
 
 def state_of(data: SimData) -> dict[str, Array]:
@@ -228,42 +185,27 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     return jnp.stack(entries, axis=-2)
 
 
-def install_rules(sim: Sim, record: PyTree, rules: Stage, checks_collisions: bool = False) -> None:
-    """Add a task's record, and a stage with the task's rules that updates it at the end of every physics step.
+def collision_placements(sim: Sim) -> list[StagePlacement]:
+    """Return the stage after each physics step in which drones that touch each other fail; none for a single drone.
 
-    Args:
-        sim: The simulation.
-        record: Record of all worlds, for ``data.plugins["task"]``.
-        rules: Stage that updates the record, such as the marks of drones that are disabled or at their goals.
-        checks_collisions: True to disable drones that touch each other, in a stage before ``rules``.
+    It is for an ``OutcomeTask``. Drones whose flights are over collide with nothing.
     """
-    placements = [StagePlacement(rules, before="increment_steps")]
-    if checks_collisions and sim.n_drones > 1:
-        placements.insert(
-            0, StagePlacement(collision_stage(sim), before="increment_steps", name=f"{TASK_RECORD_NAME}_collisions")
-        )
-    sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
-
-
-def collision_stage(sim: Sim) -> Stage:
-    """Return a stage that disables drones that touch each other, in the task's record.
-
-    The record needs ``disabled`` and ``flight_over``, (n_worlds, n_drones) each. Drones with ``flight_over`` collide
-    with nothing.
-    """
+    if sim.n_drones == 1:
+        return []
     contacts = sim.scene.contact_fn((), floor=False)
 
     @stage("world")
     def collide(data: SimData) -> SimData:
         record, s = data.plugins[TASK_RECORD_NAME], data.states
-        flight_over = record.flight_over
+        is_over = flight_over(record)
         # For this query only, drones whose flight is over are moved far away, to different heights.
-        far_pos = 1000.0 * (1 + np.arange(len(flight_over)))[:, None] * np.array([0.0, 0.0, 1.0])
-        query_pos = jnp.where(flight_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
-        collides = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~flight_over
-        return with_record(data, record.replace(disabled=record.disabled | collides))
+        far_pos = 1000.0 * (1 + np.arange(len(is_over)))[:, None] * np.array([0.0, 0.0, 1.0])
+        query_pos = jnp.where(is_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
+        collides = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~is_over
+        record = record.replace(failure=record.failure | collides)
+        return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: record})
 
-    return collide
+    return [StagePlacement(collide, before="increment_steps", name=f"{TASK_RECORD_NAME}_collisions")]
 
 
 def nearest_drones(data: SimData, n: int, is_visible: Array | None = None) -> tuple[Array, Array]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jax import Array
 
@@ -13,13 +11,12 @@ from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.goals import GoalTask, with_goal
+from crazysim.envs.tasks.goals import GoalTask
 
 MIDDLE = np.array([0.0, 0.0, 1.2])
 """Middle of the box of starts and goals, m."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Hover(GoalTask):
     """Reach a random point and hover there.
 
@@ -45,7 +42,7 @@ class Hover(GoalTask):
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
         vel, ang_vel = scale_symmetric(x["vel"], 0.5), scale_symmetric(x["ang_vel"], 0.5)
         data = flying(data, MIDDLE + scale_symmetric(x["start"], box), quat, vel, ang_vel)
-        return with_goal(data, MIDDLE + scale_symmetric(x["goal"], box))
+        return self.write(data, goal=MIDDLE + scale_symmetric(x["goal"], box))
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return proximity to the goal, and costs of turning, of changing actions and of a crash."""

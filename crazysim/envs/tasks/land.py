@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -11,15 +10,15 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.plugin import StagePlacement
+from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import device_array, leaf, static
+from crazysim.engine.pytree import static
 from crazysim.engine.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import TASK_RECORD_NAME
-from crazysim.envs.tasks.goals import pick_entry, with_record
-from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome, landing_of
+from crazysim.envs.tasks.goals import pick_entry
+from crazysim.envs.tasks.touch_down import TouchDown
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -35,20 +34,6 @@ CIRCLE_RADII = (0.3, 0.7)
 """Smallest and largest radius of a moving pad's circle, m."""
 
 
-class PadLanding(Landing):
-    """Path of each drone's pad, and the outcome of its landing."""
-
-    circle: Array = leaf("drone", 1)
-    """Radius of the circle on which the pad moves, m; zero for a pad that stands still. (n_worlds, n_drones, 1)"""
-    ang_vel: Array = leaf("drone", 1)
-    """Angular velocity of the pad on the circle, rad/s. (n_worlds, n_drones, 1)"""
-    phase: Array = leaf("drone", 1)
-    """Angle of the pad on the circle at the start of the episode, rad. (n_worlds, n_drones, 1)"""
-    pads: Handle = static()
-    """Handle of the pads, one per drone."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Land(TouchDown):
     """Land on a pad, 0.2 m above the floor.
 
@@ -59,7 +44,6 @@ class Land(TouchDown):
     """
 
     name = "land"
-    Record = PadLanding
     target_name = "pad"
     film_view = {"elevation": -20}
     # If a crash cost 10, as much as a landing earns, policies would hover next to the pad: few of their first contacts
@@ -72,6 +56,14 @@ class Land(TouchDown):
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
     radius: float = setting(default=RADIUS, low=0.05, high=0.5)
     """Radius of a pad, m."""
+    circle: Array = state()
+    """Radius of the circle on which the pad moves, m; zero for a pad that stands still."""
+    ang_vel: Array = state()
+    """Angular velocity of the pad on the circle, rad/s."""
+    phase: Array = state()
+    """Angle of the pad on the circle at the start of the episode, rad."""
+    pads: Handle = static()
+    """Handle of the pads, one per drone."""
 
     def install(self, sim: Sim) -> None:
         """Add the pads, their motion and the check of contacts."""
@@ -86,12 +78,10 @@ class Land(TouchDown):
             pos, vel = self.pad_motion(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
-        zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
-        record = PadLanding(circle=zero, ang_vel=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
         placements = [StagePlacement(self.touch_down_stage(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
             placements.insert(0, StagePlacement(move_pads, before="measurements", name=f"{TASK_RECORD_NAME}_pads"))
-        self.add_record(sim, record, placements)
+        self.add_states(sim, placements, pads=pads)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight about a metre above their pads."""
@@ -108,12 +98,9 @@ class Land(TouchDown):
         circle = CIRCLE_RADII[0] + (CIRCLE_RADII[1] - CIRCLE_RADII[0]) * x["circle"]
         ang_vel = jnp.where(x["direction"] < 0.5, -self.speed, self.speed) / circle
         is_moving = float(self.speed > 0)
-        record = landing_of(data).replace(
-            circle=is_moving * circle, ang_vel=is_moving * ang_vel, phase=2 * jnp.pi * x["phase"]
-        )
-        data = with_record(data, record)
+        data = self.write(data, circle=is_moving * circle, ang_vel=is_moving * ang_vel, phase=2 * jnp.pi * x["phase"])
         pos, pad_vel = self.pad_motion(data, data.core.steps)
-        return record.pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
+        return self.read(data).pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's pad, world frame. (..., 3) each"""
@@ -139,7 +126,7 @@ class Land(TouchDown):
             data: Data of one drone or one world.
             steps: Physics steps since the start of the episode.
         """
-        record = landing_of(data)
+        record = self.read(data)
         angle = record.phase + record.ang_vel * (steps / data.core.freq)
         radial = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
         tangential = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jax import Array
 
@@ -13,7 +11,6 @@ from crazysim.envs.tasks.land import PAD, Land
 from crazysim.envs.tasks.target_camera import TargetCamera
 
 
-@dataclass(frozen=True, kw_only=True)
 class LandOnMarker(Land):
     """Land on a marker on the ground, 2 cm thick, that the drone observes with a camera.
 

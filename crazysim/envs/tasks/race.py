@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimParams
+from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import device_array, host_array
+from crazysim.engine.pytree import device_array, host_array, static
 from crazysim.engine.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import Task
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.goals import install_rules, pick_entry, with_record
+from crazysim.envs.tasks.goals import OutcomeTask, collision_placements, pick_entry
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
 from crazysim.errors import require
+from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
 SENSOR_RANGE = 0.7
@@ -45,8 +46,7 @@ Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
 """``rewards(data, action, last_action)``: terms by name. (n_drones,) each"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Race(Task):
+class Race(OutcomeTask):
     """Race through gates among obstacles, by the rules of the drone racing project lsy_drone_racing.
 
     A drone passes a gate when it crosses the gate's plane within the opening, in the direction of the gate's x axis. A
@@ -63,7 +63,7 @@ class Race(Task):
     """
 
     name = "race"
-    Record = rules.RaceRecord
+    outcomes = ("finished", "disabled")
     film_view = {"elevation": -50}
 
     level: int = setting(default=0, low=0, high=3)
@@ -81,6 +81,27 @@ class Race(Task):
     except the last. The gates up to there count as passed. Several drones all begin at the start, or behind different
     gates."""
 
+    passed: Array = state((), dtype=np.int32)
+    """Number of gates passed, which is the index of the next gate."""
+    last_pos: Array = state((3,))
+    """Position one physics step ago, m."""
+    gates_visited: Array = state(("gates",), dtype=bool)
+    """True for gates that the drone was near before this environment step."""
+    obstacles_visited: Array = state(("obstacles",), dtype=bool)
+    """True for obstacles that the drone was near before this environment step."""
+    passed_before: Array = state((), dtype=np.int32)
+    """Number of gates passed before this environment step."""
+    remaining_way_before: Array = state(())
+    """Result of ``remaining_way`` before this environment step, m."""
+    nominal_pos: Array | None = state(("objects", 3), scope="world", optional=True)
+    """Nominal positions of gates, then of upper ends of obstacles, m; None if objects are not displaced."""
+    nominal_quat: Array | None = state(("gates", 4), scope="world", optional=True)
+    """Nominal attitudes of gates, xyzw; None if objects are not displaced."""
+    gates: Handle = static()
+    """Handle of the gates, in their order."""
+    obstacles: Handle = static()
+    """Handle of the obstacles."""
+
     def install(self, sim: Sim) -> None:
         require(
             not self.practice or sim.n_drones < max(self.track.n_gates, 2),
@@ -97,40 +118,25 @@ class Race(Task):
         obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=obstacles_pos, height=POLE_HEIGHT)
         if self.level >= 1:
             _repeat_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
-        pos, shape = sim.data.states.pos, (sim.n_worlds, sim.n_drones)
-
-        def zeros(*shape: int, dtype: DTypeLike = pos.dtype) -> Array:
-            return device_array(np.zeros(shape), dtype)
-
-        zero, false = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
-        n, is_displaced = course.n_gates + course.n_obstacles, self.level >= 2
-        record = rules.RaceRecord(
-            passed=zero,
-            disabled=false,
-            last_pos=zeros(*shape, 3),
-            gates_visited=zeros(*shape, course.n_gates, dtype=bool),
-            obstacles_visited=zeros(*shape, course.n_obstacles, dtype=bool),
-            passed_before=zero,
-            flight_over_before=false,
-            remaining_way_before=zeros(*shape),
-            nominal_pos=zeros(sim.n_worlds, 1, n, 3) if is_displaced else None,
-            nominal_quat=zeros(sim.n_worlds, 1, course.n_gates, 4) if is_displaced else None,
-            gates=gates,
-            obstacles=obstacles,
-        )
-        low, high = (np.asarray(x, float).astype(pos.dtype) for x in (course.low, course.high))
+        low, high = (np.asarray(x, float).astype(sim.data.states.pos.dtype) for x in (course.low, course.high))
         contacts = sim.scene.contact_fn([gates, obstacles], drones=False)
 
         @stage("drone")
-        def update_record(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the arena; otherwise count a gate that it passes."""
-            record, pos = race_of(data), data.states.pos
-            has_left = jnp.any((pos < low) | (pos > high), axis=-1)
-            disabled = record.disabled | (~record.finished & (has_left | contacts(data).any))
-            passed = record.passed + (rules.passes_gate(data) & ~disabled)
-            return with_record(data, record.replace(passed=passed, disabled=disabled, last_pos=pos))
+        def judge(data: SimData) -> SimData:
+            pos = data.states.pos
+            fails = jnp.any((pos < low) | (pos > high), axis=-1) | contacts(data).any
+            passed = race_of(data).passed + (rules.passes_gate(data) & ~(race_of(data).failure | fails))
+            return self.judge(self.write(data, passed=passed, last_pos=pos), passed >= course.n_gates, fails)
 
-        install_rules(sim, record, update_record, checks_collisions=True)
+        numbers: dict[str, Any] = {
+            "gates_visited": np.zeros(course.n_gates),
+            "obstacles_visited": np.zeros(course.n_obstacles),
+        }
+        if self.level >= 2:
+            numbers["nominal_pos"] = np.zeros((course.n_gates + course.n_obstacles, 3))
+            numbers["nominal_quat"] = np.zeros((course.n_gates, 4))
+        placements = [*collision_placements(sim), StagePlacement(judge, before="increment_steps")]
+        self.add_states(sim, placements, gates=gates, obstacles=obstacles, **numbers)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and gates and obstacles, with the randomness of the level."""
@@ -152,28 +158,26 @@ class Race(Task):
             data = data.replace(params=_randomize_inertia(data.params, 2 * x["inertia"] - 1))
         offset = (2 * x["start"] - 1) * np.array(START_JITTER, dtype)
         pos = start + start_offsets(n_drones).astype(dtype) + offset[..., :3]
-        record, vel = race_of(data), jnp.zeros((), dtype)
+        vel = jnp.zeros((), dtype)
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
             passed_gates = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)
             passed = jnp.where(passed > 0, passed_gates, 0)
             pos_behind, vel = _pos_behind_gate(data, passed, x["behind"])
             pos = jnp.where(passed[..., None] > 0, pos_behind, pos)
-            record = record.replace(passed=passed)
+            data = self.write(data, passed=passed)
         data = flying(data, pos, rotation.from_rpy(offset[..., 3:]), vel)
-        return with_record(data, record.replace(last_pos=data.states.pos))
+        return self.write(data, last_pos=data.states.pos)
 
     def before_step(self, data: SimData) -> SimData:
-        record = race_of(data)
         visited_gates, visited_obstacles = visited_objects(data, self.sensor_range)
-        record_after = record.replace(
+        return self.write(
+            super().before_step(data),
             gates_visited=visited_gates,
             obstacles_visited=visited_obstacles,
-            passed_before=record.passed,
-            flight_over_before=record.flight_over,
+            passed_before=race_of(data).passed,
             remaining_way_before=rules.remaining_way(data),
         )
-        return with_record(data, record_after)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the observations; see ``race_observations.observe``."""
@@ -182,22 +186,15 @@ class Race(Task):
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         return self.reward(data, action, last_action)
 
-    def terminated(self, data: SimData) -> Array:
-        return jnp.all(race_of(data).flight_over)
-
     def error(self, data: SimData) -> Array:
         """Return the distance from the next gate, m; zero where all gates are passed."""
         return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:
-        record = race_of(data)
-        return {"gates_passed": record.passed, "finished": record.finished, "disabled": record.disabled}
+        return super().info(data) | {"gates_passed": race_of(data).passed}
 
     def target(self, data: SimData) -> Array:
         return rules.next_gate(data)[0]
-
-    def succeeded(self, data: SimData) -> Array:
-        return race_of(data).finished
 
     def _gates_quat(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # returns an array even while a step is traced
@@ -205,18 +202,17 @@ class Race(Task):
 
     def _displace_objects(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
         """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""
-        course, record, dtype = self.track, race_of(data), data.states.pos.dtype
+        course, dtype = self.track, data.states.pos.dtype
         start, pos, quat, poles = course.start, course.gates_pos, self._gates_quat(), course.obstacles_pos
         if self.level == 3:
             start, pos, quat, poles = random_course(course, x["course"])
         start, pos, quat, poles = (jnp.asarray(v, dtype) for v in (start, pos, quat, poles))
         gate_shift = (2 * x["gates"] - 1) * np.array(GATE_JITTER, dtype)
         pole_shift = (2 * x["obstacles"] - 1) * np.array(OBSTACLE_JITTER, dtype)
-        record = record.replace(nominal_pos=jnp.concatenate([pos, poles]), nominal_quat=quat)
         gates_quat = rotation.multiply(quat, rotation.from_rpy(gate_shift[..., 3:]))
-        data = record.gates.set_pose(data, pos + gate_shift[..., :3], gates_quat)
-        data = record.obstacles.set_pose(data, poles + pole_shift - FOOT_TO_TOP.astype(dtype))
-        return with_record(data, record), start
+        data = race_of(data).gates.set_pose(data, pos + gate_shift[..., :3], gates_quat)
+        data = race_of(data).obstacles.set_pose(data, poles + pole_shift - FOOT_TO_TOP.astype(dtype))
+        return self.write(data, nominal_pos=jnp.concatenate([pos, poles]), nominal_quat=quat), start
 
 
 def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -28,7 +26,6 @@ PRIVILEGED_NAMES = ("gate_corners", "obstacles_near")
 """Observations of the race for a critic, and with ``gates_observed`` also for the policy."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RaceByCamera(Race):
     """Race by the rules of ``race`` with a camera on each drone, which ``make`` adds.
 

@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.envs.tasks.goals import nearest_drones, nearest_entries, pick_entry
+from crazysim.envs.tasks.goals import flight_over, nearest_drones, nearest_entries, pick_entry
 from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
@@ -70,7 +70,7 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "quat": s.quat,
         "vel": s.vel,
         "ang_vel": s.ang_vel,
-        "target_gate": jnp.where(record.finished, -1, record.passed)[..., None],
+        "target_gate": jnp.where(record.success, -1, record.passed)[..., None],
         "gates_pos": gates_pos,
         "gates_quat": gates_quat,
         "gates_visited": visited_gates,
@@ -82,5 +82,5 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "obstacles_near": to_body_frame(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
     }
     if n_drones > 1:
-        obs["drones_near"] = to_body_frame(nearest_drones(data, 2, ~record.flight_over)[0])
+        obs["drones_near"] = to_body_frame(nearest_drones(data, 2, ~flight_over(record))[0])
     return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

@@ -5,17 +5,17 @@ All functions take the data of one world or, without the axis of drones, of one 
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.engine.pytree import PyTree, leaf, static
 from crazysim.envs import terms
 from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry
-from crazysim.scene.objects import Handle
 
 OPENING = 0.45
 """Width and height of a gate's opening, m."""
@@ -28,48 +28,8 @@ FUNNEL_RADIUS = 0.15
 the plane. Positions in the funnel have a straight way to the gate."""
 
 
-class RaceRecord(PyTree):
-    """Progress of each drone, and the gates and obstacles that it has been near."""
-
-    passed: Array = leaf("drone", 0)
-    """Number of gates passed, which is the index of the next gate. (n_worlds, n_drones)"""
-    disabled: Array = leaf("drone", 0)
-    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
-    last_pos: Array = leaf("drone", 1)
-    """Position one physics step ago, m. (n_worlds, n_drones, 3)"""
-    gates_visited: Array = leaf("drone", 1)
-    """True for gates that the drone was near before this environment step. (n_worlds, n_drones, n_gates)"""
-    obstacles_visited: Array = leaf("drone", 1)
-    """True for obstacles that the drone was near before this environment step. (n_worlds, n_drones, n_obstacles)"""
-    passed_before: Array = leaf("drone", 0)
-    """Number of gates passed before this environment step. (n_worlds, n_drones)"""
-    flight_over_before: Array = leaf("drone", 0)
-    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
-    remaining_way_before: Array = leaf("drone", 0)
-    """Result of ``remaining_way`` before this environment step, m. (n_worlds, n_drones)"""
-    nominal_pos: Array | None = leaf("world", 2)
-    """Nominal positions of gates, then of upper ends of obstacles, m; None if objects are not displaced.
-    (n_worlds, 1, n, 3)"""
-    nominal_quat: Array | None = leaf("world", 2)
-    """Nominal attitudes of gates, xyzw; None if objects are not displaced. (n_worlds, 1, n_gates, 4)"""
-    gates: Handle = static()
-    """Handle of the gates, in their order."""
-    obstacles: Handle = static()
-    """Handle of the obstacles."""
-
-    @property
-    def finished(self) -> Array:
-        """True where a drone has passed all gates. (n_worlds, n_drones)"""
-        return self.passed >= self.gates_visited.shape[-1]
-
-    @property
-    def flight_over(self) -> Array:
-        """True where a drone has finished or is disabled. (n_worlds, n_drones)"""
-        return self.finished | self.disabled
-
-
-def race_of(data: SimData) -> RaceRecord:
-    """Return the race's record."""
+def race_of(data: SimData) -> Any:
+    """Return the states of the race; see ``Race``."""
     return data.plugins[TASK_RECORD_NAME]
 
 
@@ -102,13 +62,13 @@ def passes_gate(data: SimData) -> Array:
     crossed = (pos_before[..., 0] < 0) & (pos_now[..., 0] >= 0)
     fraction = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
     crossing = pos_before + fraction * (pos_now - pos_before)
-    return crossed & jnp.all(jnp.abs(crossing[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
+    return crossed & jnp.all(jnp.abs(crossing[..., 1:]) < OPENING / 2, axis=-1) & ~record.success
 
 
 def next_gate_distance(data: SimData) -> Array:
     """Return the distance to the middle of the next gate, m; zero where all gates are passed. (n_drones,)"""
     pos, _ = next_gate(data)
-    return jnp.where(race_of(data).finished, 0, rotation.safe_norm(data.states.pos - pos)[..., 0])
+    return jnp.where(race_of(data).success, 0, rotation.safe_norm(data.states.pos - pos)[..., 0])
 
 
 def remaining_way(data: SimData) -> Array:
@@ -119,7 +79,7 @@ def remaining_way(data: SimData) -> Array:
     is_ahead = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
     next_pos, next_quat = next_gate(data)
     way_to_next = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
-    return jnp.where(record.finished, 0, way_to_next + jnp.sum(jnp.where(is_ahead, legs, 0), axis=-1))
+    return jnp.where(record.success, 0, way_to_next + jnp.sum(jnp.where(is_ahead, legs, 0), axis=-1))
 
 
 def way_to_gate(pos: Array) -> Array:
@@ -150,7 +110,7 @@ def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         "gates": 2.0 * (record.passed - record.passed_before),
         "spin": -0.001 * terms.spin(data),
         "action_rate": -0.01 * terms.action_rate(action, last_action),
-        "disabled": -2.0 * record.disabled,
+        "disabled": -2.0 * record.failure,
     }
     return terms.only_where(~record.flight_over_before, reward_terms)
 
@@ -159,5 +119,5 @@ def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]
     """Return a reward of 1 for each gate passed in the step, and of -1 when the drone is disabled."""
     del action, last_action
     record, dtype = race_of(data), data.states.pos.dtype
-    gates, disabled = (record.passed - record.passed_before).astype(dtype), record.disabled.astype(dtype)
+    gates, disabled = (record.passed - record.passed_before).astype(dtype), record.failure.astype(dtype)
     return terms.only_where(~record.flight_over_before, {"gates": gates, "disabled": -disabled})

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import state
 from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.goals import Goal, goal_of, install_goal, on_floor, state_of, with_goal
-from crazysim.sim.sim import Sim
+from crazysim.envs.tasks.goals import on_floor, state_of
 
 HEIGHT = 5.0
 """Height of the start, m; with the default settings it is enough to descend for a whole episode."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ReachVel(Task):
     """Reach a random velocity and keep it. The task error is a difference of velocities, m/s.
 
@@ -32,7 +29,6 @@ class ReachVel(Task):
 
     name = "reach_vel"
     unit = "m/s"
-    Record = Goal
 
     speed: float = setting(default=1.0, low=0.0)
     """Largest x and y component of the target velocity, m/s; z is at most a quarter of that."""
@@ -40,9 +36,8 @@ class ReachVel(Task):
     """Length of an episode, s."""
     tolerance: float = 0.1
     """Difference below which the drone has the target velocity, m/s."""
-
-    def install(self, sim: Sim) -> None:
-        install_goal(sim)
+    target_vel: Array = state((3,))
+    """Target velocity, world frame, m/s."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and their target velocities."""
@@ -50,11 +45,11 @@ class ReachVel(Task):
         start = scale_symmetric(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
         data = flying(data, start, quat, scale_symmetric(x["vel"], 0.5), scale_symmetric(x["ang_vel"], 0.5))
-        return with_goal(data, start, scale_symmetric(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
+        return self.write(data, target_vel=scale_symmetric(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state and the target velocity minus its velocity, m/s."""
-        return state_of(data) | {"difference_to_target_vel": goal_of(data).vel - data.states.vel}
+        return state_of(data) | {"difference_to_target_vel": self.read(data).target_vel - data.states.vel}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         return {
@@ -69,4 +64,4 @@ class ReachVel(Task):
 
     def error(self, data: SimData) -> Array:
         """Return the norm of the difference from the target velocity, m/s."""
-        return rotation.safe_norm(goal_of(data).vel - data.states.vel)[..., 0]
+        return rotation.safe_norm(self.read(data).target_vel - data.states.vel)[..., 0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jax import Array
 
@@ -13,13 +11,12 @@ from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying, random_attitude
-from crazysim.envs.tasks.goals import GoalTask, with_goal
+from crazysim.envs.tasks.goals import GoalTask
 
 GOAL = np.array([0.0, 0.0, 3.0])
 """Goal of every drone, m."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Recover(GoalTask):
     """Catch a thrown drone, and hover at (0, 0, 3). It starts with random attitude, velocity and angular velocity.
 
@@ -45,7 +42,8 @@ class Recover(GoalTask):
         goal = GOAL.astype(data.states.pos.dtype)
         pos = goal + 2 * x["start"] - 1
         vel, ang_vel = self.speed * (2 * x["vel"] - 1), self.spin * (2 * x["ang_vel"] - 1)
-        return with_goal(flying(data, pos, random_attitude(x["attitude"]), vel, ang_vel), goal)
+        data = flying(data, pos, random_attitude(x["attitude"]), vel, ang_vel)
+        return self.write(data, goal=goal)
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         return {

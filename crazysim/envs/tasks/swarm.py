@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,15 +11,14 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import state
 from crazysim.core.settings import setting
 from crazysim.engine.pair_reductions import reduce_over_others
-from crazysim.engine.pytree import PyTree, device_array, leaf
-from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.envs.tasks.goals import install_rules, nearest_drones, on_floor, state_of, with_record
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.goals import nearest_drones, on_floor, state_of
 from crazysim.errors import ConfigError, require
 from crazysim.sim.sim import Sim
 
@@ -41,16 +39,6 @@ START_JITTER = 0.1
 """Largest component of the offset of a start from its place on the circle, m."""
 
 
-class SwarmRecord(PyTree):
-    """Goal of each drone, and its smallest separation from other drones."""
-
-    goal: Array = leaf("drone", 1)
-    """Position that the drone should take, m. (n_worlds, n_drones, 3)"""
-    closest: Array = leaf("drone", 0)
-    """Smallest separation from another drone so far; 1 at the edge of the ellipsoid. (n_worlds, n_drones)"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Swarm(Task):
     """Change places on a circle, or form a formation, at a distance from each other.
 
@@ -62,7 +50,6 @@ class Swarm(Task):
     """
 
     name = "swarm"
-    Record = SwarmRecord
 
     formation: Sequence[Sequence[float]] | None = None
     """Goals of the drones, in their order, m; None to change places. (n_drones, 3)"""
@@ -74,6 +61,10 @@ class Swarm(Task):
     """Length of an episode, s."""
     tolerance: float = 0.1
     """Distance below which a drone is at its goal, m."""
+    goal: Array = state((3,))
+    """Position that the drone should take, m."""
+    closest: Array = state(())
+    """Smallest separation from another drone so far; 1 at the edge of the ellipsoid."""
 
     def install(self, sim: Sim) -> None:
         require(
@@ -82,24 +73,17 @@ class Swarm(Task):
         if self.formation is not None:
             as_formation(self.formation, sim.n_drones)
 
-        @stage("drone")
-        def update_closest(data: SimData) -> SimData:
-            """Keep the smallest separation from another drone."""
-            record, scaled_pos = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
+        self.add_states(sim, closest=np.inf)
 
-            def square_separation(other_pos: Array, is_self: Array) -> Array:
-                return jnp.where(is_self, jnp.inf, jnp.sum((scaled_pos - other_pos) ** 2))
+    def after_substep(self, data: SimData) -> SimData:
+        """Keep the smallest separation from another drone."""
+        scaled_pos = data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
 
-            nearest = rotation.safe_sqrt(reduce_over_others(square_separation, scaled_pos, "min"))
-            return with_record(data, record.replace(closest=jnp.minimum(record.closest, nearest)))
+        def square_separation(other_pos: Array, is_self: Array) -> Array:
+            return jnp.where(is_self, jnp.inf, jnp.sum((scaled_pos - other_pos) ** 2))
 
-        pos = sim.data.states.pos
-        zero, infinity = (
-            device_array(np.zeros(pos.shape), pos.dtype),
-            device_array(np.full(pos.shape[:2], np.inf), pos.dtype),
-        )
-        record = SwarmRecord(zero, infinity)
-        install_rules(sim, record, update_closest)
+        nearest = rotation.safe_sqrt(reduce_over_others(square_separation, scaled_pos, "min"))
+        return self.write(data, closest=jnp.minimum(self.read(data).closest, nearest))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight on the circle, and their goals."""
@@ -118,13 +102,13 @@ class Swarm(Task):
         data = flying(
             data, circle_points(start_angle, n) + START_JITTER * offset, rotation.from_rpy(0.1 * rpy), 0.1 * vel
         )
-        return with_record(data, SwarmRecord(goal, separation(data.states.pos)))
+        return self.write(data, goal=goal, closest=separation(data.states.pos))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its goal, m, and relative motion of other drones, m and m/s."""
         relative_pos, relative_vel = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
         return state_of(data) | {
-            "difference_to_goal": swarm_of(data).goal - data.states.pos,
+            "difference_to_goal": self.read(data).goal - data.states.pos,
             "drones_near": relative_pos,
             "drones_near_vel": relative_vel,
         }
@@ -148,7 +132,7 @@ class Swarm(Task):
         """
         pos = data.states.pos
         is_outside = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
-        return on_floor(data) | is_outside | (self.strict & (swarm_of(data).closest < 1))
+        return on_floor(data) | is_outside | (self.strict & (self.read(data).closest < 1))
 
     def limits(self, n_drones: int) -> np.ndarray:
         """Return the largest absolute coordinates within the arena, m. (3,)"""
@@ -162,24 +146,19 @@ class Swarm(Task):
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""
-        return rotation.safe_norm(swarm_of(data).goal - data.states.pos)[..., 0]
+        return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        return {"separation": swarm_of(data).closest}
+        return {"separation": self.read(data).closest}
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         return {"lookat": (0, 0, 1.0), "distance": 4.0 + 2 * circle_radius(n_drones), "elevation": -35}
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
-        return with_record(data, swarm_of(data).replace(goal=pos))
+        return self.write(data, goal=pos)
 
     def target(self, data: SimData) -> Array:
-        return swarm_of(data).goal
-
-
-def swarm_of(data: SimData) -> SwarmRecord:
-    """Return the task's record."""
-    return data.plugins[TASK_RECORD_NAME]
+        return self.read(data).goal
 
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:

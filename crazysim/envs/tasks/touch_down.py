@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +10,10 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.engine.pytree import PyTree, device_array, leaf
+from crazysim.core.plugin import state
 from crazysim.engine.stage import Stage, stage
 from crazysim.envs import terms
-from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.envs.tasks.goals import state_of, with_record
+from crazysim.envs.tasks.goals import OutcomeTask, state_of
 from crazysim.scene.contact_report import ContactFn
 
 MAX_TOUCH_DOWN_SPEED = 0.5
@@ -24,32 +22,13 @@ MIN_UP_AXIS_Z = np.cos(np.pi / 9)
 """Smallest vertical component of the body z axis at touch-down, 1; it corresponds to a tilt of 20 degrees."""
 
 
-class Landing(PyTree):
-    """Outcome of each drone's landing."""
-
-    landed: Array = leaf("drone", 0)
-    """True where the drone has touched down softly. (n_worlds, n_drones)"""
-    crashed: Array = leaf("drone", 0)
-    """True where the drone has touched anything in another way, or left its arena. (n_worlds, n_drones)"""
-    flight_over_before: Array = leaf("drone", 0)
-    """Value of ``flight_over`` before this environment step. (n_worlds, n_drones)"""
-    remaining_way_before: Array = leaf("drone", 0)
-    """Distance from the target before this environment step, m. (n_worlds, n_drones)"""
-
-    @property
-    def flight_over(self) -> Array:
-        """True where the drone has landed or crashed. (n_worlds, n_drones)"""
-        return self.landed | self.crashed
-
-
-@dataclass(frozen=True, kw_only=True)
-class TouchDown(Task):
+class TouchDown(OutcomeTask):
     """Base of tasks in which every drone lands on its own target, which may move.
 
-    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``target_motion`` and ``has_left_arena``.
+    Subclasses define ``install``, ``spawn``, ``target_motion`` and ``has_left_arena``.
     """
 
-    Record = Landing
+    outcomes = ("landed", "crashed")
     target_name: ClassVar[str] = "place"
     """Name of the target in observations: ``difference_to_{target_name}``."""
     progress_reward: ClassVar[float] = 2.0
@@ -59,6 +38,8 @@ class TouchDown(Task):
 
     seconds: float = 6.0
     """Length of an episode, s."""
+    remaining_way_before: Array = state(())
+    """Distance from the target before this environment step, m."""
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's target, world frame. (..., 3) each
@@ -85,7 +66,7 @@ class TouchDown(Task):
 
         @stage(scope)
         def touch(data: SimData) -> SimData:
-            record, s, report = landing_of(data), data.states, contacts(data)
+            s, report = data.states, contacts(data)
             pos, vel = self.target_motion(data, steps_ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
@@ -99,19 +80,12 @@ class TouchDown(Task):
             )
             has_landed = touches_target & (offset[..., 2] > 0) & is_centred & is_soft & ~touches_other
             has_crashed = (touches_target & ~has_landed) | touches_other | self.has_left_arena(data)
-            new_record = record.replace(
-                landed=record.landed | (has_landed & ~record.crashed),
-                crashed=record.crashed | (has_crashed & ~record.landed),
-            )
-            return with_record(data, new_record)
+            return self.judge(data, has_landed, has_crashed)
 
         return touch
 
     def before_step(self, data: SimData) -> SimData:
-        record = landing_of(data)
-        return with_record(
-            data, record.replace(flight_over_before=record.flight_over, remaining_way_before=self.error(data))
-        )
+        return self.write(super().before_step(data), remaining_way_before=self.error(data))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the vector to its target, m, and the target's relative velocity, m/s."""
@@ -126,42 +100,21 @@ class TouchDown(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, distance = landing_of(data), self.error(data)
+        record, distance = self.read(data), self.error(data)
         relative_speed = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         reward_terms = {
             "progress": self.progress_reward * (record.remaining_way_before - distance),
             "speed": -0.1 * relative_speed * jnp.exp(-4 * distance),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "landed": 10.0 * record.landed,
-            "crashed": -self.crash_cost * record.crashed,
+            "landed": 10.0 * record.success,
+            "crashed": -self.crash_cost * record.failure,
         }
         return terms.only_where(~record.flight_over_before, reward_terms)
-
-    def terminated(self, data: SimData) -> Array:
-        return jnp.all(landing_of(data).flight_over)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the target, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
-    def info(self, data: SimData) -> dict[str, Array]:
-        return {"landed": landing_of(data).landed, "crashed": landing_of(data).crashed}
-
     def target(self, data: SimData) -> Array:
         return self.target_motion(data)[0]
-
-    def succeeded(self, data: SimData) -> Array:
-        return landing_of(data).landed
-
-
-def landing_of(data: SimData) -> Any:
-    """Return the task's record."""
-    return data.plugins[TASK_RECORD_NAME]
-
-
-def initial_outcome(data: SimData) -> dict[str, Array]:
-    """Return the fields of ``Landing`` for all worlds before any landing or crash, by name."""
-    pos = data.states.pos
-    zero, false = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
-    return {"landed": false, "crashed": false, "flight_over_before": false, "remaining_way_before": zero}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,13 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import state
 from crazysim.core.settings import setting
-from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import TASK_RECORD_NAME, Task
-from crazysim.envs.tasks.goals import on_floor, state_of, with_record
-from crazysim.sim.sim import Sim
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.goals import on_floor, state_of
 from crazysim.trajectories import Trajectory, figure_eight
 
 MAX_ERROR = 1.5
@@ -31,14 +30,6 @@ MAX_START_TIME = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
 
-class TrajectoryStart(PyTree):
-    """Start of an episode on the trajectory."""
-
-    start_time: Array = leaf("drone", 1)
-    """Time on the trajectory at the start of the episode, s. (n_worlds, n_drones, 1)"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class TrackTrajectory(Task):
     """Follow a trajectory.
 
@@ -47,7 +38,6 @@ class TrackTrajectory(Task):
     """
 
     name = "track"
-    Record = TrajectoryStart
     film_view = {"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30}
 
     trajectory: Trajectory = field(default_factory=figure_eight)
@@ -65,10 +55,8 @@ class TrackTrajectory(Task):
     hold: float = 5.0
     """Time at the end of an episode during which the drone must stay on the trajectory, s."""
 
-    def install(self, sim: Sim) -> None:
-        self.add_record(
-            sim, TrajectoryStart(device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype))
-        )
+    start_time: Array = state()
+    """Time on the trajectory at the start of the episode, s."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""
@@ -78,13 +66,12 @@ class TrackTrajectory(Task):
         rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
         start_time = MAX_START_TIME * x["start_time"]
         pos, path_vel = self.motion(start_time[..., 0])
-        return with_record(
-            flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel), TrajectoryStart(start_time)
-        )
+        data = flying(data, pos + offset, rotation.from_rpy(rpy), path_vel + vel)
+        return self.write(data, start_time=start_time)
 
     def time(self, data: SimData) -> Array:
         """Return the time on the trajectory, s. (n_drones,)"""
-        return data.plugins[TASK_RECORD_NAME].start_time[..., 0] + data.core.steps / data.core.freq
+        return self.read(data).start_time[..., 0] + data.core.steps / data.core.freq
 
     def motion(self, t: Array) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import StagePlacement
 from crazysim.core.settings import setting
 from crazysim.engine.pytree import static
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
-from crazysim.envs.tasks.goals import install_rules, pick_entry, state_of, with_record
+from crazysim.envs.tasks.bring_load import BringLoad
+from crazysim.envs.tasks.goals import pick_entry, state_of
 from crazysim.errors import require
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
 from crazysim.scene.objects import Handle
@@ -44,14 +43,6 @@ MIN_OPENING_MARGIN = 0.25
 together."""
 
 
-class GateDelivery(Delivery):
-    """Goal of each load, its gate, and the outcome of its flight."""
-
-    gates: Handle = static()
-    """Handle of the gates, one per drone."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Transport(BringLoad):
     """Carry a load on a rod or cable through a gate, and hold it at a goal behind it.
 
@@ -63,7 +54,6 @@ class Transport(BringLoad):
     """
 
     name = "transport"
-    Record = GateDelivery
     film_view = {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
 
     mass: float = setting(default=0.01, positive=True)
@@ -79,6 +69,8 @@ class Transport(BringLoad):
     these angles is 1.5 times that, rad/s."""
     seconds: float = 6.0
     """Length of an episode, s."""
+    gates: Handle = static()
+    """Handle of the gates, one per drone."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,27 +89,26 @@ class Transport(BringLoad):
         contacts = sim.scene.contact_fn([gates], drones=False)
 
         @stage("drone")
-        def update_record(data: SimData) -> SimData:
-            """Record crashes, and loads that stay at their goals."""
+        def judge(data: SimData) -> SimData:
             crashed = contacts(data).any | self.misses_gate(data) | is_outside_or_on_floor(data)
-            return with_record(data, self.update_outcome(data, crashed))
+            return self.update_outcome(data, crashed)
 
-        install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), update_record)
+        self.add_states(sim, [StagePlacement(judge, before="increment_steps")], gates=gates)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight with swinging loads in front of the gates, and goals behind the gates."""
-        n_drones, record = data.core.n_drones, delivery_of(data)
+        n_drones = data.core.n_drones
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
         centre = jnp.asarray(corridor_centres(n_drones), data.states.pos.dtype)
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
         data = flying(data, centre + scale_to(x["start"], *np.array(START_BOX)), quat, scale_symmetric(x["vel"], 0.3))
         yaw = scale_symmetric(x["turn"], MAX_GATE_YAW)
         gate_quat = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = record.gates.set_pose(data, centre + scale_to(x["gate"], *np.array(GATE_BOX)), gate_quat)
+        data = self.read(data).gates.set_pose(data, centre + scale_to(x["gate"], *np.array(GATE_BOX)), gate_quat)
         data = self.hang_loads(
             data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
         )
-        return with_record(data, record.replace(goal=centre + scale_to(x["goal"], *np.array(GOAL_BOX))))
+        return self.write(data, goal=centre + scale_to(x["goal"], *np.array(GOAL_BOX)))
 
     def hang_loads(self, data: SimData, angle: Array, rate: Array) -> SimData:
         """Return the data with loads that hang on taut rods or cables.
@@ -138,14 +129,21 @@ class Transport(BringLoad):
         load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * link_rate)
         return data.replace(plugins=data.plugins | {"load": load})
 
+    def gate(self, data: SimData) -> tuple[Array, Array]:
+        """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's gate."""
+        rows = self.read(data).gates.rows
+        gate_rows = slice(rows[0], rows[-1] + 1)
+        pos, quat = (x[..., gate_rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
+        return pick_entry(pos, data.core.drone_id), pick_entry(quat, data.core.drone_id)
+
     def remaining_way(self, data: SimData) -> Array:
         """Return the length of the load's way to its goal, m. (...)
 
         If the load is in front of the gate, its way leads through the opening. There it is half the length of rod or
         cable below the middle, so that drone and load pass with equal margins.
         """
-        pos, quat = gate_of(data)
-        load, goal = load_pos(data), delivery_of(data).goal
+        pos, quat = self.gate(data)
+        load, goal = load_pos(data), self.read(data).goal
         passage_point = pos - np.array([0.0, 0.0, self.length / 2], pos.dtype)
         way_through_gate = (
             rotation.safe_norm(passage_point - load)[..., 0] + rotation.safe_norm(goal - passage_point)[..., 0]
@@ -154,7 +152,7 @@ class Transport(BringLoad):
 
     def misses_gate(self, data: SimData) -> Array:
         """Return True where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
-        pos, quat = gate_of(data)
+        pos, quat = self.gate(data)
         drone_misses, load_misses = (
             (jnp.abs(local_pos[..., 0]) <= BAR_THICKNESS / 2)
             & (jnp.any(jnp.abs(local_pos[..., 1:]) > self.opening / 2 - radius, axis=-1))
@@ -166,7 +164,7 @@ class Transport(BringLoad):
         return drone_misses | load_misses
 
     def at_goal(self, data: SimData) -> Array:
-        return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
+        return is_behind(load_pos(data), *self.gate(data)) & super().at_goal(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the relative motion of its load, and vectors to gate and goal.
@@ -175,13 +173,13 @@ class Transport(BringLoad):
         the drone to the middle of the gate. ``gate_axis`` is the unit vector of the direction through the gate.
         ``difference_to_goal``, m, is the vector from the load to its goal.
         """
-        s, (pos, quat) = data.states, gate_of(data)
+        s, (pos, quat) = data.states, self.gate(data)
         return state_of(data) | {
             "load_pos": load_pos(data) - s.pos,
             "load_vel": load_vel(data) - s.vel,
             "difference_to_gate": pos - s.pos,
             "gate_axis": gate_axis(quat),
-            "difference_to_goal": delivery_of(data).goal - load_pos(data),
+            "difference_to_goal": self.read(data).goal - load_pos(data),
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
@@ -190,7 +188,7 @@ class Transport(BringLoad):
         ``approach`` still has a slope far from the goal, so that waiting in front of the gate gets less reward than
         passing it. ``proximity`` rewards rest at the goal.
         """
-        record, way = delivery_of(data), self.remaining_way(data)
+        record, way = self.read(data), self.remaining_way(data)
         rate = direction(data)[1]
         return {
             "progress": 5.0 * (record.remaining_way_before - way),
@@ -199,26 +197,18 @@ class Transport(BringLoad):
             "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -10.0 * record.crashed,
+            "crash": -10.0 * record.failure,
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
-        passed = is_behind(load_pos(data), *gate_of(data))
-        return {"passed": passed & ~delivery_of(data).crashed} | super().info(data)
+        passed = is_behind(load_pos(data), *self.gate(data))
+        return {"passed": passed & ~self.read(data).crashed} | super().info(data)
 
 
 def corridor_centres(n_drones: int) -> np.ndarray:
     """Return the middle of each drone's corridor on the floor, m. (n_drones, 3)"""
     y = CORRIDOR_SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
     return np.stack([0 * y, y, 0 * y], axis=-1)
-
-
-def gate_of(data: SimData) -> tuple[Array, Array]:
-    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's gate, for one drone or one world."""
-    rows = delivery_of(data).gates.rows
-    gate_rows = slice(rows[0], rows[-1] + 1)
-    pos, quat = (x[..., gate_rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
-    return pick_entry(pos, data.core.drone_id), pick_entry(quat, data.core.drone_id)
 
 
 def gate_axis(quat: Array) -> Array:

@@ -1,6 +1,5 @@
 """Forests: layouts of worlds and episodes, distances, free paths, difficulty, tasks, and wrong input."""
 
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -207,7 +206,6 @@ def test_a_stage_of_one_drone_can_compute_the_clearance(engine):
     np.testing.assert_allclose(sim.data.plugins["gap"].value, expected, atol=0.02)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Wander(Task):
     """Stay away from trees, which are drawn at the start of an episode."""
 
