@@ -26,6 +26,7 @@ TASK_RECORD_NAME = "task"
 """Name of a task's record in ``data.plugins``."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
 @dataclass_transform(
     frozen_default=True, kw_only_default=True, field_specifiers=(setting, state, static, dataclasses.field)
 )
@@ -211,13 +212,14 @@ class _State:
 
 
 def _move_states_to_record(cls: type[Task]) -> None:
-    """Make ``cls.Record`` of the states and static fields that a class declares, which are no settings of the task."""
+    """Make ``cls.Record`` of the states and static fields that a class declares; the others are settings."""
     fields = {name: f for name, f in vars(cls).items() if isinstance(f, dataclasses.Field)}
     states = {name: f for name, f in fields.items() if "scope" in f.metadata or f.metadata.keys() == {"static"}}
+    hints = inspect.get_annotations(cls)
+    plain = {f.name: f.type for f in dataclasses.fields(cls) if f.name in vars(cls)}  # such as ``seconds = 8.0``
+    cls.__annotations__ = {name: hint for name, hint in (plain | hints).items() if name not in states}
     if not states:
         return
-    hints = inspect.get_annotations(cls)
-    cls.__annotations__ = {name: hint for name, hint in hints.items() if name not in states}
     for name in states:
         setattr(cls, name, _State(name))
     namespace = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.Record"}  # where pickles look

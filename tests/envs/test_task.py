@@ -1,13 +1,14 @@
 """Tasks as frozen records, their installation, and their random draws."""
 
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim, Wind
+from crazysim import ConfigError, Sim, Wind, state
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import AutoReset, DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import episode_key, scale_symmetric, scale_to
@@ -142,6 +143,62 @@ class Still(Task):
 
     def error(self, data):
         return data.states.pos[:, 2]
+
+
+class Counting(Still):
+    """Counts physics steps of every drone, and episodes' first heights."""
+
+    n_counted: jax.Array = state((), dtype=int)
+    start_pos: jax.Array = state((3,))
+    wind: jax.Array | None = state((2,), scope="world", optional=True)
+
+    def spawn(self, data, key):
+        return self.write(data, start_pos=data.states.pos)
+
+    def after_substep(self, data):
+        return self.write(data, n_counted=self.read(data).n_counted + 1)
+
+    def error(self, data):
+        return 1.0 * self.read(data).n_counted
+
+
+class CountingTwice(Counting):
+    """Declares one more state than its base."""
+
+    seconds = 0.2
+    best: jax.Array = state(())
+
+
+def test_declared_states_count_every_physics_step_and_begin_at_zero_in_every_episode(two_drones):
+    env = AutoReset(make(CountingTwice(), n_worlds=3, n_drones=2))
+    reset_state = jax.jit(env.reset)(jax.random.key(0))
+    record = reset_state.data.plugins["task"]
+    assert record.n_counted.dtype == jnp.int32
+    assert record.start_pos.shape == (3, 2, 3)
+    assert record.wind is None
+    step, action = jax.jit(env.step), jnp.zeros(reset_state.action.shape)
+    after = step(step(reset_state, action), action)
+    np.testing.assert_array_equal(after.info["error"], np.full((3, 2), 2 * env.n_substeps))
+    for _ in range(env.max_steps - 2):
+        after = step(after, action)
+    assert np.all(after.truncated)
+    np.testing.assert_array_equal(after.data.plugins["task"].n_counted, np.zeros((3, 2)))
+    assert env.max_steps == 10, "a plain attribute sets an inherited setting"
+    assert [f.name for f in dataclasses.fields(CountingTwice)] == ["seconds", "tolerance", "hold"]
+    assert CountingTwice.Record.__mro__[1] is Counting.Record
+    copied = pickle.loads(pickle.dumps(record))
+    np.testing.assert_array_equal(copied.start_pos, record.start_pos)
+
+
+def test_states_are_read_from_data_and_added_by_the_task_that_declares_them(two_drones):
+    with pytest.raises(AttributeError, match=r"self\.read\(data\)\.n_counted.*self\.write"):
+        _ = Counting().n_counted
+    with pytest.raises(TypeError, match="n_counted"):
+        Counting(n_counted=3)
+    with pytest.raises(ConfigError, match="states among n_counted, start_pos, wind, got 'height'"):
+        Counting().add_states(two_drones, height=0.0)
+    with pytest.raises(ConfigError, match=r"Counting|still.*add_states"):
+        DroneEnv(two_drones, Counting())
 
 
 @pytest.fixture(scope="module")
