@@ -150,7 +150,9 @@ def test_drones_out_of_the_race_do_not_matter_to_others():
     passed = jnp.array([[0, 0], [0, 0], [4, 0], [4, 0]])
     disabled = jnp.array([[False, False], [True, False], [False, False], [False, True]])
     step = jax.jit(env.step)
-    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), offset, passed=passed, failure=disabled)
+    state = place_drones(
+        jax.jit(env.reset)(jax.random.key(0)), offset, passed=passed, success=passed == 4, failure=disabled
+    )
     after = step(state, state.action)
     #           both collide     one is out already      one has finished      one finished, one out
     expected = [[True, True], [True, False], [False, False], [False, True]]

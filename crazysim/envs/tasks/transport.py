@@ -202,7 +202,7 @@ class Transport(BringLoad):
 
     def info(self, data: SimData) -> dict[str, Array]:
         passed = is_behind(load_pos(data), *self.gate(data))
-        return {"passed": passed & ~self.read(data).crashed} | super().info(data)
+        return {"passed": passed & ~self.read(data).failure} | super().info(data)
 
 
 def corridor_centres(n_drones: int) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Forests: layouts of worlds and episodes, distances, free paths, difficulty, tasks, and wrong input."""
 
-
 import jax
 import jax.numpy as jnp
 import mujoco
