@@ -90,11 +90,6 @@ class Task:
             placements = [*placements, StagePlacement(judge, before="increment_steps")]
         sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
 
-    @property
-    def has_states(self) -> bool:
-        """Whether the task has states, or a stage in every physics step, which ``install`` must add."""
-        return self.Record is not None or type(self).after_substep is not Task.after_substep
-
     def read(self, data: SimData) -> Any:
         """Return the states of the task in data of any scope, as attributes."""
         return data.plugins[TASK_RECORD_NAME]

@@ -17,7 +17,14 @@ from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.goals import OutcomeTask, collision_placements, nearest_drones, nearest_entries, state_of
+from crazysim.envs.tasks.goals import (
+    OutcomeTask,
+    collision_placements,
+    flight_over,
+    nearest_drones,
+    nearest_entries,
+    state_of,
+)
 from crazysim.envs.tracks import ranks
 from crazysim.errors import require
 from crazysim.scene.objects import Handle
@@ -199,7 +206,7 @@ class Avoid(OutcomeTask):
             "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
-            relative_pos, _ = nearest_drones(data, 2, ~self.flight_over(data))
+            relative_pos, _ = nearest_drones(data, 2, ~flight_over(self.read(data)))
             obs["drones_near"] = relative_pos.reshape(n_drones, -1)
         return obs
 

@@ -70,7 +70,7 @@ class OutcomeTask(Task):
     failure: Array = state((), dtype=bool)
     """True where the drone has failed."""
     flight_over_before: Array = state((), dtype=bool)
-    """Value of ``flight_over`` before this environment step."""
+    """True where the flight was over before this environment step."""
 
     def judge(self, data: SimData, succeeds: Array, fails: Array) -> SimData:
         """Return data in which flights that succeed or fail in a physics step have ended; failing counts first."""
@@ -78,15 +78,11 @@ class OutcomeTask(Task):
         failure = record.failure | (~record.success & fails)
         return self.write(data, failure=failure, success=record.success | (~failure & succeeds))
 
-    def flight_over(self, data: SimData) -> Array:
-        """Return True where the flight has ended. (..., n_drones)"""
-        return flight_over(self.read(data))
-
     def before_step(self, data: SimData) -> SimData:
-        return self.write(data, flight_over_before=self.flight_over(data))
+        return self.write(data, flight_over_before=flight_over(self.read(data)))
 
     def terminated(self, data: SimData) -> Array:
-        return jnp.all(self.flight_over(data))
+        return jnp.all(flight_over(self.read(data)))
 
     def info(self, data: SimData) -> dict[str, Array]:
         return dict(zip(self.outcomes, (self.read(data).success, self.read(data).failure), strict=True))
