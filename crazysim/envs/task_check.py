@@ -33,7 +33,7 @@ def require_installed(sim: Sim, task: object) -> None:
     require(isinstance(task, Task), f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
     require(
-        not task.has_states
+        (task.Record is None and type(task).after_substep is Task.after_substep)
         or (
             TASK_RECORD_NAME in sim.plugins
             and isinstance(sim.data.plugins.get(TASK_RECORD_NAME), task.Record or object)
