@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 574,
     "engine": 6748,
-    "envs": 3756,
+    "envs": 3683,
     "geometry": 1089,
     "lab": 9697,
     "media": 967,
