@@ -16,7 +16,7 @@ from measure import medians, report, round_digits, seconds, start_hovering
 
 from crazysim import Sim
 from crazysim.control import Setpoint
-from crazysim.sim.mppi import MPPI
+from crazysim.lab.control.mppi import MPPI
 
 DEFAULT_SAMPLES = {"cpu": (1024,), "gpu": (16384,)}
 

@@ -25,6 +25,9 @@ from crazysim.startup import __version__
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
+    from crazysim.lab.control.mppi import MPPI
+    from crazysim.lab.jets.rotor_jet import RotorJet
+    from crazysim.lab.radar import Radar
     from crazysim.plugins.bodies import FreeBodies
     from crazysim.plugins.contacts.contact_log import ContactLog
     from crazysim.plugins.contacts.drone_collisions import DroneCollisions
@@ -45,18 +48,16 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators.eskf import ESKF
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
-    from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
+    from crazysim.plugins.payloads import Hook, SharedLoad, SlungLoad
     from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
     from crazysim.plugins.sensors.camera import Camera
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.lidar import Lidar
     from crazysim.plugins.sensors.motion_capture import MotionCapture
-    from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Sensor
     from crazysim.plugins.vehicles import Bicycles, Cars
     from crazysim.scene.splats import SplatScene
-    from crazysim.sim.mppi import MPPI
 
 __all__ = [
     "ESKF",

@@ -20,6 +20,9 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim": {
         "crazysim.core": "functional",
         "crazysim.envs": "make",
+        "crazysim.lab.control.mppi": "MPPI",
+        "crazysim.lab.jets.rotor_jet": "RotorJet",
+        "crazysim.lab.radar": "Radar",
         "crazysim.plugins.bodies": "FreeBodies",
         "crazysim.plugins.contacts.contact_log": "ContactLog",
         "crazysim.plugins.contacts.drone_collisions": "DroneCollisions",
@@ -30,12 +33,11 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.estimators.eskf": "ESKF",
         "crazysim.plugins.estimators.kalman": "Kalman",
         "crazysim.plugins.follow": "Follow",
-        "crazysim.plugins.payloads": "Hook RotorJet SharedLoad SlungLoad",
+        "crazysim.plugins.payloads": "Hook SharedLoad SlungLoad",
         "crazysim.plugins.scenery": "Clutter Forest Gates Pillars Rooms",
-        "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture Radar RangeFinder Sensor",
+        "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture RangeFinder Sensor",
         "crazysim.plugins.vehicles": "Bicycles Cars",
         "crazysim.scene.splats": "SplatScene",
-        "crazysim.sim.mppi": "MPPI",
     },
     "crazysim.control": {
         "crazysim.control.auto": "Auto",
@@ -56,7 +58,13 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.envs.pettingzoo": "make_parallel",
         "crazysim.envs.sb3": "DroneVecEnv",
     },
+    "crazysim.plugins.payloads": {
+        "crazysim.lab.control.load_flatness": "LoadedState load_flat_state",
+        "crazysim.lab.jets.jet_table": "JetTable load_jet_table",
+        "crazysim.lab.jets.rotor_jet": "RotorJet",
+    },
     "crazysim.plugins.sensors": {
+        "crazysim.lab.radar": "Radar",
         "crazysim.plugins.sensors.barometer": "Barometer",
         "crazysim.plugins.sensors.beacons": "Lighthouse UWB",
         "crazysim.plugins.sensors.camera": "Camera",
@@ -70,7 +78,6 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.sensors.magnetometer": "Magnetometer",
         "crazysim.plugins.sensors.motion_capture": "MotionCapture",
         "crazysim.plugins.sensors.onboard": "BatteryVoltage MultiRanger RotorSpeeds",
-        "crazysim.plugins.sensors.radar": "Radar",
         "crazysim.plugins.sensors.range_finder": "RangeFinder",
         "crazysim.plugins.sensors.sensor": "Samples Sensor",
         "crazysim.plugins.sensors.triad": "Triad",
@@ -84,6 +91,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.show": "film plot_episode",
         "crazysim.train.training": "load_policy",
     },
+    "crazysim.sim.export": {"crazysim.lab.export.casadi": "to_casadi"},
     # Modules of Crazyflow.
     "crazysim.exception": {
         "crazysim.errors": "ConfigError RenderError UnknownNameError",

@@ -36,9 +36,9 @@ from crazysim.envs.brax import BraxEnv
 from crazysim.envs.pettingzoo import DroneParallelEnv
 from crazysim.envs.tasks.hover import Hover
 from crazysim.geometry import Shape, hfield, hull
+from crazysim.lab.export.casadi import to_casadi
 from crazysim.lab.identify import read_log
 from crazysim.media import Flight, Recorder, Trail, View, flight_of
-from crazysim.sim.export import to_casadi
 from crazysim.sim.visualize import draw_label, draw_points, draw_setpoints
 from crazysim.train import TrainConfig
 

@@ -1,12 +1,17 @@
-"""Loads that hang from one drone or several, on rods, cables or hooks, and the jets of rotors on these loads."""
+"""Loads that hang from one drone or several, on rods, cables or hooks."""
 
+from typing import TYPE_CHECKING
+
+from crazysim.names import lazy_getattr
 from crazysim.plugins.payloads.hook import Hook
-from crazysim.plugins.payloads.jet_table import JetTable, load_jet_table
-from crazysim.plugins.payloads.load_flatness import LoadedState, load_flat_state
 from crazysim.plugins.payloads.point_load import direction, load_pos, load_vel
-from crazysim.plugins.payloads.rotor_jet import RotorJet
 from crazysim.plugins.payloads.shared import SharedLoad
 from crazysim.plugins.payloads.slung import SlungLoad
+
+if TYPE_CHECKING:
+    from crazysim.lab.control.load_flatness import LoadedState, load_flat_state
+    from crazysim.lab.jets.jet_table import JetTable, load_jet_table
+    from crazysim.lab.jets.rotor_jet import RotorJet
 
 __all__ = [
     "Hook",
@@ -21,3 +26,5 @@ __all__ = [
     "load_pos",
     "load_vel",
 ]
+
+__getattr__ = lazy_getattr(__name__)

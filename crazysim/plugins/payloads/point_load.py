@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState
-from crazysim.core.plugin import Simulation, derived, state
+from crazysim.core.plugin import Plugin, Simulation, derived, state
 from crazysim.core.settings import as_mask, as_rgba
 from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import select_worlds
@@ -23,7 +23,6 @@ from crazysim.plugins.effects.wind import wind_at
 from crazysim.plugins.effects.wind_field import WindField
 from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.link import drag_rate, link_geometry
-from crazysim.plugins.payloads.rotor_jet import jet_force
 
 CABLE_SEGMENTS = 8
 """Number of straight pieces with which a cable is drawn."""
@@ -50,6 +49,13 @@ class HangingLoad(CollidingPlugin, BodiesInAir, abstract=True):
     """True where the load hangs from its drone. (n_worlds, n_drones)"""
     clearance: Array = derived()
     """Height of the load's position above the floor when it rests there, m. (1,)"""
+
+
+class LoadForce(Plugin, abstract=True):
+    """Base class of plugins that push the loads of another plugin.
+
+    Their settings have ``load``, the name of the loads' plugin, and their state has ``force``, N, in the world frame.
+    """
 
 
 class PointLoad(CollidingPlugin, abstract=True):
@@ -84,7 +90,7 @@ def find_integrator(sim: Simulation) -> Callable[..., SimData] | None:
 
 
 def free_acceleration(data: SimData, load: Any, dt: float | None) -> Array:
-    """Return the acceleration of one drone's load by gravity, drag and jets, without its link, m/s^2. (3,)
+    """Return the acceleration of one drone's load by gravity, drag and plugins, without its link, m/s^2. (3,)
 
     Drag cannot reverse a motion (``drag_rate``), and a load without mass moves with the air.
 
@@ -94,9 +100,10 @@ def free_acceleration(data: SimData, load: Any, dt: float | None) -> Array:
         dt: Duration of the step, s; None for the derivative at an instant.
     """
     acc = data.params.gravity_vec
-    jet = jet_force(data, load.name)
-    if jet is not None:
-        acc = acc + jnp.where(load.mass > 0, jet / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
+    forces = [x.force for x in data.plugins.values() if isinstance(x, LoadForce) and x.load == load.name]
+    if forces:
+        force = sum(forces[1:], forces[0])
+        acc = acc + jnp.where(load.mass > 0, force / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
     if load.air_vel is None or load.drag is None:
         return acc
     air_vel = wind_at(data, load.pos) + load.air_vel

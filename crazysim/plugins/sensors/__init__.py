@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
+    from crazysim.lab.radar import Radar
     from crazysim.plugins.sensors.barometer import Barometer
     from crazysim.plugins.sensors.beacons import UWB, Lighthouse
     from crazysim.plugins.sensors.camera import Camera
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.magnetometer import Magnetometer
     from crazysim.plugins.sensors.motion_capture import MotionCapture
     from crazysim.plugins.sensors.onboard import BatteryVoltage, MultiRanger, RotorSpeeds
-    from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Samples, Sensor
     from crazysim.plugins.sensors.triad import Triad

@@ -11,25 +11,26 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, derived, param, state
+from crazysim.core.plugin import Param, Simulation, StagePlacement, derived, param, state
 from crazysim.core.settings import setting
 from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
+from crazysim.lab.jets.jet_table import JetTable
+from crazysim.lab.jets.panels import shape_panels
 from crazysim.plugins.effects.downwash import collective_thrust, hover_jet_speed, mean_rotor_vel, stream_diameter
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import needs_rotors
 from crazysim.plugins.payloads.colliders import CollidingPlugin
-from crazysim.plugins.payloads.jet_table import JetTable
-from crazysim.plugins.payloads.panels import shape_panels
+from crazysim.plugins.payloads.point_load import LoadForce
 
 PANELS_PER_LENGTH = 2
 """Default number of panels along the longest edge of a load."""
 
 
-class RotorJet(Plugin, requires=needs_rotors):
+class RotorJet(LoadForce, requires=needs_rotors):
     """Jet of a drone's rotors on the panels of loads, from tables or an analytic jet; needs rotors.
 
     The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and ``rho v
@@ -151,12 +152,6 @@ class RotorJet(Plugin, requires=needs_rotors):
         if self.velocity is not None:
             total = total + momentum_flux(rotation.rotate(quat, jet_factor * interpolate(self.velocity, table_index)))
         return total
-
-
-def jet_force(data: SimData, name: str) -> Array | None:
-    """Return the force of all jets on the load of a plugin, world frame, N; None without jets. (..., 3)"""
-    forces = [x.force for x in data.plugins.values() if isinstance(x, RotorJet) and x.load == name]
-    return sum(forces[1:], forces[0]) if forces else None
 
 
 def table_position(speed: Array, speeds: Array) -> tuple[Array, Array]:

@@ -8,9 +8,10 @@ from cases import with_states
 
 from crazysim import ConfigError, RotorJet, SharedLoad, Sim, SlungLoad
 from crazysim.geometry import Shape
+from crazysim.lab.jets import rotor_jet
+from crazysim.lab.jets.panels import shape_panels
 from crazysim.plugins.effects.downwash import hover_jet_speed
-from crazysim.plugins.payloads import Hook, JetTable, load_jet_table, rotor_jet
-from crazysim.plugins.payloads.panels import shape_panels
+from crazysim.plugins.payloads import Hook, JetTable, load_jet_table
 
 RPM = 60 / (2 * np.pi)
 """Speed of 1 rad/s, rpm."""

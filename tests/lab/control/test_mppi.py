@@ -8,7 +8,7 @@ import pytest
 from crazysim import ContactResponse, Sim, Wind
 from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
-from crazysim.sim.mppi import MPPI, RolloutRecord, setpoint_after, tracking_cost
+from crazysim.lab.control.mppi import MPPI, RolloutRecord, setpoint_after, tracking_cost
 from crazysim.trajectories import figure_eight
 
 

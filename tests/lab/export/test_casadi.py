@@ -10,7 +10,7 @@ from crazysim import Battery, ConfigError, Downwash, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.engine.stage import Axes, stage
-from crazysim.sim.export import STATES, to_casadi
+from crazysim.lab.export.casadi import STATES, to_casadi
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from crazysim import Sim, rotation
+from crazysim.lab.control.load_flatness import load_flat_state
 from crazysim.plugins.payloads import SlungLoad
-from crazysim.plugins.payloads.load_flatness import load_flat_state
 
 LENGTH, LOAD = 0.4, 0.2
 """Length of the rod, m, and mass of the load, kg."""

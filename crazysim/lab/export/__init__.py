@@ -1,0 +1,1 @@
+"""Exports of steps and policies to other systems."""

@@ -1,0 +1,1 @@
+"""Jets of rotors on the surfaces of loads, from tables or closed forms."""
