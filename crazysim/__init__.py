@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.lab.control.mppi import MPPI
-    from crazysim.lab.jets.rotor_jet import RotorJet
-    from crazysim.lab.radar import Radar
+    from crazysim.lab.plugins.radar import Radar
+    from crazysim.lab.plugins.rotor_jet import RotorJet
     from crazysim.plugins.bodies import FreeBodies
     from crazysim.plugins.contacts.contact_log import ContactLog
     from crazysim.plugins.contacts.drone_collisions import DroneCollisions

@@ -48,10 +48,10 @@ from crazysim import (
     stage,
 )
 from crazysim.control.controllers import CONTROLLERS
-from crazysim.control.load_lqr import LoadLQR
-from crazysim.control.tracking_lqr import TrackingLQR
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.geometry import Shape, distance, hull
+from crazysim.lab.control.load_lqr import LoadLQR
+from crazysim.lab.control.tracking_lqr import TrackingLQR
 from crazysim.plugins import sensors, vehicles
 from crazysim.plugins.effects import Grid
 from crazysim.plugins.estimators import ESKF, Complementary

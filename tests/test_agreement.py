@@ -13,6 +13,7 @@ import pytest
 import sweep
 from cases import COMPILED_ENGINES
 
+import crazysim.lab.plugins
 from crazysim import Plugin, plugins
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.engine import Step
@@ -64,7 +65,8 @@ def compare(name, engines):
 
 def test_every_plugin_and_controller_is_in_the_sweep():
     swept = {type(plugin) for factory in sweep.PLUGINS.values() for plugin in factory()}
-    modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(plugins.__path__, "crazysim.plugins.")]
+    found = [m for x in (plugins, crazysim.lab.plugins) for m in pkgutil.walk_packages(x.__path__, f"{x.__name__}.")]
+    modules = [importlib.import_module(module.name) for module in found]
     classes = {x for module in modules for x in vars(module).values() if isinstance(x, type) and issubclass(x, Plugin)}
     # Images are taken between kernels of the step: tests/plugins/sensors/test_depth_errors.py compares the engines.
     classes = {x for x in classes if not issubclass(x, ImageSensor)}

@@ -225,7 +225,7 @@ def export(options: argparse.Namespace) -> None:
             write(policy, path, meta)
             print(f"wrote {path}")
     if options.out_of_tree is not None:
-        from crazysim.train.out_of_tree import to_out_of_tree
+        from crazysim.lab.export.out_of_tree import to_out_of_tree
 
         env = config.make_env(1)
         for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.base.freq):

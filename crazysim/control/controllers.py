@@ -19,8 +19,8 @@ CONTROLLERS = {
     "geometric": "crazysim.control.geometric:Geometric",
     "indi": "crazysim.control.indi:INDI",
     "lqr": "crazysim.control.lqr:LQR",
-    "load_lqr": "crazysim.control.load_lqr:LoadLQR",
-    "tracking_lqr": "crazysim.control.tracking_lqr:TrackingLQR",
+    "load_lqr": "crazysim.control:LoadLQR",
+    "tracking_lqr": "crazysim.control:TrackingLQR",
 }
 """Controllers by name, as ``"module:class"``, which ``find_controller`` imports."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
 import importlib.metadata
 import inspect
 import re
@@ -20,21 +21,6 @@ from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.references import is_reference, load_listed_task, load_task
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.avoid import Avoid
-from crazysim.envs.tasks.chase import Chase
-from crazysim.envs.tasks.deliver import Deliver
-from crazysim.envs.tasks.follow_car import FollowCar
-from crazysim.envs.tasks.forest import Forest
-from crazysim.envs.tasks.hover import Hover
-from crazysim.envs.tasks.land import Land
-from crazysim.envs.tasks.land_on_marker import LandOnMarker
-from crazysim.envs.tasks.race import Race
-from crazysim.envs.tasks.race_by_camera import RaceByCamera
-from crazysim.envs.tasks.reach_vel import ReachVel
-from crazysim.envs.tasks.recover import Recover
-from crazysim.envs.tasks.swarm import Swarm
-from crazysim.envs.tasks.track import TrackTrajectory
-from crazysim.envs.tasks.transport import Transport
 from crazysim.envs.wrappers.images import CameraImages
 from crazysim.errors import ConfigError, UnknownNameError, expect, require
 from crazysim.plugins.effects.randomize import Randomize
@@ -47,8 +33,8 @@ from crazysim.sim.sim import Sim
 class Entry:
     """A registered task."""
 
-    task: type[Task]
-    """Class of the task."""
+    source: type[Task] | str
+    """Class of the task, or ``MODULE:NAME`` of a class that is imported at its first use."""
     id: str
     """Id in Gymnasium's registry; empty if it is not registered there."""
     control: str = "attitude"
@@ -57,30 +43,38 @@ class Entry:
     """Default number of drones."""
 
     @property
+    def task(self) -> type[Task]:
+        """Class of the task."""
+        if not isinstance(self.source, str):
+            return self.source
+        module, _, name = self.source.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+    @property
     def options(self) -> tuple[str, ...]:
         """Names of the task's settings."""
         return tuple(f.name for f in dataclasses.fields(self.task))
 
 
 TASKS: dict[str, Entry] = {
-    "hover": Entry(Hover, "crazysim/Hover-v0"),
-    "reach_vel": Entry(ReachVel, "crazysim/ReachVel-v0"),
-    "recover": Entry(Recover, "crazysim/Recover-v0"),
-    "track": Entry(TrackTrajectory, "crazysim/Track-v0"),
-    "land": Entry(Land, "crazysim/Land-v0"),
-    "land_on_marker": Entry(LandOnMarker, "crazysim/LandOnMarker-v0"),
-    "chase": Entry(Chase, "crazysim/Chase-v0"),
-    "follow_car": Entry(FollowCar, "crazysim/FollowCar-v0"),
-    "deliver": Entry(Deliver, "crazysim/Deliver-v0"),
-    "race": Entry(Race, "crazysim/Race-v0"),
-    "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),
-    "race_by_camera": Entry(RaceByCamera, "crazysim/RaceByCamera-v0", "body_rate"),
-    "avoid": Entry(Avoid, "crazysim/Avoid-v0"),
-    "forest": Entry(Forest, "crazysim/Forest-v0"),
-    "transport": Entry(Transport, "crazysim/Transport-v0"),
-    "swarm": Entry(Swarm, "crazysim/Swarm-v0", n_drones=4),
+    "hover": Entry("crazysim.envs.tasks.hover:Hover", "crazysim/Hover-v0"),
+    "reach_vel": Entry("crazysim.envs.tasks.reach_vel:ReachVel", "crazysim/ReachVel-v0"),
+    "recover": Entry("crazysim.envs.tasks.recover:Recover", "crazysim/Recover-v0"),
+    "track": Entry("crazysim.envs.tasks.track:TrackTrajectory", "crazysim/Track-v0"),
+    "land": Entry("crazysim.envs.tasks.land:Land", "crazysim/Land-v0"),
+    "land_on_marker": Entry("crazysim.lab.tasks.land_on_marker:LandOnMarker", "crazysim/LandOnMarker-v0"),
+    "chase": Entry("crazysim.lab.tasks.chase:Chase", "crazysim/Chase-v0"),
+    "follow_car": Entry("crazysim.lab.tasks.follow_car:FollowCar", "crazysim/FollowCar-v0"),
+    "deliver": Entry("crazysim.lab.tasks.deliver:Deliver", "crazysim/Deliver-v0"),
+    "race": Entry("crazysim.envs.tasks.race:Race", "crazysim/Race-v0"),
+    "multi_race": Entry("crazysim.envs.tasks.race:Race", "crazysim/MultiRace-v0", n_drones=2),
+    "race_by_camera": Entry("crazysim.envs.tasks.race_by_camera:RaceByCamera", "crazysim/RaceByCamera-v0", "body_rate"),
+    "avoid": Entry("crazysim.envs.tasks.avoid:Avoid", "crazysim/Avoid-v0"),
+    "forest": Entry("crazysim.envs.tasks.forest:Forest", "crazysim/Forest-v0"),
+    "transport": Entry("crazysim.lab.tasks.transport:Transport", "crazysim/Transport-v0"),
+    "swarm": Entry("crazysim.envs.tasks.swarm:Swarm", "crazysim/Swarm-v0", n_drones=4),
 }
-"""All registered tasks, by name."""
+"""All registered tasks, by name. Those that show a feature are in the laboratory."""
 
 BUILT_IN_TASKS = frozenset(TASKS)
 """Names of the tasks of this package."""
@@ -222,7 +216,8 @@ def entry_of(task: str | Task, is_named: bool = True) -> Entry:
         ConfigError: If there is no such file, module or class, or it may not be executed.
     """
     if isinstance(task, Task):
-        entries = (entry for entry in TASKS.values() if entry.task is type(task))
+        sources = (type(task), f"{type(task).__module__}:{type(task).__name__}")
+        entries = (entry for entry in TASKS.values() if entry.source in sources)
         return next(entries, Entry(_check_class(type(task)), ""))
     require(
         isinstance(task, str), f"expected the name of a task or a task, got {task!r}. A class has to be called: Task()."

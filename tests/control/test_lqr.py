@@ -10,16 +10,16 @@ from scipy.spatial.transform import Rotation
 from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.linear_models import linearize, load_derivative, rod_angles, rod_direction
-from crazysim.control.load_lqr import LoadLQR, load_gain, load_lqr_control, load_reference
 from crazysim.control.lqr import LQR, flat_reference, hover_gain, lqr_control, state_error, weight_matrix
-from crazysim.control.tracking_lqr import (
+from crazysim.errors import ConfigError
+from crazysim.lab.control.load_lqr import LoadLQR, load_gain, load_lqr_control, load_reference
+from crazysim.lab.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
     interpolate_gain,
     tracking_gains,
     tracking_lqr_control,
 )
-from crazysim.errors import ConfigError
 
 LAB_Q, LAB_R = [100] * 6 + [10] * 3 + [1] * 3, [50] * 4
 LAB_LOAD_Q = [10, 10, 100, 1, 1, 10, 0.1, 0.1, 1, 0.4, 0.4, 0.4, 0.1, 0.1, 0.05, 0.05]

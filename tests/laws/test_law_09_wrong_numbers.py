@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 import crazysim.envs.tasks
+import crazysim.lab.plugins
+import crazysim.lab.tasks
 import crazysim.plugins
 from crazysim import Sim
 from crazysim.core.plugin import FunctionPlugin, Plugin
 from crazysim.core.population import Population
 from crazysim.core.settings import allowed_types, collect_settings
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import GoalTask
 from crazysim.envs.tasks.touch_down import TouchDown
 from crazysim.errors import ConfigError
@@ -27,6 +28,7 @@ from crazysim.lab.live.mocap.playback import Playback
 from crazysim.lab.live.mocap.tracker import Rules
 from crazysim.lab.live.mocap.twins import Twin
 from crazysim.lab.live.sitl import Origin
+from crazysim.lab.tasks.bring_load import BringLoad
 from crazysim.plugins.effects import Battery, Grid
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.estimator import Estimator
@@ -90,21 +92,24 @@ UNCHECKED = ["Bicycles.members", "Cars.members", "Follow.degrees", "FreeBodies.m
 """Settings whose annotation mixes numbers with other types; their classes check them."""
 
 
-def concrete_classes(base, package=crazysim.plugins):
-    """Return the concrete classes of a package that derive from a base."""
-    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        importlib.import_module(module.name)
+def concrete_classes(base, *packages):
+    """Return the concrete classes of some packages that derive from a base."""
+    for package in packages:
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    roots = tuple(package.__name__ for package in packages)
 
     def subclasses_of(kind):
         return {kind, *[x for sub in kind.__subclasses__() for x in subclasses_of(sub)]}
 
-    classes = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
+    classes = [kind for kind in subclasses_of(base) - ABSTRACT - {base} if kind.__module__.startswith(roots)]
     named = [kind for kind in classes if not issubclass(kind, Plugin) or hasattr(kind, "name")]
     return sorted(named, key=lambda kind: kind.__name__)
 
 
-PLUGINS, TASKS = concrete_classes(Plugin), concrete_classes(Task, crazysim.envs.tasks)
-OTHER_CLASSES = [Origin, Playback, Rules, Triad, Twin, *concrete_classes(PathController)]
+PLUGINS = concrete_classes(Plugin, crazysim.plugins, crazysim.lab.plugins)
+TASKS = concrete_classes(Task, crazysim.envs.tasks, crazysim.lab.tasks)
+OTHER_CLASSES = [Origin, Playback, Rules, Triad, Twin, *concrete_classes(PathController, crazysim.plugins)]
 
 
 def is_numeric(kind, name):

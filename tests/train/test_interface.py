@@ -17,13 +17,13 @@ from crazysim.__main__ import main
 from crazysim.envs import Observe, make
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.tasks.hover import Hover
+from crazysim.lab.export.out_of_tree import to_out_of_tree
 from crazysim.lab.live import PolicyPilot
 from crazysim.lab.live.link import TrainedPolicy, fly_policy
 from crazysim.train import checkpoint
 from crazysim.train.export import describe, to_c
 from crazysim.train.interface import Interface
 from crazysim.train.networks import Policies, Policy, init_mlp
-from crazysim.train.out_of_tree import to_out_of_tree
 from crazysim.train.task_code import task_digest
 from crazysim.train.training import POLICY_FILE, load_policy
 

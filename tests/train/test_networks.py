@@ -15,6 +15,7 @@ from crazysim import ConfigError
 from crazysim.envs import AutoReset, DroneEnv, Observe, PrivilegedObservation, RandomizeWith, make, state_of, uniform
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
+from crazysim.lab.export.out_of_tree import to_out_of_tree
 from crazysim.lab.live.link import TrainedPolicy
 from crazysim.lab.live.policy_pilot import PolicyPilot
 from crazysim.plugins.sensors import MotionCapture
@@ -27,7 +28,6 @@ from crazysim.train.dagger import imitate
 from crazysim.train.evaluation import evaluate
 from crazysim.train.export import to_c
 from crazysim.train.networks import Policies, gru_network, init_weights, unroll
-from crazysim.train.out_of_tree import to_out_of_tree
 from crazysim.train.seeds import rollout_seeds, stack_configs, take_seed
 from crazysim.train.show import film
 from crazysim.train.training import CHECKPOINT_FILE, load_policy, train

@@ -1,1 +1,1 @@
-"""Controllers of the laboratory: sampling model-predictive control, and the flatness of a drone with a load."""
+"""Controllers of the laboratory: LQR of loads and along trajectories, sampling model-predictive control."""

@@ -10,8 +10,8 @@ from crazysim.plugins.payloads.slung import SlungLoad
 
 if TYPE_CHECKING:
     from crazysim.lab.control.load_flatness import LoadedState, load_flat_state
-    from crazysim.lab.jets.jet_table import JetTable, load_jet_table
-    from crazysim.lab.jets.rotor_jet import RotorJet
+    from crazysim.lab.plugins.jet_table import JetTable, load_jet_table
+    from crazysim.lab.plugins.rotor_jet import RotorJet
 
 __all__ = [
     "Hook",

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
-    from crazysim.lab.radar import Radar
+    from crazysim.lab.plugins.radar import Radar
     from crazysim.plugins.sensors.barometer import Barometer
     from crazysim.plugins.sensors.beacons import UWB, Lighthouse
     from crazysim.plugins.sensors.camera import Camera

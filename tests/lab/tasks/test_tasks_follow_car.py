@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, PrivilegedObservation, make
-from crazysim.envs.tasks.follow_car import FOLLOW_DISTANCE, FOLLOW_HEIGHT, MAX_DISTANCE, MIN_HEIGHT, FollowCar
+from crazysim.lab.tasks.follow_car import FOLLOW_DISTANCE, FOLLOW_HEIGHT, MAX_DISTANCE, MIN_HEIGHT, FollowCar
 from crazysim.train.evaluation import evaluate
 
 N_WORLDS, N_STEPS = 64, 100

@@ -18,8 +18,8 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.lab.jets.jet_table import JetTable
-from crazysim.lab.jets.panels import shape_panels
+from crazysim.lab.plugins.jet_table import JetTable
+from crazysim.lab.plugins.panels import shape_panels
 from crazysim.plugins.effects.downwash import collective_thrust, hover_jet_speed, mean_rotor_vel, stream_diameter
 from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, UNFUSED_REASON, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import needs_rotors

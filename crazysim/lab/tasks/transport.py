@@ -15,9 +15,9 @@ from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import pick_entry, state_of
 from crazysim.errors import require
+from crazysim.lab.tasks.bring_load import BringLoad
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim

@@ -9,7 +9,7 @@ from crazysim import ConfigError, Sim
 from crazysim.engine.pytree import PyTree
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.transport import Transport, gate_axis, is_behind
+from crazysim.lab.tasks.transport import Transport, gate_axis, is_behind
 from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, LENGTH = 512, 0.3

@@ -7,7 +7,7 @@ import pytest
 
 from crazysim import ConfigError, Sim, rotation
 from crazysim.envs import PrivilegedObservation, make
-from crazysim.envs.tasks.target_camera import TargetCamera
+from crazysim.lab.tasks.target_camera import TargetCamera
 
 CONTACT_HEIGHT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""

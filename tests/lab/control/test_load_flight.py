@@ -7,8 +7,8 @@ import pytest
 from cases import broadcast_like, with_states
 
 from crazysim import Hook, Sim, SlungLoad, load_airframe
-from crazysim.control.load_lqr import LoadLQR
 from crazysim.dynamics.first_principles import rotor_vel_of_thrust
+from crazysim.lab.control.load_lqr import LoadLQR
 from crazysim.plugins.follow import Follow
 from crazysim.plugins.payloads import load_flat_state
 from crazysim.trajectories import figure_eight

@@ -16,8 +16,8 @@ from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import pick_entry, state_of
+from crazysim.lab.tasks.bring_load import BringLoad
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData

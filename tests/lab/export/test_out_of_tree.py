@@ -19,9 +19,9 @@ from crazysim.engine.backends import native
 from crazysim.envs import make
 from crazysim.envs.actions import hover_rotor_states
 from crazysim.envs.statistics import RunningStats
+from crazysim.lab.export.out_of_tree import to_out_of_tree
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy, init_mlp
-from crazysim.train.out_of_tree import to_out_of_tree
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")

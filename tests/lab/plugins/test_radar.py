@@ -6,7 +6,7 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Radar, Sim
-from crazysim.lab.radar import lobe_curves, lobe_margin
+from crazysim.lab.plugins.radar import lobe_curves, lobe_margin
 
 LOBES = [(10.0, 1.3, 1.0, 0.0), (6.0, 2.5, 0.6, 0.3), (8.0, 0.0, 1.0, 0.0), (8.0, 2.0, 0.7, -0.2)]
 

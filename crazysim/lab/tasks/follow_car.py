@@ -14,9 +14,9 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.chase import CARS, VEHICLE, rolling_car
 from crazysim.envs.tasks.goals import motion_of
-from crazysim.envs.tasks.target_camera import TargetCamera
+from crazysim.lab.tasks.chase import CARS, VEHICLE, rolling_car
+from crazysim.lab.tasks.target_camera import TargetCamera
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle

@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import make
-from crazysim.envs.tasks.deliver import MIN_HEIGHT, ring_motion, ring_positions
+from crazysim.lab.tasks.deliver import MIN_HEIGHT, ring_motion, ring_positions
 
 N_WORLDS = 5
 

@@ -8,7 +8,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.envs.tasks.goals import motion_of
 from crazysim.envs.tasks.land import PAD, Land
-from crazysim.envs.tasks.target_camera import TargetCamera
+from crazysim.lab.tasks.target_camera import TargetCamera
 
 
 class LandOnMarker(Land):

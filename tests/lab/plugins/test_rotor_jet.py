@@ -8,8 +8,8 @@ from cases import with_states
 
 from crazysim import ConfigError, RotorJet, SharedLoad, Sim, SlungLoad
 from crazysim.geometry import Shape
-from crazysim.lab.jets import rotor_jet
-from crazysim.lab.jets.panels import shape_panels
+from crazysim.lab.plugins import rotor_jet
+from crazysim.lab.plugins.panels import shape_panels
 from crazysim.plugins.effects.downwash import hover_jet_speed
 from crazysim.plugins.payloads import Hook, JetTable, load_jet_table
 

@@ -1,0 +1,1 @@
+"""Plugins of the laboratory: jets of rotors on the surfaces of loads, and radars."""
