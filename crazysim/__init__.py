@@ -50,12 +50,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, SharedLoad, SlungLoad
     from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
-    from crazysim.plugins.sensors.camera import Camera
-    from crazysim.plugins.sensors.imu import IMU
-    from crazysim.plugins.sensors.lidar import Lidar
-    from crazysim.plugins.sensors.motion_capture import MotionCapture
-    from crazysim.plugins.sensors.range_finder import RangeFinder
-    from crazysim.plugins.sensors.sensor import Sensor
+    from crazysim.plugins.sensors import IMU, Camera, Lidar, MotionCapture, RangeFinder, Sensor
     from crazysim.plugins.vehicles import Bicycles, Cars
     from crazysim.scene.splats import SplatScene
 
