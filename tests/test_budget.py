@@ -11,20 +11,20 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 1164,
-    "control": 1987,
+    "control": 1765,
     "core": 1578,
-    "crazysim": 840,
+    "crazysim": 836,
     "drones": 514,
     "dynamics": 574,
     "engine": 6748,
-    "envs": 3683,
+    "envs": 3222,
     "geometry": 1089,
-    "lab": 9697,
+    "lab": 11046,
     "media": 967,
-    "plugins": 7380,
+    "plugins": 7051,
     "scene": 3090,
-    "sim": 1208,
-    "train": 2437,
+    "sim": 945,
+    "train": 2358,
     "trajectories": 1393,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
