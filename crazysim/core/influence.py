@@ -70,10 +70,11 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     for field, rate in rates.items():
         if field not in state_names:
             owner = "drone" if plugin.scope == "drone" else "member"
+            remedy = f"{field}: Array = state((3,))" if isinstance(record, Plugin) else f"leaf({owner!r}, ...)"
             raise ConfigError(
-                f"expected {title} to return rates of leaves of {owner}s in its record, which are "
+                f"expected {title} to return rates of states of {owner}s in its record, which are "
                 f"{', '.join(map(repr, state_names)) or 'none'}, got one of {field!r}. Declare such a state with "
-                f"leaf({owner!r}, ...)."
+                f"{remedy}."
             )
         x = getattr(record, field)
         has_same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype

@@ -568,8 +568,7 @@ class Plugin(PyTree):
         """Return the time derivatives of the plugin's states, per second, by their fields of the record.
 
         All integrators advance these states together with the drone's states. ``data`` is of one drone, with the
-        influences of all plugins applied. A derivative has the shape of its field, which is declared with
-        ``leaf("drone", ...)``.
+        influences of all plugins applied. A derivative has the shape of its field, which is declared with ``state``.
         """
         return {}
 

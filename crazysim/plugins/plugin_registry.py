@@ -67,6 +67,9 @@ class PluginRegistry(Mapping[str, Plugin]):
     def __contains__(self, name: object) -> bool:
         return name in self._stages.plugins
 
+    def __repr__(self) -> str:
+        return f"<plugins {', '.join(f'{name}: {type(x).__name__}' for name, x in self.items()) or 'none'}>"
+
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add a plugin; see ``Sim.add``."""
         expect(isinstance(plugin, Plugin), "a plugin", plugin, "Use sim.add(Wind(...)), or your subclass of Plugin.")

@@ -583,6 +583,7 @@ def test_a_required_plugin_may_be_added_later_and_is_missed_at_the_first_step():
     sim = Sim(engine="interpret")
     earlier_step, earlier_data = sim.build_step_fn(), sim.data
     sim.add(Sail())
+    assert repr(sim.plugins) == "<plugins sail: Sail>"
     earlier_step(earlier_data)
     step, reset = sim.build_step_fn(), sim.build_reset_fn()
     for act in (sim.step, sim.reset, lambda: step(sim.data), lambda: jax.eval_shape(step, sim.data),

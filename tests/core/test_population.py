@@ -385,7 +385,7 @@ def test_a_rate_of_something_else_is_refused():
 
     sim = Sim(engine="plain")
     sim.add(Wrong())
-    with pytest.raises(ConfigError, match="rates of leaves of members in its record, which are 'member_id', 'pos'"):
+    with pytest.raises(ConfigError, match="rates of states of members in its record, which are 'member_id', 'pos'"):
         sim.step()
 
 

@@ -22,7 +22,7 @@ from crazysim.engine.pytree import CORE_NDIM_KEY, Members, PyTree
 from crazysim.errors import ConfigError, expect, require
 from crazysim.plugins.effects.battery import Battery, open_circuit_voltage
 from crazysim.plugins.effects.latency import Latency
-from crazysim.plugins.effects.moving_air import MovingAir, has_drag, needs_rotors, require_drag, with_moving_air
+from crazysim.plugins.effects.moving_air import MovingAir, has_drag, require_drag, require_rotors, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
 from crazysim.tables import NOT_NEGATIVE, range_between, read_number, read_numbers
 
@@ -43,18 +43,25 @@ INVERSES = {"params.J": "params.J_inv", "params.J_inv": "params.J"}
 """Paths of numbers that are inverse to others, which change with them."""
 
 
-class Randomize(MovingAir, Plugin, requires=needs_rotors):
-    """Random differences of the drones from their airframe, drawn anew for every episode; needs rotors.
+def _needs_rotors(sim: Simulation, plugin: Plugin) -> None:
+    """Check that the model has rotors, if a setting acts on their numbers."""
+    if any(getattr(plugin, name) is not None for name in (*FACTOR_NAMES, "wind")):
+        require_rotors(sim, "Randomize with settings other than paths, charge and delay")
+
+
+class Randomize(MovingAir, Plugin, requires=_needs_rotors):
+    """Random differences of the drones from their airframe, drawn anew for every episode.
 
     Numbers of drones, controllers, sensors and other plugins are drawn by their path in ``sim.data``, such as
     ``Randomize({"plugins.imu.accel.noise": (0.5, 2.0), "controls.controller.params.kp": 0.2})``, as a range of
     factors of the nominal number. 0.2 is short for (0.8, 1.2). Dynamics, controllers and plugins compute with the
     product; ``sim.data`` keeps the nominal number, which filters assume and your own stages read.
 
-    The settings below act on several numbers, or are no factors. Each is a range (low, high): one for all drones, (2,),
-    or one per drone, (n_worlds, n_drones, 2); for a factor, a number r is short for (1 - r, 1 + r). A number is drawn
-    uniformly for every drone at every reset, or in the first step of a simulation that was not reset. Two equal numbers
-    give a fixed number; None changes nothing. The number drawn for a path or a setting does not depend on the others.
+    The settings below act on several numbers, or are no factors; all but ``charge`` and ``delay`` need rotors. Each is
+    a range (low, high): one for all drones, (2,), or one per drone, (n_worlds, n_drones, 2); for a factor, a number r
+    is short for (1 - r, 1 + r). A number is drawn uniformly for every drone at every reset, or in the first step of a
+    simulation that was not reset. Two equal numbers give a fixed number; None changes nothing. The number drawn for a
+    path or a setting does not depend on the others.
     ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges from the literature.
     """
 

@@ -163,6 +163,11 @@ def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
         build(mass=(0.9, 1.0, 1.1))
     with pytest.raises(ConfigError, match="first_principles"):
         Sim(dynamics="so_rpy").add(Randomize.crazyflie())
+    fitted = Sim(2, dynamics="so_rpy", engine="interpret", plugins=[IMU.crazyflie()])
+    drawn = fitted.add(Randomize({"plugins.imu.accel.noise": (0.5, 2.0)}))  # of a sensor, which needs no rotors
+    fitted.reset()
+    fitted.step()
+    assert np.ptp(drawn.read(fitted.data).path_factors) > 0
     with pytest.raises(ConfigError, match="acts through drag"):
         Sim(drone="bumblebee").add(Randomize(wind=(0.0, 1.0)))
     sim = Sim(3)
