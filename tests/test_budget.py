@@ -12,7 +12,7 @@ SLACK = 40
 BUDGET = {
     "commands": 1164,
     "control": 1765,
-    "core": 1578,
+    "core": 1579,
     "crazysim": 836,
     "drones": 514,
     "dynamics": 574,
@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 11046,
     "media": 967,
-    "plugins": 7051,
+    "plugins": 7056,
     "scene": 3090,
     "sim": 945,
     "train": 2358,
