@@ -10,7 +10,6 @@ from crazysim.core import functional as F
 
 
 def path_setpoint(path, t):
-    """Return the setpoint of a path at a time. The path is a function of time to (x, y, z, yaw)."""
     values = []
     for _ in range(5):
         values.append(path)
@@ -32,7 +31,6 @@ def hover(t):
 
 
 def start_on_path(sim, path):
-    """Put every drone at the beginning of a path, with its velocity, and rotors at hover speed."""
     from crazysim.dynamics import first_principles
 
     sp = path_setpoint(path, jnp.float32(0))
@@ -77,5 +75,4 @@ def rms_error(states, setpoints, start=0.0, total=1.0):
 
 
 def make_sim(drone="cf21B_500", control="force_torque", **settings):
-    """Return a simulation of one drone."""
     return Sim(drone=drone, control=control, **settings)

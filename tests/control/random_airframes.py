@@ -88,13 +88,11 @@ def draw_airframe(rng, n, name):
 
 
 def draw_airframes(n, count, seed=0):
-    """Return random airframes of n rotors."""
     rng = np.random.default_rng([seed, n])
     return [draw_airframe(rng, n, f"{n} rotors, number {k} of seed {seed}") for k in range(count)]
 
 
 def set_flying_states(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
-    """Set the states of all drones, with hover speeds of rotors, and remove the floor."""
     if "clip_floor_pos" in sim.step_pipeline:
         remove_fn(sim.step_pipeline, "clip_floor_pos")
         sim.build_step_fn()

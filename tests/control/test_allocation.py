@@ -25,7 +25,6 @@ def setup(name="cf21B_500"):
 @given(thrusts=arrays(np.float64, 4, elements=st.floats(0.03, 0.19)))
 @pytest.mark.parametrize("name", ["cf21B_500", "crazyflie"])
 def test_a_wrench_within_the_limits_is_given_exactly(name, thrusts):
-    """Thrusts to wrench with the mixing matrix, and back by the allocation."""
     airframe, params = setup(name)
     thrusts = thrusts * airframe.value("rotors.thrust_max") / 0.2
     arms = [airframe.arm, airframe.arm, airframe.value("controller.thrust2torque")]

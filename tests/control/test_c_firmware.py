@@ -94,7 +94,6 @@ static inline int powerDistributionCap(const motors_thrust_uncapped_t *thrusts, 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """Return the path of a compiled library for its source."""
     folder = tmp_path_factory.mktemp("c")
 
     def compile_library(name, source):
@@ -230,7 +229,6 @@ def test_a_new_controller_loads_a_library_that_was_compiled_again(tmp_path):
 
 
 def test_the_example_gives_the_firmware_its_inputs(tmp_path):
-    """The types are those of the firmware's stabilizer_types.h; the controller returns sums of its inputs."""
     for name in ("math3d", "controller_lee", "controller_mellinger", "power_distribution"):
         (tmp_path / f"{name}.h").write_text(STAND_IN_HEADER if name == "math3d" else '#include "math3d.h"')
     command_line = [

@@ -99,7 +99,6 @@ def test_an_airframe_without_gains_is_refused(controller):
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("controller", [PID(), Mellinger()], ids=["pid", "mellinger"])
 def test_gradients_are_finite_at_rest_and_at_saturation(controller):
-    """At rest the axes of a level drone coincide with the desired ones; far away every limit is active."""
     states, commands = np.zeros((6, 2, 13)), np.zeros((6, 2, 16))
     states[..., 9] = commands[..., 12] = 1.0
     commands[:, 1, :3] = 50.0

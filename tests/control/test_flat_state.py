@@ -22,12 +22,10 @@ STEP = 1e-4
 
 
 def wave(amplitude, rate, phase, order, t):
-    """Return a derivative of a sine."""
     return amplitude * rate**order * jnp.sin(rate * t + phase + order * jnp.pi / 2)
 
 
 def setpoint_on_curve(curve, t):
-    """Return the setpoint of a curve of sines at a time."""
     amplitude, rate, phase, yaw = curve
     derivatives = [wave(amplitude, rate, phase, k, t) for k in range(5)]
     heading = [jnp.reshape(wave(*yaw, k, t), (1,)) for k in range(3)]

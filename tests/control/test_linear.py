@@ -52,7 +52,6 @@ def energy(x):
 
 
 def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
-    """Without thrust the centre of mass falls freely, whatever the rod does."""
     x = np.zeros(16)
     x[3:6], x[12:16] = [1, 2, 3], [0.6, -0.4, 2.0, 3.0]
     after = integrate(load, x, np.zeros(4), 1e-3, 500)
@@ -68,7 +67,6 @@ def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
 
 
 def test_a_load_off_the_centre_keeps_energy_and_momentum():
-    """Without thrust and gravity: linear and angular momentum about the origin, and energy."""
     attach, still = np.array([0.05, -0.03, 0.02]), np.zeros(3)
     rates_off_centre = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, still, LOAD, LENGTH, attach))
     x = np.linspace(-0.4, 0.5, 16)
@@ -100,7 +98,6 @@ def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
 
 
 def test_the_linearisation_with_a_load_agrees_with_the_lab():
-    """Elements of the matrices that AIMotionLab-Virtual computes."""
     A, B = (np.asarray(x) for x in linearize_load(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0])))
     assert round(float(A[3, 7]), 4) == 10.6207
     assert round(float(A[3, 13]), 4) == -0.8107

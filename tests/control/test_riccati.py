@@ -14,7 +14,7 @@ SOLVERS = {
     "discrete": (jax.jit(solve_discrete), scipy.linalg.solve_discrete_are),
 }
 GAINS = {gain: jax.jit(gain) for gain in (gain_continuous, gain_discrete)}
-SIZES = [(2, 1), (4, 2), (12, 4), (16, 4)]
+SIZES = [(4, 2), (16, 4)]
 """Numbers of states and inputs."""
 
 

@@ -39,7 +39,6 @@ def test_at_the_setpoint_the_command_is_level_and_carries_the_assumed_mass():
 @pytest.mark.parametrize("axis, angle, sign", [(0, 1, 1), (1, 0, -1)])
 @pytest.mark.parametrize("start", [0, 3])
 def test_the_drone_tilts_towards_its_setpoint(start, axis, angle, sign):
-    """Towards a setpoint ahead (x) the pitch is positive, nose down; to the left (y) the roll is negative."""
     cmd = setpoint()
     cmd[start + axis] = 0.1
     rpy = np.array(run_controller(cmd)[0][:3])

@@ -18,17 +18,14 @@ FIRMWARE_PAIR = (HEXAROTOR, "cf2x_L250")
 MIXED_PAIR = ("bumblebee", HEXAROTOR)
 STATES = ("pos", "quat", "vel", "ang_vel")
 CASES = [
-    ("attitude", "crazyflow", FLEET),
     ("state", "crazyflow", FLEET),
     ("body_rate", "crazyflow", MIXED_PAIR),
-    ("force_torque", "crazyflow", MIXED_PAIR),
     ("rotor_vel", "crazyflow", FLEET),
     ("state", "geometric", MIXED_PAIR),
     ("state", "lqr", MIXED_PAIR),
     ("state", "indi", MIXED_PAIR),
     ("state", "mellinger", FIRMWARE_PAIR),
     ("state", "pid", FIRMWARE_PAIR),
-    ("attitude", "mellinger", FIRMWARE_PAIR),
 ]
 """Command level, controller and airframes."""
 COMMANDS = {
@@ -42,7 +39,6 @@ COMMANDS = {
 
 
 def set_flying(sim, pos):
-    """Place moving drones at positions, send them a command, and return the simulation."""
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos, vel=np.full_like(pos, 0.1)))
     n_rotors = sim.data.states.rotor_vel.shape[-1]
     command = COMMANDS[sim.control.value][: n_rotors if sim.control == "rotor_vel" else None]
@@ -74,8 +70,7 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
         np.testing.assert_array_equal(result[n:], 0)
 
 
-@pytest.mark.parametrize("name", ["bumblebee", "hexarotor"])
-@pytest.mark.parametrize("key", ["inertia", "lag"])
+@pytest.mark.parametrize(("key", "name"), [("inertia", "hexarotor"), ("lag", "bumblebee")])
 def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, name):
     """The airframe whose rotors differ is the one with fewer or the one with more rotors."""
     fleet = {"bumblebee": load_airframe("bumblebee"), "hexarotor": load_airframe(HEXAROTOR)}
@@ -92,9 +87,8 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
         np.testing.assert_allclose(result, expected, rtol=3e-5, atol=3e-5)
 
 
-@pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])
-def test_fitted_models_may_be_mixed(dynamics):
-    fleet = ("cf21B_500", "cf2x_L250")
+def test_fitted_models_may_be_mixed():
+    fleet, dynamics = ("cf21B_500", "cf2x_L250"), "so_rpy_rotor"
     pos = random_positions(2, 2)
     mixed = set_flying(Sim(2, drone=fleet, dynamics=dynamics, engine="interpret"), pos)
     mixed.step(50)
@@ -125,9 +119,9 @@ def test_only_parameters_that_differ_have_an_axis_of_drones():
     np.testing.assert_array_equal(np.any(exists, axis=-1), [False, False, True, False])
 
 
-@pytest.mark.parametrize("n_worlds", [1, 2, 3])
+@pytest.mark.parametrize("n_worlds", [2, 3])
 def test_worlds_and_drones_may_be_equally_many(n_worlds):
-    sim = Sim(n_worlds, drone=FLEET[:n_worlds] if n_worlds > 1 else FLEET[:2], engine="plain")
+    sim = Sim(n_worlds, drone=FLEET[:n_worlds], engine="plain")
     check_axes(sim.data, n_worlds, sim.n_drones)
     mass = [airframe.value("rigid_body.mass") for airframe in sim.airframes]
     result = np.asarray(sim.data.params.mass)[..., 0]
@@ -145,7 +139,7 @@ def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
 @pytest.mark.long("compiles gradients through a controller for each airframe")
 @pytest.mark.parametrize(
     ("control", "controller", "engine"),
-    [("state", "crazyflow", None), ("state", "geometric", None), ("rotor_vel", "crazyflow", "lanes")],
+    [("state", "crazyflow", None), ("rotor_vel", "crazyflow", "lanes")],
 )
 def test_gradients_of_a_mixed_fleet_are_finite(control, controller, engine):
     """Law 7, without and with an engine: missing rotors cause no division by zero, and nothing depends on them."""
@@ -246,7 +240,6 @@ def test_the_airframe_of_a_mixed_fleet_is_an_error_that_lists_them():
     ],
 )
 def test_wrong_lists_are_refused(n_drones, fleet, error, message):
-    """Law 9."""
     with pytest.raises(error, match=message):
         Sim(n_drones=n_drones, drone=fleet)
 
@@ -258,13 +251,3 @@ def test_airframes_that_lack_gains_are_named():
     records["bumblebee"] = records["cf21B_500"].replace(L=None)
     with pytest.raises(ConfigError, match="the same fields of Params, got 'cf21B_500' and 'bumblebee'"):
         create_per_drone([load_airframe(name) for name in records], lambda airframe: records[airframe.name], 1)
-
-
-def test_resets_keep_the_airframes():
-    sim = set_flying(Sim(2, drone=FLEET), random_positions(2, 4))
-    mass = np.asarray(sim.data.params.mass)
-    sim.step(5)
-    sim.reset(np.array([True, False]))
-    np.testing.assert_array_equal(sim.data.params.mass, mass)
-    sim.reset()
-    np.testing.assert_array_equal(sim.data.params.mass, mass)

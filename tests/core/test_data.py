@@ -49,7 +49,6 @@ def test_the_cascade_of_crazyflow_uses_every_level_below(control):
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_nothing_is_commanded_at_the_start(dynamics, control):
-    """A state setpoint at the origin with yaw zero, no thrust at every other level."""
     data = shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control).data
     for ctrl in (data.controls.attitude, data.controls.body_rate, data.controls.force_torque):
         if ctrl is not None:

@@ -46,7 +46,6 @@ SETPOINT_PARTS = [
 @pytest.mark.parametrize("on_device", [False, True])
 @pytest.mark.parametrize("parts", SETPOINT_PARTS, ids=lambda parts: "-".join(parts))
 def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
-    """Parts are broadcast, on the host and on the device; missing parts and the body rates are zero."""
     data = get_sim("first_principles", "state").data
     expected = np.zeros((2, 2, 16))
     for name, indices in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
@@ -104,31 +103,11 @@ def test_law_09_a_number_too_large_for_the_state_is_reported_as_infinite():
         F.attitude_control(data, command)
 
 
-def test_device_arrays_of_any_real_type_are_cast():
-    data = get_sim("first_principles", "attitude").data
-    for dtype in (jnp.int32, jnp.float16, jnp.bfloat16, jnp.uint8):
-        staged = F.attitude_control(data, jnp.ones((2, 2, 4), dtype)).controls.attitude.staged_cmd
-        assert staged.dtype == data.states.pos.dtype
-        np.testing.assert_array_equal(staged, np.ones((2, 2, 4)))
-
-
 def test_check_finite_does_nothing_inside_jit():
     data = get_sim("first_principles", "attitude").data
     command = jnp.full((2, 2, 4), jnp.nan)
     staged = jax.jit(lambda c: F.attitude_control(data, c, check_finite=True).controls.attitude.staged_cmd)(command)
     assert np.all(np.isnan(staged))
-
-
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_controllable_is_per_world(dynamics, control):
-    data = get_sim(dynamics, control).data
-    freq = 500 if control == "rotor_vel" else getattr(data.controls, control).freq
-    period = 500 // freq
-    for steps in ([0, 1], [period, period + 1], [7 * period, 7 * period - 1]):
-        later_data = data.replace(core=data.core.replace(steps=jnp.asarray(steps, jnp.int32)[:, None]))
-        expected = [[step % period == 0] for step in steps]
-        np.testing.assert_array_equal(F.controllable(later_data), expected)
-        assert F.controllable(later_data).dtype == bool
 
 
 def test_commands_are_staged_in_one_function():

@@ -47,7 +47,6 @@ def fly_all(data, integrator, deriv_fn=first_principles_derivative):
 
 
 def convergence_order(errors):
-    """Return the order of convergence: the slope of log error over log step length."""
     errors = np.asarray(errors)
     assert np.all(errors > 1e-14), f"rounding hides the order: {errors}"
     return np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
@@ -63,7 +62,6 @@ def prepare_data(data, params=None, **states):
 
 
 def rotation_error(quat, exact):
-    """Return the angle between attitudes, rad. (n_drones,)"""
     return [(Rotation.from_quat(np.asarray(q)) * exact.inv()).magnitude() for q in quat[0]]
 
 

@@ -141,8 +141,7 @@ def still(data):
     return data
 
 
-@pytest.mark.parametrize("is_rebuilt", [False, True])
-@pytest.mark.parametrize("edit", EDITS)
+@pytest.mark.parametrize(("edit", "is_rebuilt"), [*((edit, False) for edit in EDITS), ("append", True)])
 def test_an_edit_takes_effect_at_the_next_step(sim, edit, is_rebuilt):
     sim.step_pipeline = {"still": still, "increment_steps": sim.step_pipeline["increment_steps"]}
     before_editing = sim.build_step_fn()

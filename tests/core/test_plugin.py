@@ -83,7 +83,6 @@ class Wake(Plugin):
 
 @partial(jax.jit, static_argnames="integrator")
 def fly(data, integrator):
-    """Return the states and wakes of drones that fly for the same time with different numbers of steps."""
     n_steps = STEPS[None, :, None]
     integrate = Integration(INTEGRATORS[integrator], first_principles_derivative, (Wake(),))
 
@@ -273,7 +272,6 @@ def test_a_replacement_that_fails_changes_nothing():
 
 
 def test_two_of_a_kind_have_two_names():
-    """Gusts of different names are different, and drag adds up."""
     sim = make_hovering_sim(engine="interpret")
     first = sim.add(Wind((1.0, 0, 0), 7.7))
     second = sim.add(Wind((0, 2.0, 0), 7.7), name="thermal")
@@ -310,16 +308,6 @@ def test_plugins_draw_into_images():
     sim.plugins.draw(0)
     assert len(sim.overlays) == 0
     assert finder.visible
-
-
-def test_a_reset_restores_states_of_plugins_in_its_worlds_only():
-    sim = make_hovering_sim(engine="interpret")
-    sim.add(Wake())
-    flown = np.asarray(fly_on(sim).plugins["wake"].vel)
-    sim.reset(np.array([True, False, True]))
-    after = np.asarray(sim.data.plugins["wake"].vel)
-    np.testing.assert_array_equal(after[[0, 2]], 0.0)
-    np.testing.assert_array_equal(after[1], flown[1])
 
 
 class StartRecorder(Plugin):
@@ -648,10 +636,9 @@ class ArrayPlugin(Plugin):
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
-@pytest.mark.parametrize("values", [[True, False], [1.0, 2.0]])
-def test_arrays_of_both_libraries_are_settings(xp, values):
-    np.testing.assert_array_equal(ArrayPlugin(xp.asarray(values)).which, values)
-    np.testing.assert_array_equal(ArrayPlugin(mask=xp.asarray(values)).mask, values)
+def test_arrays_of_both_libraries_are_settings(xp):
+    np.testing.assert_array_equal(ArrayPlugin(xp.asarray([1.0, 2.0])).which, [1.0, 2.0])
+    np.testing.assert_array_equal(ArrayPlugin(mask=xp.asarray([True, False])).mask, [True, False])
 
 
 class Discs(Plugin):

@@ -15,12 +15,11 @@ from crazysim import ConfigError, Sim, stage
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
-from crazysim.engine import Step
 from crazysim.engine.pytree import PyTree, check_axes, leaf, scopes
 from crazysim.engine.sharding import world_mesh
-from crazysim.errors import EngineWarning, UnknownNameError
+from crazysim.errors import EngineWarning
 
-COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
+COUNTS = [(2, 2, 2), (3, 2, 4), (4, 3, 1)]
 """Numbers of worlds, drones and members."""
 
 
@@ -32,7 +31,6 @@ def keep_mass_stages(sim):
 
 
 def states_by_name(data):
-    """Return the states of drones and masses."""
     result = {"drones": data.states.pos, "speeds": data.states.vel}
     for name, record in data.plugins.items():
         result |= {f"masses of {name}": record.pos, f"ticks of {name}": record.ticks}
@@ -55,7 +53,6 @@ def test_law_02_axes_are_as_declared_for_any_counts(n_worlds, n_drones, n_member
 
 
 def test_a_member_moves_like_a_single_member():
-    """Law 1: the motion of a member does not depend on the others."""
     sim = keep_mass_stages(build_springs(Springs, 3, 2, 4, engine="interpret"))
     sim.step(9)
     record = jax.device_get(sim.data.plugins["springs"])
@@ -73,7 +70,6 @@ def test_a_member_moves_like_a_single_member():
 
 @pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
 def test_integration_follows_the_scheme(integrator):
-    """Law 8: a spring is a cosine; the error falls with the order of the scheme."""
     errors, freqs = [], (50, 100, 200)
     with jax.enable_x64(True):
         for freq in freqs:
@@ -84,18 +80,6 @@ def test_integration_follows_the_scheme(integrator):
             errors.append(abs(np.asarray(sim.data.plugins["springs"].pos)[0, 0, 0] - exact))
     slope = np.polyfit(np.log(1 / np.asarray(freqs)), np.log(errors), 1)[0]
     assert abs(slope - sim.integrator.order) < 0.35
-
-
-def test_semi_implicit_euler_keeps_energy():
-    energies = {}
-    for integrator in ("euler", "symplectic_euler"):
-        sim = Sim(integrator=integrator, engine="plain")
-        sim.add(Springs(1, rate=None))
-        keep_mass_stages(sim).step(2000)
-        record = jax.device_get(sim.data.plugins["springs"])
-        energies[integrator] = np.sum(STIFFNESS * record.pos**2 + record.vel**2) / (3 * STIFFNESS)
-    assert abs(energies["symplectic_euler"] - 1) < 0.02
-    assert energies["euler"] > 1.3
 
 
 @pytest.mark.long("compiles gradients in both directions")
@@ -137,18 +121,6 @@ def test_a_derivative_reaches_the_drones_from_a_mass():
     assert np.all(slope[0] == 0)
 
 
-def test_worlds_are_reset_with_their_members():
-    sim = build_springs(Tying, 3, 2, 2, engine="interpret")
-    sim.step(20)
-    before = jax.device_get(sim.data.plugins["springs"])
-    sim.reset(np.array([True, False, True]))
-    after, start = jax.device_get((sim.data.plugins["springs"], sim.default_data.plugins["springs"]))
-    for name in ("pos", "vel", "ticks"):
-        np.testing.assert_array_equal(getattr(after, name)[::2], getattr(start, name)[::2])
-        np.testing.assert_array_equal(getattr(after, name)[1], getattr(before, name)[1])
-    assert not np.array_equal(before.pos[0], start.pos[0])
-
-
 def test_worlds_are_spread_over_devices():
     kinds = (Springs, Tying)
     unsharded_sim = build_springs(kinds, 4, 2, 3)
@@ -162,8 +134,6 @@ def test_worlds_are_spread_over_devices():
 
 
 def test_random_numbers_are_those_of_world_and_member():
-    """Law 10: they do not depend on how many worlds and members there are."""
-
     @stage("springs")
     def kick(data):
         record = data.plugins["springs"]
@@ -239,17 +209,6 @@ def test_a_stage_that_no_engine_supports_is_reported_once():
     assert len(caught) == 1
 
 
-def test_a_mass_that_is_not_finite_flags_its_world_only():
-    sim = build_springs(Springs, 3, 2, 2)
-    record = sim.data.plugins["springs"]
-    vel = np.array(record.vel)
-    vel[1, 0, 0] = np.nan
-    sim.data = sim.plugins["springs"].write(sim.data, record.replace(vel=vel))
-    sim.step(2)
-    np.testing.assert_array_equal(np.asarray(sim.data.core.nonfinite)[:, 0], [False, True, False])
-    assert np.all(np.isfinite(sim.data.states.pos))
-
-
 def test_a_population_is_added_replaced_and_removed():
     sim = Sim(2, 2, engine="lanes")
     before, leaves = list(sim.step_pipeline), len(jax.tree.leaves(sim.data))
@@ -272,14 +231,6 @@ def test_a_population_is_added_replaced_and_removed():
     sim.remove("springs")
     assert list(sim.step_pipeline) == before
     assert len(jax.tree.leaves(sim.data)) == leaves
-
-
-def test_ten_calls_are_one_trace():
-    """Law 6."""
-    sim = build_springs(Springs, engine="lanes")
-    for n in range(10):
-        sim.step(n + 1)
-    assert sim.step_fn._cache_size() == 1
 
 
 def test_names_are_those_given_or_numbers():
@@ -387,21 +338,3 @@ def test_a_rate_of_something_else_is_refused():
     sim.add(Wrong())
     with pytest.raises(ConfigError, match="rates of states of members in its record, which are 'member_id', 'pos'"):
         sim.step()
-
-
-def test_the_step_is_used_inside_jit_and_vmap():
-    sim = build_springs(Tying, 2, 2, 3, engine="lanes")
-    step = Step(sim.step_pipeline, "lanes")
-
-    def final(cmd):
-        return step(sim.plugins["springs"].with_command(sim.data, cmd), 3).plugins["springs"].pos
-
-    commands = np.stack([np.ones((2, 3, 3), np.float32), np.zeros((2, 3, 3), np.float32)])
-    both = np.asarray(jax.jit(jax.vmap(final))(commands))
-    for k in range(2):
-        np.testing.assert_allclose(both[k], final(commands[k]), rtol=1e-6)
-
-
-def test_an_unknown_plugin_is_refused():
-    with pytest.raises(UnknownNameError, match="springs"):
-        Springs().read(Sim().data)

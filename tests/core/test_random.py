@@ -9,19 +9,9 @@ from cases import shared_sim
 from crazysim.core.random import drone_keys, normal, uniform
 
 
-def bits(keys):
-    return np.asarray(jax.random.key_data(keys))
-
-
 @pytest.fixture(scope="module")
 def data():
     return shared_sim(n_worlds=3, n_drones=2, control="rotor_vel").data
-
-
-def test_keys_are_the_same_inside_jit(data):
-    np.testing.assert_array_equal(
-        bits(jax.jit(drone_keys, static_argnums=1)(data, "wind")), bits(drone_keys(data, "wind"))
-    )
 
 
 def test_numbers_are_uniform_and_uncorrelated(data):

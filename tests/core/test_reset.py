@@ -33,7 +33,6 @@ class Counter:
 
     @staticmethod
     def create():
-        """Return a counter at zero."""
         zeros = jnp.zeros((N_WORLDS, 2, 2))
         return Counter(jnp.zeros((N_WORLDS, 1)), jnp.zeros(3), {"one": zeros}, jnp.zeros(N_WORLDS))
 
@@ -46,7 +45,6 @@ class NativeRecord(PyTree):
 
 
 def count(data):
-    """Add one to every plugin."""
     return data.replace(plugins=jax.tree.map(lambda x: x + 1, data.plugins))
 
 
@@ -93,27 +91,6 @@ def test_metadata_on_a_field_that_holds_a_record_are_refused(counting_sim):
     nested = dataclasses.replace(Counter.create(), count=Counter.create())
     with pytest.raises(ConfigError, match=r"\['foreign'\].count, whose metadata have 'core_ndim', got a Counter"):
         scopes(counting_sim.data.replace(plugins={"foreign": nested}))
-
-
-def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
-    sim = Sim(n_worlds=N_WORLDS, control="attitude")
-    key = jax.random.key_data(sim.data.core.rng_key)
-    params, controller_data = sim.data.params, sim.data.controls.controller
-    heavy = params.replace(mass=2 * params.mass, gravity_vec=0 * params.gravity_vec)
-    stiff = controller_data.replace(
-        params=controller_data.params.replace(stiffness=3 * controller_data.params.stiffness)
-    )
-    changed = sim.data.replace(params=heavy, controls=sim.data.controls.replace(controller=stiff))
-    sim.data = changed
-    sim.seed(7)
-    sim.reset(MASK)
-    np.testing.assert_array_equal(sim.data.params.mass, heavy.mass)
-    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, stiff.params.stiffness)
-    sim.reset()
-    np.testing.assert_array_equal(sim.data.params.mass, params.mass)
-    np.testing.assert_array_equal(sim.data.params.gravity_vec, params.gravity_vec)
-    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, controller_data.params.stiffness)
-    assert not np.array_equal(jax.random.key_data(sim.data.core.rng_key), key), "the seed stays"
 
 
 def test_a_parameter_of_each_drone_returns_to_the_shared_default_and_stays_of_each_drone():

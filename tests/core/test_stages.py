@@ -3,18 +3,17 @@
 import jax
 import numpy as np
 import pytest
-from cases import hover_rotor_state, needs_compiler, weight, with_states
+from cases import hover_rotor_state, weight, with_states
 
 from crazysim import Sim
 from crazysim.core import remove_fn
 from crazysim.core.integration import FLOOR_HEIGHT, Integrator
 
 
-@pytest.mark.parametrize("engine", ["plain", pytest.param("fused", marks=needs_compiler)])
 @pytest.mark.parametrize("integrator", list(Integrator))
-def test_a_drone_stands_at_its_start_takes_off_and_lands(integrator, engine):
+def test_a_drone_stands_at_its_start_takes_off_and_lands(integrator):
     """The floor carries it at the height of its start, and 1 mm lower once it has landed."""
-    sim = Sim(2, control="rotor_vel", integrator=integrator, engine=engine)
+    sim = Sim(2, control="rotor_vel", integrator=integrator, engine="plain")
     hover, start = hover_rotor_state(sim.data), sim.data.states
     push = [0.2 * weight(sim.data), 0, 0]
     sim.data = with_states(sim.data, force=push, torque=[1e-5, 0, 1e-4])
@@ -33,9 +32,8 @@ def test_a_drone_stands_at_its_start_takes_off_and_lands(integrator, engine):
     np.testing.assert_array_equal(sim.data.states.vel, 0)
 
 
-@pytest.mark.parametrize("integrator", list(Integrator))
-def test_a_drone_without_a_floor_falls_from_its_start(integrator):
-    sim = Sim(integrator=integrator)
+def test_a_drone_without_a_floor_falls_from_its_start():
+    sim = Sim()
     remove_fn(sim.step_pipeline, "clip_floor_pos")
     sim.step(100)
     assert float(sim.data.states.pos[0, 0, 2]) < -0.15  # g t^2 / 2 = 0.196 m, less drag

@@ -25,7 +25,6 @@ def read_tables(name):
 
 
 def iterate_numbers(node, path=""):
-    """Yield path and entry of every key that is not a table of keys."""
     for key, entry in node.items():
         if isinstance(entry, dict) and "value" not in entry:
             yield from iterate_numbers(entry, f"{path}{key}.")
@@ -280,50 +279,35 @@ WRONG_AIRFRAMES = {
         r"expected rigid_body.mass as a number, an array or \{ value, unit, source \}, got \{'kilos': 0.03\}",
     ),
     "mass as text": (set_key("rigid_body.mass", "0.03"), "rigid_body.mass as a number or array, got '0.03'"),
-    "mass true": (set_key("rigid_body.mass", True), "rigid_body.mass as a number or array, got True"),
     "mass negative": (set_key("rigid_body.mass", -0.03), "rigid_body.mass to be from 1e-6 to 1e6 kg, got -0.03"),
-    "mass zero": (set_key("rigid_body.mass", 0.0), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 0.0"),
-    "mass nan": (set_key("rigid_body.mass", float("nan")), "rigid_body.mass to be from 1e-6 to 1e6 kg, got nan"),
-    "mass tiny": (set_key("rigid_body.mass", 1e-300), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 1e-300"),
     "mass huge": (set_key("rigid_body.mass", 10**400), "rigid_body.mass as a number or array, got 1000"),
     "too light": (set_key("rigid_body.mass", 1e-6), "expected rotors that lift 1e-06 kg, .* 1000 times its weight"),
     "too heavy": (set_key("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, .*, got 4 rotors of .* to 0.2 N"),
-    "least thrust above weight": (set_key("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
     "inertia of no rigid body": (
         set_key("rigid_body.inertia", [1e-5, 1e-5, 9e-5]),
         "moment is at most the sum of the others",
     ),
     "inertia tiny": (set_key("rigid_body.inertia", [1e-14] * 3), "turn the body with at most 1e[+]06 rad/s"),
-    "inertia zero": (set_key("rigid_body.inertia", [1e-300] * 3), "three positive moments"),
     "rotor inertia large": (set_key("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
     "rotor inertia negative": (set_key("rotors.inertia", -1e-8), "rotors.inertia to be at least zero, got -1e-08"),
     "thrust curve zero": (set_key("rotors.thrust_curve", [0, 0, 0]), "expected thrust_curve with a positive quadratic"),
     "thrust curve falls": (set_key("rotors.thrust_curve", [0.2, 0, -1e-10]), "expected thrust_curve with a positive"),
-    "thrust curve linear": (set_key("rotors.thrust_curve", [0, 1e-5, 0]), "expected thrust_curve with a positive"),
     "thrust at rest": (set_key("rotors.thrust_curve", [0.1, 0, 4e-10]), "rises from thrust_min to thrust_max"),
     "thrust curve tiny": (set_key("rotors.thrust_curve", [0, 0, 1e-28]), "between 0 and 1e[+]06 rpm"),
-    "thrust curve zero for one rotor": (
-        set_key("rotors.thrust_curve", [[0, 0, 4e-10]] * 3 + [[0, 0, 0]]),
-        "thrust_curve with",
-    ),
     "torque curve negative": (
         set_key("rotors.torque_curve", [0, 0, -1e-12]),
         "expected torque_curve that rises at the speed of hover",
     ),
-    "torque curve zero": (set_key("rotors.torque_curve", [0, 0, 0]), "torque_curve that rises at the speed of hover"),
     "torque curve below zero": (set_key("rotors.torque_curve", [-1, 0, 2e-12]), "torque_curve of at least 0 N m"),
-    "torque curve huge": (set_key("rotors.torque_curve", [0, 0, 1.0]), "torque_curve of at least 0 N m .* at most"),
     "lag negative": (set_key("rotors.lag", [-14, 0, 14, 0]), "rotors.lag to be at least zero, got .-14.0"),
     "lag without spin-up": (set_key("rotors.lag", [0, 0, 14, 0]), "lag with a positive linear or quadratic term"),
     "lag too fast": (
         set_key("rotors.lag", [1e4, 0, 14, 0]),
         r"rotors.lag .* slow for steps of 1/500 s, .*freq=6667 or",
     ),
-    "signs of two": (set_key("rotors.yaw_torque_sign", [2, -1, 1, -1]), "yaw_torque_sign to be 1 or -1 for each rotor"),
     "signs of a half": (set_key("rotors.yaw_torque_sign", [0.5, -1, 1, -1]), "yaw_torque_sign as 1 or -1"),
     "signs alike": (set_key("rotors.yaw_torque_sign", [1, 1, 1, 1]), "yaw_torque_sign as 1 or -1 .* not all equal"),
     "rotors in the middle": (set_key("rotors.position", [[0, 0, 0.1]] * 4), "rotors beside the centre of mass"),
-    "rotors at one side": (set_key("rotors.position", [[0.1, 0, 0]] * 4), "turn it about x, y and z, each alone, got"),
     "rotors in a row": (
         set_key("rotors.position", [[x, 0, 0] for x in (-0.1, -0.05, 0.05, 0.1)]),
         "turn it about x, y and z, each alone, got",
@@ -336,10 +320,6 @@ WRONG_AIRFRAMES = {
     "rotors far away": (set_key("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
     "drag that pushes": (set_key("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
     "drag large": (set_key("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
-    "drag matrix that pushes": (
-        set_key("drag.coefficients", [[-0.01, 0.03, 0], [0.03, -0.01, 0], [0, 0, -0.01]]),
-        "expected drag.coefficients that brakes",
-    ),
     "stiffness that repels": (set_key("fitted.so_rpy.rpy_coef", [150.0] * 3), "fitted.so_rpy.rpy_coef to be negative"),
     "fit that does not lift": (
         set_key("fitted.so_rpy.cmd_f_coef", 0.1),
@@ -351,11 +331,6 @@ WRONG_AIRFRAMES = {
     "plate without size": (set_key("shape.plate", [0.03, 0.0, 0.02]), "shape.plate to be from 1e-6 to 1e3 m"),
     "sphere without size": (set_key("shape.collision_sphere", [0, 0, 0, -1]), "coordinates and a positive radius"),
     "camera above": (set_key("shape.track_camera", [0, 0, 1]), "track_camera behind or ahead of the drone"),
-    "inertia of two": (
-        set_key("rigid_body.inertia", [1e-5, 1e-5]),
-        r"rigid_body.inertia of shape \(3,\) or \(3, 3\), got \(2,\)",
-    ),
-    "inertia negative": (set_key("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
     "inertia not symmetric": (
         set_key("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
         "symmetric positive definite",
@@ -366,21 +341,8 @@ WRONG_AIRFRAMES = {
         r"expected rotors.position of shape \(n, 3\), got \(2,\)",
     ),
     "ragged positions": (set_key("rotors.position", [[0.1, 0.1], [0.1]]), "as a number or array, got"),
-    "three signs": (
-        set_key("rotors.yaw_torque_sign", [1, -1, 1]),
-        r"expected rotors.yaw_torque_sign of shape \(4,\), got \(3,\)",
-    ),
     "thrust negative": (set_key("rotors.thrust_max", -0.1), "rotors.thrust_max to be positive, got -0.1"),
     "thrusts reversed": (set_key("rotors.thrust_max", 0.01), "expected 0 <= thrust_min < thrust_max, got"),
-    "curve of two": (
-        set_key("rotors.thrust_curve", [0.0, 1e-10]),
-        r"expected rotors.thrust_curve of shape \(3,\) or \(4, 3\), got \(2,\)",
-    ),
-    "one drag": (
-        set_key("drag.coefficients", [-0.02]),
-        r"expected drag.coefficients of shape \(3,\) or \(3, 3\), got \(1,\)",
-    ),
-    "lag of two": (set_key("rotors.lag", [14.0, 1e-4]), r"expected rotors.lag of shape \(4,\) or \(4, 4\), got \(2,\)"),
     "stiffness": (
         set_key("fitted.so_rpy.rpy_coef", -150.0),
         r"expected fitted.so_rpy.rpy_coef of shape \(3,\), got \(\)",
@@ -402,14 +364,6 @@ WRONG_AIRFRAMES = {
         set_key("rigidbody", {"mass": 0.05}),
         r"airframe 'custom': expected a table that exists, got \[rigidbody\]. Did you mean \[rigid_body\]\? docs",
     ),
-    "inner table misspelt": (
-        set_key("controller.atitude", {"kR": [1, 1, 1]}),
-        r"got \[controller.atitude\]. Did you mean \[controller.attitude\]",
-    ),
-    "mass misspelt": (
-        set_key("rigid_body.mas", 0.05),
-        "expected a key that exists, got 'rigid_body.mas'. Did you mean 'rigid_body.mass'",
-    ),
     "base misspelt": (set_key("bse", "cf2x_L250"), "expected a key that exists, got 'bse'. Did you mean 'base'"),
     "mass in no table": (set_key("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'battery.mass' or 'con"),
     "unit misspelt": (
@@ -421,7 +375,6 @@ WRONG_AIRFRAMES = {
         set_key("fitted.so_rpy.thrust_dyn_coef", 16.0),
         "got 'fitted.so_rpy.thrust_dyn_coef'. Did you mean 'fitted.so_rpy_rotor.thrust_dyn_coef'",
     ),
-    "shape of two": (set_key("shape.plate", [0.03, 0.03]), r"expected shape.plate of shape \(3,\), got \(2,\)"),
     "no drag": (remove_key("drag"), "has no value 'drag.coefficients'"),
     "no thrust curve": (remove_key("rotors.thrust_curve"), r"has parameters for \(so_rpy.*\), got 'first_principles'"),
 }
@@ -477,7 +430,6 @@ def test_law_09_a_model_of_bodies_gets_the_way_to_a_toml_file(tmp_path, name):
 
 
 def nested(depth):
-    """Return a list that is nested to a depth."""
     value = []
     for _ in range(depth):
         value = [value]
@@ -531,7 +483,6 @@ def test_law_09_an_unknown_key_is_answered_with_the_file(tmp_path):
 
 
 def test_the_page_lists_all_tables_and_keys_and_no_others():
-    """Cells of the first two columns of the table "Keys", and the first of the table "Shape"."""
     page = (Path(__file__).parents[2] / "docs/guides/airframes.md").read_text(encoding="utf-8")
     section = page.split("## Keys")[1].split("## From a dict")[0]
     rows = [

@@ -23,7 +23,6 @@ quats = unit_quats()
 
 
 def reference(quat, vel, ang_vel, cmd, rotor_vel, force, torque, airframe):
-    """Return the derivatives by matrices, cross products and loops, from the numbers of the airframe's file."""
     a = airframe.value
     rotation = Rotation.from_quat(quat).as_matrix()
     total_force = np.array(force) + rotation @ np.diag(a("drag.coefficients")) @ rotation.T @ vel

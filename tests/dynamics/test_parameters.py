@@ -48,7 +48,6 @@ def test_values_of_another_array_module():
 
 
 def test_limits_of_the_rotors():
-    """In rpm the thrusts at the limits are the airframe's; a fitted model has four times the thrust of one rotor."""
     low, high = rotor_vel_limits("first_principles", "cf2x_L250")
     k0, k1, k2 = load_params("first_principles", "cf2x_L250")["rpm2thrust"]
     np.testing.assert_allclose([k0 + k1 * w + k2 * w**2 for w in (low, high)], [0.012817578393, 0.12], rtol=1e-5)

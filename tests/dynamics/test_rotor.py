@@ -121,7 +121,6 @@ def test_reaction_torque_by_hand():
 
 @given(rotor_vel=speeds, ang_vel=vectors)
 def test_law_08_spinning_rotors_and_body_keep_their_angular_momentum(rotor_vel, ang_vel):
-    """Law 8: gyroscopic and reaction torque together are -dh/dt of the rotors' momentum, seen from the turning body."""
     inertia, acc = np.array([38.93e-9]), rotor_acceleration(np.full(4, 15e3), rotor_vel, LAG)
     spin = -SIGN * (2 * math.pi / 60) * inertia
     h, h_dot = np.array([0, 0, spin @ rotor_vel]), np.array([0, 0, spin @ acc])

@@ -23,14 +23,13 @@ from cases import (
     zero_thrust_command,
 )
 
-from crazysim import ConfigError, PyTree, Sim, leaf
+from crazysim import PyTree, Sim, leaf
 from crazysim.core.integration import FLOOR_HEIGHT
 from crazysim.engine.pytree import n_batch_axes, scopes
 
 
 @functools.cache
 def build_program(dynamics="first_principles", control="attitude", **settings):
-    """Return the data at rest, the step and the reset of three worlds of two drones."""
     sim = shared_sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, **settings)
     return sim.default_data, sim.build_step_fn(), sim.build_reset_fn()
 
@@ -92,14 +91,15 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
     good = repeat_command(data, hover_command(data)).astype(np.float32)
     # Fitted dynamics contain the attitude controller and ignore the last three numbers, the desired body rates.
     used = 13 if dynamics in FITTED_DYNAMICS and control == "state" else good.shape[-1]
+    clean = run_steps(step, send(data, jnp.asarray(good)), 20)
+    assert not clean.core.nonfinite.any()
     for component in range(used):
         bad = good.copy()
         bad[1, 0, component] = np.nan
         if component == 0:
             with pytest.raises(ValueError, match=r"NaN or infinite.* in world\(s\) \[1\]"):
                 send(data, bad)
-        clean, poisoned = (run_steps(step, send(data, jnp.asarray(cmd)), 20) for cmd in (good, bad))
-        assert not clean.core.nonfinite.any()
+        poisoned = run_steps(step, send(data, jnp.asarray(bad)), 20)
         np.testing.assert_array_equal(poisoned.core.nonfinite[:, 0], [False, True, False], err_msg=f"{component}")
         for x, y in zip(jax.tree.leaves(poisoned.states), jax.tree.leaves(clean.states), strict=True):
             np.testing.assert_array_equal(x[::2], y[::2])  # the other worlds are not affected
@@ -111,16 +111,6 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
     assert not healed.core.nonfinite.any()
     for x, y in zip(jax.tree.leaves(healed.states), jax.tree.leaves(clean.states), strict=True):
         np.testing.assert_array_equal(x[1], y[1])
-
-
-@pytest.mark.parametrize(
-    "level, freq, level_freq",
-    [("state", 500, 300), ("attitude", 500, 333), ("attitude", 400, 500), ("body_rate", 100, 40)],
-)
-def test_fault_05_rates_that_do_not_divide_are_refused(level, freq, level_freq):
-    """Crazyflow runs such a controller at another rate than the one its integrals and derivatives use."""
-    with pytest.raises(ConfigError, match=f"{level}_freq is {level_freq} Hz, which does not divide freq = {freq} Hz"):
-        Sim(control=level, freq=freq, **{f"{level}_freq": level_freq})
 
 
 def simulate_fall(data, n_steps, command_rotors=lambda r: 0.0):
@@ -183,7 +173,7 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
     assert v < -3.5, "gravity gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
 
 
-@pytest.mark.parametrize("dynamics", ["first_principles", *FITTED_DYNAMICS])
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy_rotor_drag"])
 def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(dynamics):
     """Rotors that stand still cannot turn a drone, and start late. Compensation of drag does not tilt it."""
     data, step, _ = build_program(dynamics, "state")
@@ -216,29 +206,8 @@ def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():
     np.testing.assert_array_equal(data.states.rotor_vel, 0.0)
 
 
-def test_fault_09_a_parameter_is_shared_or_per_drone_never_guessed():
-    """If there are as many worlds as drones, Crazyflow takes one mass per world for one mass per drone."""
-    sim = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
-    data, step = with_states(sim.data, pos=[0, 0, 10.0]), sim.build_step_fn()
-    hover_speeds, m = hover_rotor_state(data), float(data.params.mass[0])
-    data = send(with_states(data, rotor_vel=hover_speeds), repeat_command(data, hover_speeds))
-    with pytest.raises(ConfigError, match=r"data.params.mass has shape \(2, 1\).*jnp.broadcast_to"):
-        run_steps(step, with_params(data, mass=np.full((2, 1), m, np.float32)), 1)
-
-    heavy_world = np.broadcast_to(np.float32([m, 2 * m])[:, None, None], (2, 2, 1))
-    vel = np.asarray(run_steps(step, with_params(data, mass=heavy_world), 50).states.vel[..., 2])
-    np.testing.assert_allclose(vel[0], 0.0, atol=1e-4)  # float32: hover to 1e-5 of the weight
-    # With twice the mass and the same thrust, half of gravity is left; drag reduces it by 2%.
-    np.testing.assert_allclose(vel[1], -0.5 * 9.81 * 0.1, rtol=0.03)
-
-    heavy_drone = np.swapaxes(heavy_world, 0, 1)
-    swapped = np.asarray(run_steps(step, with_params(data, mass=heavy_drone), 50).states.vel[..., 2])
-    np.testing.assert_allclose(swapped, vel.T, atol=1e-6)
-
-
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(integrator):
-    """A side force of half its weight and a yaw torque act on it, and its rotors carry half its weight."""
     data, step, _ = build_program("first_principles", "rotor_vel", integrator=integrator)
     hover, m = hover_rotor_state(data), float(data.params.mass[0])
     tilt = [0.1, -0.05, np.sin(0.3), 0.0]
@@ -287,7 +256,6 @@ class Queue(PyTree):
 
 @pytest.fixture(scope="module")
 def used_data():
-    """Return default data with plugins, data after a flight with other parameters, and the reset."""
     data, step, reset = build_program("first_principles", "state")
     queue = Queue(jnp.zeros((3, 2, 4, 16)), jnp.zeros((3, 1)), jnp.arange(5.0))
     default = data.replace(plugins={"queue": queue, "undeclared": jnp.zeros((3, 2))})

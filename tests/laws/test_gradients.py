@@ -60,12 +60,10 @@ def make_losses(dynamics, control, engine, n_worlds, n_steps=100):
 
 
 def forward_mode(losses, x, directions):
-    """Return the losses, and their derivatives along the directions, by forward mode."""
     return jax.jvp(losses, (x,), (directions,))
 
 
 def reverse_mode(losses, x, directions):
-    """Return the losses, and their derivatives along the directions, by reverse mode."""
     values, pullback = jax.vjp(losses, x)
     (gradient,) = pullback(jnp.ones_like(values))
     return values, sum(jnp.sum(gradient[name] * directions[name], axis=-1) for name in x)
@@ -74,9 +72,7 @@ def reverse_mode(losses, x, directions):
 CASES = [
     ("first_principles", "state", "plain", reverse_mode),
     ("first_principles", "body_rate", "stages", forward_mode),
-    ("first_principles", "force_torque", "stages", forward_mode),
     ("first_principles", "rotor_vel", "stages", forward_mode),
-    ("so_rpy", "attitude", "stages", forward_mode),
     ("so_rpy_rotor_drag", "state", "stages", forward_mode),
     ("first_principles", "attitude", "auto", reverse_mode),
 ]
@@ -149,12 +145,10 @@ def test_gradients_of_contacts_equal_central_differences(x64):
 
 
 def one_sided_quotients(fn, x, h):
-    """Return the forward and the backward difference quotient."""
     return (fn(x + h) - fn(x)) / h, (fn(x) - fn(x - h)) / h
 
 
 def side_error(gradient, sides):
-    """Return the difference of a gradient from the nearer of two one-sided quotients, relative to their size."""
     scale = max(1e-9, *(abs(float(side)) for side in sides))
     return min(abs(float(gradient) - float(side)) for side in sides) / scale
 
@@ -187,25 +181,3 @@ def test_at_saturation_the_gradient_is_one_side(limit_name, x64):
     assert side_error(1.0, one_sided_quotients(saturated, limit, 1e-3)) < 1e-6
     outside = limit * (1 + 1e-9 * (1 if limit_name == "rotor_vel_max" else -1))
     assert float(gradient(outside)) == 0.0
-
-
-@pytest.mark.long("compiles the gradient of all stages")
-def test_on_the_floor_and_at_rest_gradients_are_finite():
-    """The drones rest, hit the floor, hover, and fall with their motors off."""
-    sim = Sim(n_worlds=4, control="attitude")
-    step = build_stagewise_step(sim)
-
-    def loss(x):
-        pos, vel, thrust = x
-        states = sim.data.states.replace(pos=pos, vel=vel)
-        cmd = jnp.zeros((4, 1, 4)).at[:, 0, 3].set(thrust)
-        s = step(F.attitude_control(sim.data.replace(states=states), cmd), 100).states
-        return jnp.sum(s.pos**2) + jnp.sum(s.vel * s.ang_vel) + jnp.sum(s.vel)
-
-    pos, vel = np.zeros((2, 4, 1, 3), np.float32)
-    pos[:, 0, 2] = [-0.001, 0.05, 1.0, 0.5]
-    vel[1, 0, 2] = -1.0
-    gradient = jax.jit(jax.grad(loss))((pos, vel, np.float32([0.0, 0.1, WEIGHT, 0.0])))
-    for part in gradient:
-        assert np.all(np.isfinite(part))
-    assert np.abs(gradient[0]).sum() > 0.1

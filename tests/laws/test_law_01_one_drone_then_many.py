@@ -31,7 +31,6 @@ MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation
 
 
 def public_functions(module):
-    """Return the public functions of a module that return arrays."""
     functions = [f for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
     return [f for f in functions if "Array" in f.__annotations__["return"] and not f.__name__.startswith("_")]
 
@@ -47,7 +46,6 @@ CASES = [
 
 
 def make_parameters(module, model):
-    """Return the shared parameters that the functions of a module take."""
     if module is fitted:
         return fitted.Params.create(AIRFRAME, Dynamics(model))
     records = {allocation: AllocationParams, attitude_controller: AttitudeParams, state_controller: StateParams}
@@ -67,7 +65,6 @@ def draw_command(module, function, rng):
 
 
 def draw_arguments(module, function, model, rng, per_drone):
-    """Return random arguments by name: arguments with batch axes, and arguments that all drones share."""
     shared = make_parameters(module, model)
     if per_drone:
         shared = jax.tree.map(lambda x: x * rng.uniform(0.9, 1.1, (*BATCH, *x.shape)), shared)
@@ -98,11 +95,9 @@ def draw_arguments(module, function, model, rng, per_drone):
         draw_functions = {name: functools.partial(rng.uniform, *ends, (*BATCH, 4)) for name, ends in ranges.items()}
     batched, shared_arguments = {}, {}
     for name in inspect.signature(function).parameters:
-        if name == "ctrl_freq":
-            shared_arguments[name] = 100.0
-        elif name == "dt":
-            shared_arguments[name] = 0.002
-        elif name == "params":
+        if name in CONSTANTS:
+            continue
+        if name == "params":
             (batched if per_drone else shared_arguments)[name] = shared
         elif name in ("coefficients", "yaw_torque_sign") or hasattr(shared, name):
             value = {"coefficients": "rpm2thrust", "yaw_torque_sign": "mixing_matrix"}.get(name, name)
@@ -115,25 +110,29 @@ def draw_arguments(module, function, model, rng, per_drone):
     return jax.tree.map(np.asarray, batched), shared_arguments
 
 
-@pytest.mark.parametrize("per_drone", [False, True], ids=["shared", "per_drone"])
+CONSTANTS = {"ctrl_freq": 100.0, "dt": 0.002}
+"""Arguments that are known when a function is compiled."""
+
+
 @pytest.mark.parametrize("module, function, model", CASES)
-def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model, per_drone, x64, rng):
-    """Law 1 for every function of dynamics and control, with shared parameters and parameters per drone."""
-    batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone)
-    if not batched:  # a function of parameters only: without batch axes there is nothing to compare
-        assert not per_drone
-        batched, shared_arguments = draw_arguments(module, function, model, rng, per_drone=True)
-    compiled = jax.jit(lambda batched: function(**batched, **shared_arguments))
-    batch_results = jax.tree.leaves(jax.device_get(compiled(batched)))
-    assert batch_results
-    for i in np.ndindex(BATCH):
-        drone_results = jax.tree.leaves(jax.device_get(compiled(jax.tree.map(lambda x, i=i: x[i], batched))))
-        for of_batch, of_drone in zip(batch_results, drone_results, strict=True):
-            assert of_batch.shape == (*BATCH, *of_drone.shape)
-            assert np.all(np.isfinite(of_drone))
-            # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
-            scale = 1e-13 * max(1.0, float(np.abs(of_batch).max()))
-            np.testing.assert_allclose(of_batch[i], of_drone, rtol=1e-12, atol=scale)
+def test_functions_of_a_batch_equal_those_of_each_drone(module, function, model, x64, rng):
+    constants = {name: x for name, x in CONSTANTS.items() if name in inspect.signature(function).parameters}
+    compiled = jax.jit(lambda arguments: function(**arguments, **constants))
+    for per_drone in (False, True):
+        batched, shared = draw_arguments(module, function, model, rng, per_drone)
+        if not batched and not per_drone:  # a function of parameters only: there is nothing to compare
+            continue
+        batch_results = jax.tree.leaves(jax.device_get(compiled(batched | shared)))
+        assert batch_results
+        for i in np.ndindex(BATCH):
+            drone = jax.tree.map(lambda x, i=i: x[i], batched)
+            drone_results = jax.tree.leaves(jax.device_get(compiled(drone | shared)))
+            for of_batch, of_drone in zip(batch_results, drone_results, strict=True):
+                assert of_batch.shape == (*BATCH, *of_drone.shape)
+                assert np.all(np.isfinite(of_drone))
+                # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
+                scale = 1e-13 * max(1.0, float(np.abs(of_batch).max()))
+                np.testing.assert_allclose(of_batch[i], of_drone, rtol=1e-12, atol=scale)
 
 
 @pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in ("load_lqr", "tracking_lqr")])
@@ -191,7 +190,6 @@ def test_the_cases_cover_dynamics_and_control():
 
 
 def source_files():
-    """Return the source files of physics and control."""
     root = Path(crazysim.__file__).parent
     paths = [p for package in ("dynamics", "control") for p in sorted((root / package).glob("*.py"))]
     assert len(paths) >= 10

@@ -25,7 +25,6 @@ def make_data(sim, n_worlds, n_drones):
 
 
 def with_drone_parameters(data):
-    """Return the data with all shared parameters broadcast to one per drone."""
     shape = data.states.pos.shape[:2]
 
     def broadcast(record):
@@ -41,7 +40,6 @@ def with_drone_parameters(data):
 
 
 def array_types(tree):
-    """Return structure, shapes and types of a tree."""
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
 
 
@@ -124,7 +122,7 @@ def test_a_mass_belongs_to_its_world_and_drone(three_by_three):
     np.testing.assert_allclose(data.states.vel, expected, rtol=5e-7)
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 1), (3, 1, 1), (1, 3, 1), (3, 3), (3, 3, 3), (3, 3, 1, 1), (2, 3, 1), ()])
+@pytest.mark.parametrize("shape", [(3,), (3, 1, 1), (3, 3), (2, 3, 1), ()])
 def test_a_mass_of_a_world_without_an_axis_of_drones_is_refused(three_by_three, shape):
     """Law 2: a parameter is shared or per drone; the user must broadcast a parameter of a world to its drones."""
     wrong = with_params(three_by_three.data, mass=np.full(shape, 0.03, np.float32))
@@ -136,7 +134,6 @@ def test_a_mass_of_a_world_without_an_axis_of_drones_is_refused(three_by_three, 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_docstrings_give_the_shapes(dynamics, control):
-    """Law 2: every array field of every record documents its shape correctly."""
     data = make_data(shared_sim(dynamics=dynamics, control=control), 2, 3)
     assert count_documented_arrays(data, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(data))
 

@@ -46,18 +46,20 @@ def test_a_command_is_taken_over_at_its_tick(dynamics, control):
     np.testing.assert_allclose(sim.time[:, 0], steps / 500, rtol=1e-6)  # one float32 division
 
 
-@pytest.mark.parametrize("level", ["state", "attitude", "body_rate", "force_torque"])
-@pytest.mark.parametrize("rate, nearest", [(300, 250), (501, 500), (1000, 500), (99, 50)])
+@pytest.mark.parametrize(
+    "level, rate, nearest",
+    [("state", 300, 250), ("attitude", 501, 500), ("body_rate", 1000, 500), ("force_torque", 99, 50)],
+)
 def test_a_rate_that_does_not_divide_names_the_nearest(level, rate, nearest):
     """Law 4: rates that would fire between steps are refused, with the next rate below that would do."""
     with pytest.raises(ConfigError, match=rf"{level}_freq is {rate} Hz.*nearest.*\b{nearest} Hz"):
         Sim(control=level, freq=500, **{f"{level}_freq": rate})
 
 
-@pytest.mark.parametrize("rate", [0, -100, 100.0, True, "100"])
-@pytest.mark.parametrize("name", ["freq", "attitude_freq"])
+@pytest.mark.parametrize(
+    "name, rate", [("freq", 0), ("freq", -100), ("freq", 100.0), ("attitude_freq", True), ("attitude_freq", "100")]
+)
 def test_a_rate_is_a_positive_whole_number(name, rate):
-    """Law 4: no other rate has a period in steps."""
     with pytest.raises(ValueError, match=rf"{name}.*positive whole number"):
         Sim(**{name: rate})
 
@@ -67,16 +69,13 @@ def test_a_rate_is_a_positive_whole_number(name, rate):
     [
         ({"control": "state", "freq": 499}, ("near 100 Hz", "outer_freq", "got 499 Hz", "1 Hz", "freq=500")),
         ({"control": "state", "freq": 5}, ("near 100 Hz", "outer_freq", "got 5 Hz", "freq=100")),
-        ({"control": "state", "freq": 125}, ("near 100 Hz", "got 125 Hz", "25 Hz", "freq=126")),
         ({"freq": 5}, ("near 500 Hz", "freq of controller 'auto'", "got 5 Hz", "freq=100")),
-        ({"freq": 997}, ("near 500 Hz", "got 997 Hz", "1 Hz", "freq=998")),
         ({"control": "body_rate", "freq": 50}, ("near 500 Hz", "freq of controller 'auto'", "freq=100")),
         ({"control": "force_torque", "freq": 751}, ("near 500 Hz", "force_torque_freq", "freq=752")),
         (
             {"control": "state", "dynamics": "so_rpy", "freq": 5},
             ("near 100 Hz", "freq of controller 'auto'", "freq=50"),
         ),
-        ({"controller": "crazyflow", "freq": 5}, ("near 500 Hz", "freq of controller 'crazyflow'", "freq=100")),
         ({"control": "state", "controller": "pid", "freq": 499}, ("outer_freq of controller 'pid'", "freq=500")),
         ({"control": "state", "controller": "mellinger", "freq": 997}, ("freq of controller 'mellinger'", "freq=998")),
     ],

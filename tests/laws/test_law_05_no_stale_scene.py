@@ -37,13 +37,11 @@ class Unreadable:
 
 @pytest.fixture(scope="module")
 def one_world_sim():
-    """Return a simulation of one world with one drone."""
     return Sim()
 
 
 @pytest.fixture(scope="module")
 def two_world_sim():
-    """Return a simulation of two worlds with one drone, and a ball that the tests move."""
     sim = Sim(n_worlds=2)
     add_ball(sim)
     return sim
@@ -51,7 +49,6 @@ def two_world_sim():
 
 @pytest.fixture
 def syncs(monkeypatch):
-    """Return a list that grows by one with every sync of all worlds."""
     done = []
 
     def counted(*args):
@@ -73,14 +70,12 @@ def add_ball(sim):
 
 
 def with_heights(data, *heights):
-    """Return the data with the drones of each world at a given height."""
     pos = np.array(data.states.pos)
     pos[..., 2] = np.reshape(heights, (-1, 1))
     return data.replace(states=data.states.replace(pos=pos))
 
 
 def scene_with_ball(sim, *heights):
-    """Return the scene with the ball at another height in every world."""
     ids = sim.mj_model.body("ball").mocapid.item()
     mocap_pos = np.array(sim.mjx_data.mocap_pos)
     mocap_pos[:, ids] = [[0, 0, z] for z in heights]
@@ -88,7 +83,6 @@ def scene_with_ball(sim, *heights):
 
 
 def drone_touches(sim):
-    """Return whether the drone touches anything, for each world."""
     return np.asarray(sim.contacts("drone:0")).any(-1).tolist()
 
 
@@ -102,15 +96,6 @@ def sync_scene(sim, *heights):
 
 
 # What clears the flag -------------------------------------------------------------------------------------------
-
-
-def test_contacts_after_a_teleport_are_those_of_the_new_place(two_world_sim, syncs):
-    """Fault 7: assigning sim.data makes the scene stale, whatever flag the assigned data carries."""
-    sync_scene(two_world_sim, 0.0, FREE_HEIGHT)
-    assert drone_touches(two_world_sim) == [True, False]
-    assert bool(two_world_sim.data.core.mjx_synced), "the data that is assigned next claims to be synced"
-    two_world_sim.data = with_heights(two_world_sim.data, FREE_HEIGHT, 0.0)
-    assert drone_touches(two_world_sim) == [False, True]
 
 
 def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
@@ -142,88 +127,44 @@ def test_contacts_after_box_collision_are_those_of_boxes(one_world_sim):
     assert drone_touches(one_world_sim) == [True]
 
 
-def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two_world_sim, syncs):
-    """Assigning sim.mjx_data makes the scene stale: a ball put on the drone of world 1 touches it."""
+def assign_synced(sim):
+    sim.data, sim.mjx_data = sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
+
+
+def claim_to_be_synced(sim, flag):
+    sim.data = sim.data.replace(core=sim.data.core.replace(mjx_synced=flag))
+
+
+CHANGES = {
+    "step": lambda sim: sim.step(),
+    "three steps": lambda sim: sim.step(3),
+    "reset": lambda sim: sim.reset(),
+    "masked reset": lambda sim: sim.reset(np.array([True, False])),
+    "sim.data": lambda sim: setattr(sim, "data", sim.data),
+    "sim.mjx_data": lambda sim: setattr(sim, "mjx_data", sim.mjx_data),
+    "a flag": lambda sim: claim_to_be_synced(sim, np.True_),
+    "a flag of False": lambda sim: claim_to_be_synced(sim, jnp.asarray(False)),
+    "results of a sync": assign_synced,
+    "F command": lambda sim: setattr(sim, "data", F.attitude_control(sim.data, np.zeros((2, 1, 4)))),
+    "seed": lambda sim: sim.seed(3),
+    "build_data": lambda sim: sim.build_data(),
+    "build_mjx": lambda sim: sim.build_mjx(),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_next_query_after_a_change_syncs_once(syncs, two_world_sim, change):
+    """A change clears ``data.core.mjx_synced`` and computes nothing; a query sets the flag."""
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    assert drone_touches(two_world_sim) == [False, False]
-    syncs.clear()
-    two_world_sim.mjx_data = scene_with_ball(two_world_sim, 5, FREE_HEIGHT)
-    assert drone_touches(two_world_sim) == [False, True]
-    assert drone_touches(two_world_sim) == [False, True]
-    assert len(syncs) == 1
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param(lambda sim: sim.step(), id="step"),
-        pytest.param(lambda sim: sim.step(3), id="three steps"),
-        pytest.param(lambda sim: sim.reset(), id="reset"),
-        pytest.param(lambda sim: sim.reset(np.array([True, False])), id="masked reset"),
-        pytest.param(lambda sim: setattr(sim, "data", sim.data), id="sim.data"),
-        pytest.param(lambda sim: setattr(sim, "mjx_data", sim.mjx_data), id="sim.mjx_data"),
-        pytest.param(
-            lambda sim: setattr(sim, "data", F.attitude_control(sim.data, np.zeros((2, 1, 4)))), id="F command"
-        ),
-        pytest.param(lambda sim: sim.seed(3), id="seed"),
-        pytest.param(lambda sim: sim.build_data(), id="build_data"),
-        pytest.param(lambda sim: sim.build_mjx(), id="build_mjx"),
-    ],
-)
-def test_the_next_query_after_a_change_syncs_once(two_world_sim, syncs, change):
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    syncs.clear()
-    change(two_world_sim)
-    assert not syncs, "a change syncs nothing"
-    two_world_sim.contacts()
-    assert len(syncs) == 1
-    two_world_sim.contacts()
-    assert len(syncs) == 1
-
-
-def test_the_flag_of_the_data_follows(two_world_sim):
-    """``data.core.mjx_synced`` is set by a query, and cleared by whatever makes the scene stale."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    synced = two_world_sim.data
-    changes = {
-        "step": two_world_sim.step,
-        "reset": two_world_sim.reset,
-        "build_mjx": two_world_sim.build_mjx,
-        "the same data": lambda: setattr(two_world_sim, "data", two_world_sim.data),
-        "data that was synced": lambda: setattr(two_world_sim, "data", synced),
-        "data that claims to be": lambda: setattr(
-            two_world_sim, "data", two_world_sim.data.replace(core=two_world_sim.data.core.replace(mjx_synced=np.True_))
-        ),
-        "mjx_data": lambda: setattr(two_world_sim, "mjx_data", two_world_sim.mjx_data),
-        "what a sync returns": lambda: setattr(
-            two_world_sim, "data", sync_sim2mjx(two_world_sim.data, two_world_sim.mjx_data, two_world_sim.mjx_model)[0]
-        ),
-    }
-    for name, change in changes.items():
-        two_world_sim.contacts()
-        assert bool(two_world_sim.data.core.mjx_synced), name
-        for _ in range(2):
-            change()
-            assert not bool(two_world_sim.data.core.mjx_synced), name
-
-
-def test_the_next_query_after_an_edit_of_the_scene_syncs_once(syncs):
-    """An edit compiles the scene at the next query, and clears the flag."""
-    sim = Sim(n_worlds=2)
-    edits = {
-        "add": lambda: sim.scene.add("sphere", pos=(0.0, 0.0, 9.0)),
-        "build_mjx": sim.build_mjx,
-    }
-    for name, edit in edits.items():
-        sim.contacts()
-        assert sim.data.core.mjx_synced, name
+    for _ in range(2):
+        assert bool(two_world_sim.data.core.mjx_synced)
         syncs.clear()
-        edit()
-        assert not sim.data.core.mjx_synced, name
+        CHANGES[change](two_world_sim)
+        assert not syncs
+        assert not bool(two_world_sim.data.core.mjx_synced)
         for _ in range(2):
-            sim.contacts()
-            assert sim.data.core.mjx_synced, name
-        assert len(syncs) == 1, name
+            two_world_sim.contacts()
+        assert len(syncs) == 1
 
 
 def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two_world_sim):
@@ -251,38 +192,10 @@ def test_a_cleared_flag_is_an_array_of_its_own(two_world_sim):
     assert len(set(map(id, flags))) == len(flags)
 
 
-def test_results_of_a_sync_may_be_assigned(two_world_sim, syncs):
-    """After the results of sync_sim2mjx are assigned, one redundant sync is allowed, but no stale answer."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    syncs.clear()
-    two_world_sim.data, two_world_sim.mjx_data = sync_sim2mjx(
-        with_heights(two_world_sim.data, 0.0, FREE_HEIGHT), two_world_sim.mjx_data, two_world_sim.mjx_model
-    )
-    assert drone_touches(two_world_sim) == [True, False]
-    assert len(syncs) <= 1
-
-
 # What keeps the flag --------------------------------------------------------------------------------------------------
 
 
-def test_queries_share_a_sync_until_the_next_step(one_world_sim, syncs):
-    """Two queries after a step need one sync, and two syncs if there is a step between them."""
-    one_world_sim.step(5)
-    syncs.clear()
-    one_world_sim.contacts()
-    one_world_sim.contacts("drone:0")
-    assert len(syncs) == 1
-
-    one_world_sim.step(5)
-    syncs.clear()
-    one_world_sim.contacts()
-    one_world_sim.step(5)
-    one_world_sim.contacts()
-    assert len(syncs) == 2
-
-
 def test_pictures_show_the_world_as_it_is_and_do_not_use_mjx(one_world_sim, syncs, opengl):
-    """An image after a step shows that step, whether the contacts were up to date or not."""
     one_world_sim.reset()
     one_world_sim.contacts()
     syncs.clear()
@@ -294,30 +207,6 @@ def test_pictures_show_the_world_as_it_is_and_do_not_use_mjx(one_world_sim, sync
         assert not one_world_sim.data.core.mjx_synced
     assert one_world_sim.mjx_data is before
     assert not syncs
-
-
-def test_commands_leave_the_scene_fresh(two_world_sim, syncs):
-    """A command moves nothing, so no flag is cleared."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    syncs.clear()
-    two_world_sim.attitude_control(np.zeros((2, 1, 4)))
-    assert bool(two_world_sim.data.core.mjx_synced)
-    two_world_sim.contacts()
-    assert not syncs
-
-
-def test_wrong_queries_change_nothing(two_world_sim, syncs):
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    data, mjx_data = two_world_sim.data, two_world_sim.mjx_data
-    for wrong in (
-        lambda: two_world_sim.contacts("gate"),
-        lambda: two_world_sim.render("film"),
-        lambda: two_world_sim.render("rgb_array", world=2),
-    ):
-        with pytest.raises(ValueError):
-            wrong()
-    assert two_world_sim.data is data
-    assert two_world_sim.mjx_data is mjx_data
 
 
 def test_queries_read_no_flag_from_the_device(two_world_sim, syncs):
@@ -362,7 +251,6 @@ def test_commands_between_queries_read_poses_once_on_the_host(syncs):
 
 
 def test_a_scene_with_a_load_is_synced_once_for_two_queries(syncs):
-    """Plugins compute the poses of their objects at a query; the same data gives the same arrays."""
     sim = Sim(n_worlds=2, plugins=[SlungLoad(0.01, 0.5)])
     for _ in range(2):
         sim.step(5)
@@ -410,16 +298,6 @@ def with_traced_height(data, height):
     return data.replace(states=data.states.replace(pos=data.states.pos.at[..., 2].set(height)))
 
 
-def test_a_flag_replaced_by_false_forces_a_sync(two_world_sim, syncs):
-    """As in Crazyflow: whoever changed the scene behind the simulation's back clears the flag."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    syncs.clear()
-    data = two_world_sim.data
-    two_world_sim.data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
-    two_world_sim.contacts()
-    assert len(syncs) == 1
-
-
 @pytest.mark.parametrize("engine", ["plain", "fused"])
 def test_a_pure_step_clears_the_flag(two_world_sim, engine):
     """Functional code asks the flag of its data, which is False after every step, also inside jit."""
@@ -433,7 +311,6 @@ def test_a_pure_step_clears_the_flag(two_world_sim, engine):
 
 
 def test_no_scene_state_of_worlds_is_allocated_before_it_is_needed():
-    """Steps, resets and rebuilds allocate no MuJoCo state of any world; contacts do."""
     n_worlds = 977  # a number that no other test uses, so arrays with this number of rows belong to this simulation
     sim = Sim(n_worlds=n_worlds)
 
@@ -522,23 +399,6 @@ def test_drawing_one_world_allocates_nothing_for_the_others(opengl, syncs):
     assert not sim.scene.is_allocated
     assert sim.scene._mjx._model is None
     assert not syncs
-
-
-def test_the_scene_is_returned_as_it_is(two_world_sim, syncs):
-    """Reading sim.mjx_data syncs nothing: it returns the same object, as of the last sync."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    syncs.clear()
-    before = two_world_sim.mjx_data
-    two_world_sim.data = with_heights(two_world_sim.data, 0.25, 0.5)
-    assert two_world_sim.mjx_data is before
-    np.testing.assert_allclose(
-        two_world_sim.mjx_data.mocap_pos[:, two_world_sim.data.core.drone_mocap_ids[0], 2], FREE_HEIGHT
-    )
-    assert not syncs
-    two_world_sim.contacts()
-    np.testing.assert_allclose(
-        two_world_sim.mjx_data.mocap_pos[:, two_world_sim.data.core.drone_mocap_ids[0], 2], [0.25, 0.5]
-    )
 
 
 # Any order ------------------------------------------------------------------------------------------------------

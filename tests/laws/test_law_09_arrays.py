@@ -89,8 +89,6 @@ def results_of_state(state):
 
 
 def fly_env(function):
-    """Return a call of an environment with an action, and an action of whole numbers."""
-
     def build():
         env, state, flat = hover(mode="SameStep")
         calls = {
@@ -257,7 +255,6 @@ def test_edited_flat_data_is_refused(edit):
     "settings", [{"control": "body_rate"}, {"n_worlds": 2}, {"task": "race"}, {"mode": None}, {"mode": "NextStep"}]
 )
 def test_states_and_flat_data_of_another_environment_are_refused(settings):
-    """Another command level, another number of worlds, another task, and other automatic resets."""
     env, state, flat = hover(mode="SameStep")
     settings = {"mode": "SameStep", "n_worlds": N_WORLDS, "task": "hover", "control": "attitude"} | settings
     mode, task, n_worlds = settings.pop("mode"), settings.pop("task"), settings.pop("n_worlds")

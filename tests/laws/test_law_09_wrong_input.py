@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import LEVELS
 
-from crazysim import Cars, ConfigError, ContactLog, ContactResponse, FreeBodies, Sim, SlungLoad, Terrain, Wind
+from crazysim import Cars, ConfigError, ContactLog, Sim, SlungLoad, Terrain, Wind
 from crazysim.control.geometric import Geometric
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
@@ -20,50 +20,26 @@ from crazysim.sim.visualize import change_material, draw_capsule, draw_points
 WRONG_SETTINGS = [
     ({"n_worlds": 0}, "n_worlds is 0", "positive whole number"),
     ({"n_worlds": 2.5}, "n_worlds is 2.5", "positive whole number"),
-    ({"n_worlds": True}, "n_worlds is True", "positive whole number"),
-    ({"n_worlds": np.int64(-1)}, "n_worlds is", "positive whole number"),
     ({"n_worlds": 2**31 - 1}, "n_worlds=2147483647", "fit into the", "Use fewer worlds"),
     ({"n_drones": -3}, "n_drones is -3", "positive whole number"),
-    ({"n_drones": "4"}, "n_drones is '4'", "positive whole number"),
-    ({"freq": 0}, "freq is 0", "positive whole number"),
-    ({"freq": -500}, "freq is -500", "positive whole number"),
-    ({"freq": 500.0}, "freq is 500.0", "positive whole number"),
     ({"freq": 20_000}, "freq is 20000", "jax_enable_x64"),
-    ({"attitude_freq": 0}, "attitude_freq is 0", "positive whole number"),
-    ({"attitude_freq": -50}, "attitude_freq is -50", "positive whole number"),
-    ({"attitude_freq": 2.5}, "attitude_freq is 2.5", "positive whole number"),
-    ({"attitude_freq": 300}, "attitude_freq is 300", "divide freq = 500 Hz", "250 Hz"),
-    ({"attitude_freq": 1000}, "attitude_freq is 1000", "divide freq = 500 Hz", "500 Hz"),
-    ({"control": "state", "state_freq": 33}, "state_freq is 33", "25 Hz"),
-    ({"control": "body_rate", "body_rate_freq": 300}, "body_rate_freq is 300", "250 Hz"),
-    ({"control": "force_torque", "force_torque_freq": 400}, "force_torque_freq is 400", "250 Hz"),
     ({"drone": "cf99"}, "'cf99'", "cf21B_500"),
     ({"drone": "/nowhere/mine.toml"}, "/nowhere/mine.toml", "no file of that path"),
-    ({"drone": 3}, "got 3", "a dict or an Airframe"),
     ({"drone": {}}, "no table [rigid_body]", "Add [rigid_body]"),
     ({"dynamics": "quadratic"}, "'quadratic'", "'first_principles', 'so_rpy'"),
-    ({"dynamics": None}, "None", "'first_principles'"),
     ({"control": "velocity"}, "'velocity'", "'state', 'attitude', 'body_rate', 'force_torque', 'rotor_vel'"),
+    ({"engine": "warp"}, "'warp'", "auto, plain, lanes, fused"),
     ({"integrator": "heun"}, "'heun'", "'euler', 'symplectic_euler', 'rk4'"),
     ({"dynamics": "so_rpy", "control": "rotor_vel"}, "'rotor_vel'", "dynamics='first_principles'"),
-    ({"dynamics": "so_rpy_rotor", "control": "force_torque"}, "'force_torque'", "dynamics='first_principles'"),
-    ({"dynamics": "so_rpy_rotor_drag", "control": "body_rate"}, "'body_rate'", "dynamics='first_principles'"),
     ({"drone": "hb_x500"}, "expected dynamics that drone 'hb_x500' has parameters for", "so_rpy"),
     ({"device": "abacus"}, "got 'abacus'", "'cpu' or 'gpu'"),
-    ({"device": "cpu:99"}, "got 'cpu:99'", "'cpu' or 'gpu'"),
-    ({"device": None}, "got None", "jax.Device"),
-    ({"device": ""}, "got ''", "Use device='cpu'"),
     ({"device": "cpu:-1"}, "got 'cpu:-1'", "Use device='cpu'"),
     ({"drone": []}, "got an empty list", "a list with one for each drone"),
-    ({"drone": [], "n_drones": 3}, "got an empty list", "a list with one for each drone"),
     ({"mesh": 2}, "got 2", "world_mesh"),
     ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
-    ({"xml_path": 3}, "as xml_path, got 3", "MJCF"),
     ({"strict": "no"}, "expected strict as True or False", "got 'no'"),
-    ({"strict": 1}, "expected strict as True or False", "got 1"),
     ({"control": "state", "controller": Geometric(feedforward="no")}, "feedforward of Geometric", "got 'no'"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
-    ({"rng_key": 1.5}, "1.5", "an integer"),
     ({"rng_key": 2**70}, str(2**70), "64 bits"),
 ]
 
@@ -83,7 +59,6 @@ def level_sim(request):
 
 
 def wrong_commands(shape):
-    """Yield wrong commands for a shape, with two parts of the message each."""
     zeros = np.zeros(shape)
     needed = str(shape)
     yield zeros[0], str(shape[1:]), needed
@@ -168,27 +143,14 @@ def sim():
 # Calls, and parts of the message.
 WRONG_CALLS = [
     (lambda sim: sim.step(0), "n_steps is 0", "positive whole number"),
-    (lambda sim: sim.step(-5), "n_steps is -5", "positive whole number"),
-    (lambda sim: sim.step(1.0), "n_steps is 1.0", "positive whole number"),
-    (lambda sim: sim.step(True), "n_steps is True", "positive whole number"),
     (lambda sim: sim.step("3"), "n_steps is '3'", "positive whole number"),
     (lambda sim: sim.reset(np.zeros(2, bool)), "shape (2,)", "(3,) and bool"),
-    (lambda sim: sim.reset(np.zeros((3, 1), bool)), "shape (3, 1)", "(3,) and bool"),
-    (lambda sim: sim.reset(np.array([1, 0, 1])), "int64", "(3,) and bool"),
-    (lambda sim: sim.reset(jnp.zeros(3)), "float32", "(3,) and bool"),
-    (lambda sim: sim.reset([0, 2]), "shape (2,)", "(3,) and bool"),
     (lambda sim: sim.reset([[True], [True, False]]), "[[True], [True, False]]", "one bool per world"),
-    (lambda sim: sim.reset(True), "shape ()", "(3,) and bool"),
     (lambda sim: sim.seed(1.5), "1.5", "an integer"),
-    (lambda sim: sim.seed("7"), "'7'", "an integer"),
-    (lambda sim: sim.seed(None), "None", "an integer"),
     (lambda sim: sim.render("rgb_array", world=3), "expected a world from 0 to 2", "got 3"),
-    (lambda sim: sim.render("rgb_array", world=-1), "expected a world from 0 to 2", "got -1"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
-    (lambda sim: sim.render("rgb_array", world=1.0), "expected a world from 0 to 2", "got 1.0"),
     (lambda sim: sim.sync(1.0), "expected a world from 0 to 2, got 1.0"),
     (lambda sim: setattr(sim, "max_geom_pairs", "a"), "max_geom_pairs is 'a'", "positive whole number"),
-    (lambda sim: setattr(sim, "max_geom_pairs", -2), "max_geom_pairs is -2", "positive whole number"),
     (
         lambda sim: sim.rollout(lambda params, data: jnp.zeros((*data.states.pos.shape[:2], 4)), None, 2 * 10**9),
         "expected arrays that fit into the ",
@@ -203,22 +165,14 @@ WRONG_CALLS = [
     (lambda sim: sim.rollout(None, None, 4), "expected policy as a function, got None"),
     (lambda sim: sim.rollout(lambda params, data: 0, None, 4, keep=3), "expected keep as a function, got 3"),
     (lambda sim: sim.contact_report(3), "expected objects as handles or names of bodies, got 3"),
-    (lambda sim: sim.contact_report([[1], [2, 3]]), "expected objects as handles or names", "got [[1], [2, 3]]"),
-    (lambda sim: sim.contact_report(floor=[1]), "expected floor as True or False", "got [1]"),
     (lambda sim: sim.add(ContactLog(objects=3)), "expected objects as handles or names of bodies,", "got 3"),
-    (lambda sim: sim.add(ContactResponse(objects=[[1]])), "expected objects as handles or names", "got [[1]]"),
-    (lambda sim: sim.add(FreeBodies(1, objects=3)), "expected objects as handles or names of bodies, ", "got 3"),
     (lambda sim: setattr(sim, "step_pipeline", []), "expected step_pipeline as a dict", "got []"),
-    (lambda sim: setattr(sim, "step_pipeline", {}), "expected step_pipeline as a dict", "got {}"),
     (lambda sim: setattr(sim, "step_pipeline", {"still": 3}), "expected names and functions", "'still': 3"),
     (lambda sim: setattr(sim, "reset_pipeline", None), "expected reset_pipeline as a dict", "got None"),
     (lambda sim: sim.scene.add("box", rgba="red"), "expected rgba as a number or array", "Use (1, 0, 0, 1)"),
     (lambda sim: sim.scene.add("box", size="big"), "expected size of 'box' as a number or array", "'big'"),
     (lambda sim: sim.scene.add("box", size=(np.nan, 1, 1)), "expected size of 'box' to be positive", "nan"),
-    (lambda sim: sim.scene.add("box", size=[1, 1]), "expected size of 'box' of shape (3,), got (2,)"),
     (lambda sim: sim.scene.add("sphere", radius="1"), "expected radius of 'sphere' as a number, got '1'"),
-    (lambda sim: sim.scene.add("sphere", radius=[0.1, 0.1]), "expected radius of 'sphere' of shape ()", "got (2,)"),
-    (lambda sim: sim.scene.add("gate", stand="a"), "expected stand of 'gate' as a number, got 'a'"),
     (lambda sim: sim.scene.add("box", count=10**9), "count is 1000000000", "at most 100000"),
     (lambda sim: sim.scene.add("box", mocap="no"), "expected mocap as True or False", "got 'no'"),
     (lambda sim: sim.contact_report(floor="no"), "expected floor as True or False", "got 'no'"),
@@ -239,7 +193,6 @@ WRONG_CALLS = [
     ),
     (lambda sim: draw_points(sim, [0, 0, 0], rgba="red"), "expected rgba as numbers", "got 'red'"),
     (lambda sim: change_material(sim, "led_top", [0], rgba=(np.nan,) * 4), "expected rgba to be from 0 to 1", "nan"),
-    (lambda sim: View(rgba="red"), "expected rgba of View as a number or array", "'red'"),
     (lambda sim: View(width=10**9), "width is 1000000000", "at most 16384"),
     (lambda sim: sim.add(Wind((1e300, 0, 0))), "expected", "1e+300"),
 ]
@@ -328,15 +281,12 @@ def with_command(sim, **fields):
     "wrong, fragments",
     [
         (lambda sim: None, ("got NoneType", "sim.data.replace")),
-        (lambda sim: sim.data.states, ("got SimState",)),
         (lambda sim: sim.data.replace(core=None), ("got SimData",)),
         (lambda sim: Sim(n_worlds=2).data, ("data of 3 worlds of 1 drones", "got data of 2 worlds of 1 drones")),
-        (lambda sim: Sim(n_worlds=3, n_drones=2).data, ("got data of 3 worlds of 2 drones",)),
         (lambda sim: Sim(n_worlds=3, control="state").data, ("'attitude' commands", "'state' commands")),
         (lambda sim: Sim(n_worlds=3, freq=250).data, ("at 500 Hz", "at 250 Hz")),
         (lambda sim: Sim(n_worlds=3, dynamics="so_rpy").data, ("first-principles", "fitted")),
         (lambda sim: Sim(n_worlds=3, controller="crazyflow").data, ("with memory AutoMemory", "memory AttitudeMemory")),
-        (lambda sim: Sim(n_worlds=3, controller="pid").data, ("controller 'auto' with memory AutoMemory", "PIDMemory")),
         (lambda sim: Sim(n_worlds=3, attitude_freq=250).data, ("freq=500, got", "AutoParams and freq=250")),
         (lambda sim: Sim(n_worlds=3, controller=["auto"], switch=0).data, ("got memory SwitchMemory(AutoMemory)",)),
         (
@@ -351,9 +301,7 @@ def with_command(sim, **fields):
         ),
         (lambda sim: with_state(sim, pos=jnp.zeros((3, 1, 2))), ("data.states.pos", "shape (3, 1, 3)", "got an array")),
         (lambda sim: with_state(sim, vel=jnp.zeros((3, 1, 3), int)), ("data.states.vel", "(3, 1, 3) and type int32")),
-        (lambda sim: with_state(sim, quat=None), ("data.states.quat as an array of shape (3, 1, 4)", "got None")),
         (lambda sim: with_state(sim, force=0.0), ("data.states.force as an array of shape (3, 1, 3)", "got 0.0")),
-        (lambda sim: sim.data.replace(states=None), ("data.states.pos as an array", "got None")),
         (lambda sim: with_command(sim, cmd=jnp.zeros((3, 1, 3))), ("data.controls.attitude.cmd", "(3, 1, 3)")),
         (lambda sim: with_command(sim, staged_cmd=None), ("data.controls.attitude.staged_cmd", "got None")),
         (

@@ -93,7 +93,6 @@ UNCHECKED = ["Bicycles.members", "Cars.members", "Follow.degrees", "FreeBodies.m
 
 
 def concrete_classes(base, *packages):
-    """Return the concrete classes of some packages that derive from a base."""
     for package in packages:
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
@@ -117,12 +116,10 @@ def is_numeric(kind, name):
 
 
 def numeric_fields(kind):
-    """Return the fields of a class that hold numbers, with their declarations."""
     return [(name, declared) for name, declared in collect_settings(kind).items() if is_numeric(kind, name)]
 
 
 def make_example(kind, **changes):
-    """Return an instance of a class."""
     settings = dict(EXAMPLES.get(kind.__name__, {}))
     if issubclass(kind, Estimator):
         settings["sensors"] = REQUIRED_PLUGINS[kind.__name__]
@@ -254,7 +251,6 @@ def sims():
 
 
 def part_names(sim):
-    """Return the names of the parts of a simulation and of its scene."""
     objects = sim.data.objects
     pipelines, records = (sim.step_pipeline, sim.reset_pipeline), (sim.data.plugins, sim.default_data.plugins)
     bodies = [body.name for body in sim.spec.worldbody.bodies]

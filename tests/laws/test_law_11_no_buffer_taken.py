@@ -74,25 +74,6 @@ def test_a_command_array_stays_its_callers(sim):
     np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, 0.5)
 
 
-def test_default_data_survives_many_steps_and_resets(sim):
-    default, copies = sim.default_data, snapshot(sim.default_data)
-    for i in range(30):
-        sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
-        sim.step(2)
-        sim.reset(np.array([True, i % 2 == 0]))
-    assert sim.default_data is default
-    assert_unchanged(default, copies)
-    np.testing.assert_array_equal(sim.data.states.pos[0], default.states.pos[0])
-
-
-def test_one_state_can_be_stepped_twice(sim):
-    """The branches of a tree search begin with the same arrays."""
-    step, start = sim.build_step_fn(), sim.data
-    first, second = step(start, jnp.int32(4)), step(start, jnp.int32(4))
-    for x, y in zip(snapshot(first), snapshot(second), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def test_nothing_is_donated_in_the_compiled_programs(sim):
     """On CPU a donated buffer may survive, so the compiled programs are examined."""
     step, reset = sim.build_step_fn(), sim.build_reset_fn()

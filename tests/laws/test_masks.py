@@ -34,24 +34,21 @@ WORLD_MASK_FUNCTIONS = {
 }
 WRONG_MASKS = {
     "ints": np.array([1, 0, 1]),
-    "list of ints": [1, 0, 1],
-    "one int": [1],
     "one bool": [True],
     "a bool": True,
     "floats": jnp.ones(N_WORLDS),
     "a column": np.ones((N_WORLDS, 1), bool),
     "of another number of worlds": np.ones(N_WORLDS + 1, bool),
-    "a word": "all",
     "words": ["yes", "no", "yes"],
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG_MASKS)
 @pytest.mark.parametrize("name", WORLD_MASK_FUNCTIONS)
-def test_a_mask_over_worlds_is_bool_and_one_per_world(name, wrong):
+def test_a_mask_over_worlds_is_bool_and_one_per_world(name):
     before = sim.data
-    with pytest.raises(ConfigError, match=r"expected a mask of .*got"):
-        WORLD_MASK_FUNCTIONS[name](WRONG_MASKS[wrong])
+    for mask in WRONG_MASKS.values():
+        with pytest.raises(ConfigError, match=r"expected a mask of .*got"):
+            WORLD_MASK_FUNCTIONS[name](mask)
     assert sim.data is before
 
 

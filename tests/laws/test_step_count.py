@@ -13,7 +13,6 @@ from crazysim.envs.vector import make_vector
 
 
 def with_step_counts(data, steps):
-    """Return the data with other step counts. (n_worlds,)"""
     return data.replace(core=data.core.replace(steps=np.array(steps, np.int32)[:, None]))
 
 

@@ -52,7 +52,7 @@ ENGINES = ("plain", "lanes")
     engine=st.sampled_from(ENGINES),
 )
 @example(["ContactResponse"], ["wall"], "vel", "grad", "lanes")
-@settings(max_examples=settings.default.max_examples // 8)
+@settings(max_examples=settings.default.max_examples // 30)
 def test_derivatives_can_be_traced(names, objects, field, transformation, engine):
     sim = Sim(n_drones=2)
     for name in objects:

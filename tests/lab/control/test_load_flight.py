@@ -31,11 +31,10 @@ def start_of_flight(sim):
     return jax.tree.map(np.asarray, state), path
 
 
-@pytest.mark.parametrize("freq", [500, 100])
-def test_a_load_tracks_a_figure_eight_within_one_centimetre(freq):
+def test_a_load_tracks_a_figure_eight_within_one_centimetre():
     """0.2 kg on 0.4 m below a Bumblebee, along 2 m at 2 m/s: 5 cm RMS are required at the load, 1 cm is reached."""
     eight = figure_eight(*2 * SIZE, speed=SPEED)
-    sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=LOAD_MASS, length=LENGTH, freq=freq))
+    sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=LOAD_MASS, length=LENGTH, freq=100))
     sim.add(Follow(eight, visible=False))
     start, path = start_of_flight(sim)
     motion = {"pos": start.pos, "vel": start.vel, "quat": start.quat, "ang_vel": start.ang_vel}
@@ -86,7 +85,6 @@ def test_the_target_rests_at_the_setpoint_with_a_load_off_the_centre(target):
 
 
 def test_the_tip_of_an_empty_hook_flies_to_the_setpoint():
-    """The load stands elsewhere. The swing of the hook is damped."""
     sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.0203, length=LENGTH))
     sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.4]))
     hook = sim.add(Hook.bumblebee(LOAD_MASS, load_at=(2.0, 1.0, 0.0), in_scene=False))
