@@ -18,6 +18,7 @@ from crazysim.storage import (
     open_replacement,
     process_name,
     read_arrays,
+    read_text,
     wrap_read_errors,
     write_figure,
     write_file,
@@ -147,6 +148,12 @@ def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=message) as error, wrap_read_errors(path, "some arrays", "Use another copy."):
         path.read_bytes()
     assert not isinstance(error.value, DamagedFileError)
+
+
+def test_a_byte_order_mark_is_no_text(tmp_path):
+    path = tmp_path / "goals.txt"
+    path.write_text("0 0 1\n", encoding="utf-8-sig")
+    assert read_text(path, 100) == "0 0 1\n"
 
 
 def test_writers_of_texts_and_figures_leave_nothing_on_a_full_disk(tmp_path):
