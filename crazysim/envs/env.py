@@ -143,7 +143,7 @@ class Env(ABC):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
-            state = self._add_step_results(self._reset_episodes(state_of_data(data)))
+            state = self._add_step_results(self._reset_episodes(state_of_data(data, self.task.name)))
         self._known_structures.add(jax.tree.structure(state))
         if not is_traced([state.full_data.states.pos]):
             state = EnvState(put_on_device(state.full_data, self.sim.device)) if self.sim.mesh is None else state
@@ -403,7 +403,8 @@ class DroneEnv(Env):
 def _describe_state(state: EnvState) -> str:
     """Return what distinguishes the states of environments, for a message."""
     names = {"observations": state.obs, "info": state.info, "memory": state.memory}
-    return ", ".join([describe_data(state.data), *(f"{key} {', '.join(names[key]) or 'none'}" for key in names)])
+    task = f"task {state.record.task!r}"
+    return ", ".join([task, describe_data(state.data), *(f"{key} {', '.join(names[key]) or 'none'}" for key in names)])
 
 
 def _set_keys(core: SimCore, key: Array) -> SimCore:

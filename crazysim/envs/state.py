@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.settings import is_real
 from crazysim.eager import is_traced
-from crazysim.engine.pytree import PyTree, leaf
+from crazysim.engine.pytree import PyTree, leaf, static
 from crazysim.envs.actions import Actions
 from crazysim.errors import ConfigError, require, short_repr
 from crazysim.tables import read_numbers
@@ -58,6 +58,8 @@ class EnvRecord(PyTree):
     """Action passed to ``step``; after ``act``, the action as changed by the wrappers. (n_worlds, n_drones, k)"""
     must_reset: Array = leaf("world", scratch=True)
     """True where a new episode begins within the step. (n_worlds, 1)"""
+    task: str = static(default="")
+    """Name of the task, whose states no other environment takes."""
 
 
 RESULT_FIELDS = ("obs", "images", "reward", "terminated", "truncated", "drone_info", "world_info")
@@ -203,10 +205,10 @@ def _map_outside_records(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
     return jax.tree.map(lambda x: x if is_record(x) else fn(x), memory, is_leaf=is_record)
 
 
-def state_of_data(data: SimData) -> EnvState:
-    """Return a state with an empty record, which the reset of an episode fills."""
+def state_of_data(data: SimData, task: str = "") -> EnvState:
+    """Return a state of a task with an empty record, which the reset of an episode fills."""
     no_array: Any = None
-    record = EnvRecord({}, {}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array)
+    record = EnvRecord({}, {}, no_array, no_array, no_array, no_array, {}, {}, {}, no_array, no_array, task)
     return EnvState(data.replace(plugins=data.plugins | {ENV_RECORD_NAME: record}))
 
 

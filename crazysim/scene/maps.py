@@ -52,12 +52,13 @@ def map_spec(
             f"expected finite coordinates, got {n} of {len(points)} points that are not finite. Drop them."
         )
     points = to_world_frame(points, pos, quat, scale)
-    remedy = "Use a larger resolution=."
+    remedy, work = "Use a larger resolution=.", "finding the voxels of triangles"
     if scale is None:
         size = " x ".join(f"{x:.3g}" for x in np.ptp(points, axis=0))
         remedy += (
             f" The map is {size} m large: if the file is in millimetres, pass scale=0.001, and in metres scale=1.0."
         )
+        work += f" of a map of {size} m (scale=0.001 if the file is in millimetres)"
     if triangles is None:
         _check_count("points", len(points), MAX_VOXELS, f"Use a part of the map. {remedy}")
         voxels = voxels_of_points(points, resolution, min_points)
@@ -70,7 +71,7 @@ def map_spec(
         max_voxels = MAX_UNSCALED_VOXELS if scale is None else MAX_VOXELS
         label = f"voxels of {resolution:g} m near triangles"
         _check_count(label, count_candidates(corners, resolution), max_voxels, remedy)
-        with announce_if_slow("finding the voxels of triangles", "up to 2 minutes for large meshes"):
+        with announce_if_slow(work, "up to 2 minutes for large meshes"):
             voxels = voxels_of_triangles(corners, resolution)
     boxes = merge_voxels(voxels)
     require(

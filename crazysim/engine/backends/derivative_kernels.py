@@ -92,7 +92,7 @@ class DerivativeKernels:
                     self._launches[launch_key] = compile_kernel(source, location)
                 self.descriptions[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
         except UnsupportedError as error:
-            announce("compiling a derivative of the steps on lanes", "10 to 40 s")
+            announce("compiling a derivative of the steps on lanes", "10 to 40 s, with contacts many minutes")
             self.descriptions[f"{kind}: on lanes ({error})"] = None
             if not isinstance(error, LimitError):
                 warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning)

@@ -298,7 +298,11 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
             (body,) = op.blocks
             length, carry = op.param("length"), [map_element(x) for x in op.args]
             if length * sum(1 for _ in body.walk()) > MAX_UNROLLED_OPERATIONS:
-                raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
+                raise UnsupportedError(
+                    f"a loop of {length} iterations is too long to be reversed; jax.jvp and jax.jacfwd have a kernel",
+                    op.name,
+                    op.stage,
+                )
             for _ in range(length):
                 inner_values = values | dict(zip(body.inputs, carry, strict=True))
                 carry = _unroll(builder, body, inner_values)
