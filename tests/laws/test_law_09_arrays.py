@@ -252,7 +252,15 @@ def test_edited_flat_data_is_refused(edit):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"control": "body_rate"}, {"n_worlds": 2}, {"task": "race"}, {"task": "recover"}, {"mode": None}, {"mode": "NextStep"}]
+    "settings",
+    [
+        {"control": "body_rate"},
+        {"n_worlds": 2},
+        {"task": "race"},
+        {"task": "recover"},
+        {"mode": None},
+        {"mode": "NextStep"},
+    ],
 )
 def test_states_and_flat_data_of_another_environment_are_refused(settings):
     env, state, flat = hover(mode="SameStep")
