@@ -91,6 +91,11 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.show": "film plot_episode",
         "crazysim.train.training": "load_policy",
     },
+    "crazysim.plugins.vehicles": {
+        "crazysim.lab.vehicles.commonroad": "CommonRoadParams CommonRoadState commonroad_single_track",
+        "crazysim.lab.vehicles.lpv": "LPV",
+        "crazysim.lab.vehicles.path_lqr": "PathLQR",
+    },
     "crazysim.sim.export": {"crazysim.lab.export.casadi": "to_casadi"},
     # Modules of Crazyflow.
     "crazysim.exception": {

@@ -1,17 +1,22 @@
 """Ground vehicles: cars, bicycles and trailers, paths on the ground, and controllers that follow them."""
 
+from typing import TYPE_CHECKING
+
+from crazysim.names import lazy_getattr
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, ackermann
 from crazysim.plugins.vehicles.cars import Bicycles, Cars
-from crazysim.plugins.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
 from crazysim.plugins.vehicles.following import PathController, PathState, PurePursuit, Stanley
 from crazysim.plugins.vehicles.kinematic import kinematic
-from crazysim.plugins.vehicles.lpv import LPV
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle, vehicle_names
 from crazysim.plugins.vehicles.path import Path, PathPoint
-from crazysim.plugins.vehicles.path_lqr import PathLQR
 from crazysim.plugins.vehicles.single_track import single_track
+
+if TYPE_CHECKING:
+    from crazysim.lab.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
+    from crazysim.lab.vehicles.lpv import LPV
+    from crazysim.lab.vehicles.path_lqr import PathLQR
 
 __all__ = [
     "LPV",
@@ -37,3 +42,5 @@ __all__ = [
     "single_track",
     "vehicle_names",
 ]
+
+__getattr__ = lazy_getattr(__name__)
