@@ -15,6 +15,7 @@ import pytest
 import crazysim.envs.tasks
 import crazysim.lab.plugins
 import crazysim.lab.tasks
+import crazysim.lab.vehicles
 import crazysim.plugins
 from crazysim import Sim
 from crazysim.core.plugin import FunctionPlugin, Plugin
@@ -108,7 +109,14 @@ def concrete_classes(base, *packages):
 
 PLUGINS = concrete_classes(Plugin, crazysim.plugins, crazysim.lab.plugins)
 TASKS = concrete_classes(Task, crazysim.envs.tasks, crazysim.lab.tasks)
-OTHER_CLASSES = [Origin, Playback, Rules, Triad, Twin, *concrete_classes(PathController, crazysim.plugins)]
+OTHER_CLASSES = [
+    Origin,
+    Playback,
+    Rules,
+    Triad,
+    Twin,
+    *concrete_classes(PathController, crazysim.plugins, crazysim.lab.vehicles),
+]
 
 
 def is_numeric(kind, name):
