@@ -254,7 +254,7 @@ def _is_abandoned(name: str, age: float) -> bool:
     """
     matches = re.findall(r"[.-]([0-9a-f]{8})-(\d+)-", name)
     if not matches:
-        return name.endswith(".tmp") and age > ABANDONMENT_AGE  # of an earlier version
+        return False
     machine, pid = matches[-1]
     if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
         return age > ABANDONMENT_AGE

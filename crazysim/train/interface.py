@@ -22,7 +22,7 @@ REMEDY = (
 
 @dataclass(frozen=True)
 class Interface:
-    """Observations and commands of a policy. What an older file does not say is None, and is not compared."""
+    """Observations and commands of a policy. None is not compared."""
 
     observations: tuple[tuple[str, int], ...]
     """Name and size of each observation, in the order of the inputs: alphabetical."""
@@ -32,7 +32,7 @@ class Interface:
     """Command level."""
     ranges: tuple[tuple[float, float], ...]
     """Command at a zero action, and its change per unit of action, of each component of the action."""
-    freq: int | None = None
+    freq: int
     """Actions per second, Hz."""
     task: str | None = None
     """Name of the task."""
@@ -50,7 +50,8 @@ class Interface:
                 tuple(sorted((name, x["height"], x["width"]) for name, x in images.items())),
                 str(actions["level"]),
                 tuple(zip(centre, scale, strict=True)),
-                *(meta.get(name) for name in ("freq", "task", "task_code")),
+                int(meta["freq"]),
+                *(meta.get(name) for name in ("task", "task_code")),
             )
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(

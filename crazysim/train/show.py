@@ -202,17 +202,14 @@ def _save_figure(figure: Any, path: Path) -> None:
 def read_curve(folder: Path) -> list[dict[str, float]]:
     """Return the learning curve of a run, one point per evaluation.
 
-    Files of earlier versions have ``round`` in place of ``iteration``.
-
     Raises:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged.
     """
     path = as_path(folder) / CURVE_FILE
-    with wrap_read_errors(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
-        with open_file(path, MAX_TEXT_BYTES) as file:
-            curve = json.load(file)
-        return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
+    remedy = "Write it again with 'crazysim train TASK --resume'."
+    with wrap_read_errors(path, "a learning curve", remedy), open_file(path, MAX_TEXT_BYTES) as file:
+        return [dict(point) for point in json.load(file)]
 
 
 def color_depth(depth: np.ndarray, far: float) -> np.ndarray:

@@ -32,7 +32,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
-from crazysim.errors import ConfigError, DivergedError, require, require_callable, warn
+from crazysim.errors import ConfigError, DivergedError, require, require_callable
 from crazysim.progress import progress_bar
 from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, read_text, write_file
 from crazysim.tables import POSITIVE, read_number
@@ -563,8 +563,6 @@ def load_policy(
         weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)
         return Policy(RunningStats.create(n_obs, used_network.pixels), weights.layers, weights.body, used_network)
 
-    if interface.freq is None:
-        warn(f"{path} is of an older version: the rate and the code of its task cannot be compared with an environment")
     interface = interface if task is None else dataclasses.replace(interface, task=None)  # the caller names the task
     policy = checkpoint.restore(path, arrays, jax.eval_shape(make_policy)).replace(interface=interface)
     return policy, config, meta

@@ -143,13 +143,12 @@ def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
         make_remains(f"key.{machine}-{gone}-140.tmp"),
         make_remains(f"crazysim-{machine}-{gone}-abc"),
         make_remains(f"key.{other}-{os.getpid()}-1.tmp", old),
-        make_remains("key.4711.140.tmp", old),  # as version 0.1 named them
     ]
     needed = [
         make_remains(f"key.{here}-140.tmp", old),
         make_remains(f"crazysim-{here}-abc", old),
         make_remains(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
-        make_remains("key.4711.140.tmp2.tmp"),
+        make_remains("key.4711.140.tmp", old),
         make_remains("crazysim-mine", old),
     ]
     for pattern in ("*.tmp", "crazysim-*"):

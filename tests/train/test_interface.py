@@ -221,12 +221,11 @@ def rewrite(folder, source, **changes):
     return folder
 
 
-def test_changed_code_and_older_files_are_said_in_one_line(folder, env, loaded, tmp_path):
+def test_changed_code_and_unknown_code_are_said_in_one_line(folder, env, loaded, tmp_path):
     changed, _, _ = load_policy(rewrite(tmp_path, folder, task_code="0" * 64))
     with pytest.warns(UserWarning, match="the code of the task differs .* other units or contents"):
         PolicyPilot(env, changed)
-    with pytest.warns(UserWarning, match="is of an older version: the rate and the code of its task cannot be"):
-        old, _, _ = load_policy(rewrite(tmp_path, folder, task_code=None, task=None, freq=None))
+    old, _, _ = load_policy(rewrite(tmp_path, folder, task_code=None, task=None))
     PolicyPilot(env, old)
     obs = env.reset(jax.random.key(0)).obs
     np.testing.assert_array_equal(old(obs), loaded[0](obs))

@@ -355,7 +355,7 @@ def test_a_run_without_its_learning_curve_resumes(uninterrupted_run, tmp_path):
     (tmp_path / "curve.json").write_text('[{"iteration": 0, "env')
     with pytest.raises(DamagedFileError, match=r"expected a learning curve, got .*curve\.json.*--resume"):
         read_curve(tmp_path)
-    (tmp_path / "curve.json").write_text('[{"round": 4, "success": 0.5}]')  # of an earlier version
+    (tmp_path / "curve.json").write_text('[{"iteration": 4, "success": 0.5}]')
     assert read_curve(tmp_path) == [{"iteration": 4, "success": 0.5}]
     train_quietly(tmp_path, small_config(), resume=True)
     assert [point["iteration"] for point in read_curve(tmp_path)] == [0, 4]

@@ -37,9 +37,6 @@ from crazysim.storage import (
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
 
-UNFINISHED_SUFFIXES = (UNFINISHED_SUFFIX, ".tmp")
-"""Suffixes of kernels that are being written, now and in version 0.1."""
-
 
 def digest(*parts: str | bytes) -> str:
     """Return the hash of some texts, which depends on their order and on the boundaries between them."""
@@ -78,8 +75,7 @@ def _warn_once(kernel_folder: Path, reason: str) -> None:
 @functools.cache
 def _remove_abandoned_files_once(kernel_folder: Path) -> None:
     """Remove unfinished files of processes that have ended from a folder, once."""
-    for suffix in UNFINISHED_SUFFIXES:
-        remove_abandoned_files(kernel_folder, f"*{suffix}")
+    remove_abandoned_files(kernel_folder, f"*{UNFINISHED_SUFFIX}")
 
 
 def temporary_folder() -> Path:
@@ -106,7 +102,7 @@ def _make_temporary_folder(pid: int) -> Path:
 def find_files(cache_folder: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
     for path in sorted(cache_folder.glob(f"{key}-*")):
-        if path.suffix in UNFINISHED_SUFFIXES or untrusted_reason(path):
+        if path.suffix == UNFINISHED_SUFFIX or untrusted_reason(path):
             continue
         try:
             is_intact = path.stem == f"{key}-{digest(path.read_bytes())}"
