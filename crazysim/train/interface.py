@@ -32,7 +32,7 @@ class Interface:
     """Command level."""
     ranges: tuple[tuple[float, float], ...]
     """Command at a zero action, and its change per unit of action, of each component of the action."""
-    freq: int
+    freq: int | None = None
     """Actions per second, Hz."""
     task: str | None = None
     """Name of the task."""
@@ -50,8 +50,7 @@ class Interface:
                 tuple(sorted((name, x["height"], x["width"]) for name, x in images.items())),
                 str(actions["level"]),
                 tuple(zip(centre, scale, strict=True)),
-                int(meta["freq"]),
-                *(meta.get(name) for name in ("task", "task_code")),
+                *(meta.get(name) for name in ("freq", "task", "task_code")),
             )
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(

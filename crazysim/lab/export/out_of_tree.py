@@ -75,7 +75,7 @@ def to_out_of_tree(
     )
     interface = Interface.read(meta)
     require(
-        interface.freq == freq,
+        interface.freq in (None, freq),
         f"expected the rate of the training, {interface.freq} Hz, got {freq} Hz. Use freq=meta['freq'].",
     )
     observations = interface.sizes

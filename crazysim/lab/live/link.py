@@ -137,8 +137,8 @@ class TrainedPolicy:
     def require_commands(self, level: str, freq: float) -> None:
         """Check that a flight has the command level and the rate of the training, if they are known."""
         require(
-            (level, freq) == (self.interface.level, self.interface.freq),
-            f"expected {self.interface.level} commands at {self.interface.freq} Hz, as in the policy's "
+            (level, freq) == (self.interface.level, self.interface.freq or freq),
+            f"expected {self.interface.level} commands at {self.interface.freq or freq} Hz, as in the policy's "
             f"training, got {level} commands at {freq} Hz. Use fly_policy(..., freq=meta['freq'], "
             f"level=meta['actions']['level']).",
         )
