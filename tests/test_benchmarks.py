@@ -40,36 +40,42 @@ def run(benchmarks, monkeypatch, capsys):
     return run
 
 
-SMALL = ["--worlds", "4", "--controls", "rotor_vel", "--integrators", "euler"]
+SMALL = "--worlds 4 --controls rotor_vel --integrators euler"
+SCRIPTS = [
+    (f"step.py {SMALL} --engine lanes plain --steps 2 --repeats 2", "steps_per_s",
+     [{"engine": "lanes", "n_steps": 2}, {"engine": "plain", "n_steps": 2}]),
+    ("loop.py --worlds 4 --controls state --repeats 2", "iteration_s",
+     [{"control": "state", "n_worlds": 4}, {"benchmark": "loop/contacts"}, {"benchmark": "loop/jax"},
+      {"benchmark": "loop/mj_step"}]),
+    ("devices.py --small --cases physics gradient --devices 1 2 --repeats 1", "rate",  # which exchange nothing
+     [{"case": case, "n_devices": n, "exchanged": {}} for case in ("physics", "gradient") for n in (1, 2)]),
+    ("scaling.py --engine lanes --controls rotor_vel --most-worlds 4 --most-drones 1 --total 4 --steps 10 --repeats 1"
+     " --plot {0}/scaling.png", "bytes_a_world",
+     [{"series": "worlds", "n_worlds": 1}, {"series": "worlds", "n_worlds": 4}, {"series": "drones", "n_worlds": 4}]),
+    ("versus_crazyflow.py --only swarm --batch-worlds 2 --swarm 3 --engine lanes --repeats 1", "ratio",
+     [{"n_worlds": 2, "n_drones": 3}]),
+    ("mppi.py --samples 16 --horizon 5 --repeats 2", "commands_per_s", [{"samples": 16, "horizon": 5}]),
+    ("mocap.py --objects 50 --freq 240 --seconds 1", "frame_ms", [{"lost": 0}]),
+    ("live.py --seconds 0.3 --drones 2 --only max", "factor", [{"late": 0}]),
+    ("plugins.py --worlds 4 --cases imu --repeats 1", "ratio", [{"case": "none", "ratio": 1}, {"case": "imu"}]),
+    ("flight_stack.py --worlds 4 --cases rod --repeats 1 --operations", "ratio",
+     [{"case": "rotor"}, {"case": "rod", "reference": "rotor"}]),
+    ("vehicles.py --worlds 4 --cases path beside_drone --repeats 1", "steps_per_s",
+     [{"case": "path", "alone": True}, {"case": "beside_drone", "alone": False}]),
+    ("first_results.py --repeat 1 --cases step", "cpu_s", [{"cache": "off"}, {"cache": "on"}]),
+    ("gradient.py --worlds 4 --controls rotor_vel --steps 3 --repeats 1", "steps_per_s", [{"control": "rotor_vel"}]),
+]  # fmt: skip
+"""Scripts with small settings, a positive number that each line has, and parts of the lines."""
 
 
-def test_step_prints_a_line_with_its_machine(run):
-    lines = run("step.py", *SMALL, "--engine", "lanes", "plain", "--steps", "2", "10", "--repeats", "2")
-    assert [(line["engine"], line["n_steps"]) for line in lines] == [
-        ("lanes", 2), ("plain", 2), ("lanes", 10), ("plain", 10)
-    ]  # fmt: skip
-    assert all(line["steps_per_s"] > 0 for line in lines)
-    assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
-
-
-def test_loop_prints_the_time_of_an_iteration(run):
-    line, contacts_line, jax_line, box = run("loop.py", "--worlds", "4", "--controls", "state", "--repeats", "2")
-    assert (line["control"], line["n_worlds"]) == ("state", 4)
-    assert line["realtime"] == pytest.approx(4 * 0.01 / line["iteration_s"])
-    assert contacts_line["benchmark"] == "loop/contacts"
-    assert (jax_line["benchmark"], box["benchmark"]) == ("loop/jax", "loop/mj_step")
-    assert 0 < box["shortest_s"] <= box["iteration_s"]
-
-
-def test_devices_prints_rates_and_the_exchange_between_devices(run):
-    """Two of the four host devices: physics exchanges nothing, and a gradient with respect to commands neither."""
-    lines = run("devices.py", "--small", "--cases", "physics", "gradient", "--devices", 1, 2, "--repeats", 1)
-    assert [(line["case"], line["n_devices"]) for line in lines] == [
-        ("physics", 1), ("physics", 2), ("gradient", 1), ("gradient", 2)
-    ]  # fmt: skip
-    assert all(line["rate"] == pytest.approx(line["n_devices"] * 64 * 4 / line["call_s"], rel=0.01) for line in lines)
-    assert [line["ratio"] for line in lines[::2]] == [1.0, 1.0]
-    assert all(line["exchanged"] == {} and line["memory_bytes"] > 0 for line in lines)
+@pytest.mark.long("compiles the programs that it measures")
+@pytest.mark.parametrize(("command", "figure", "expected"), SCRIPTS, ids=[x[0].split(".")[0] for x in SCRIPTS])
+def test_a_script_prints_lines_with_their_figure(run, tmp_path, command, figure, expected):
+    lines = run(*command.format(tmp_path).split())
+    assert [{name: line[name] for name in part} for line, part in zip(lines, expected, strict=True)] == expected
+    assert all(line[figure] > 0 for line in lines)
+    if command.startswith("step"):
+        assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
 
 
 @pytest.mark.long("compiles a training and evaluations of two airframes")
@@ -85,7 +91,7 @@ def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, monke
 
 def test_compile_prints_its_parts_from_a_process_of_its_own():
     """As a user runs it: the script is a program, and each case is compiled by a process that has compiled nothing."""
-    command = [sys.executable, BENCHMARKS / "compile.py", *SMALL]
+    command = [sys.executable, BENCHMARKS / "compile.py", *SMALL.split()]
     (line,) = lines_of(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert line["compile_s"] > 0
     assert line["trace_s"] > 0
@@ -145,15 +151,6 @@ def test_randomised_leaves_no_parameter_shared(benchmarks):
     assert len(set(sim.data.params.mass.ravel().tolist())) == 6
 
 
-def test_scaling_measures_both_series_and_draws_them(run, tmp_path):
-    picture = tmp_path / "scaling.png"
-    sizes = ["--most-worlds", "4", "--most-drones", "1", "--total", "4", "--steps", "10", "--repeats", "1"]
-    lines = run("scaling.py", "--engine", "lanes", "--controls", "rotor_vel", *sizes, "--plot", str(picture))
-    assert [(line["series"], line["n_worlds"]) for line in lines] == [("worlds", 1), ("worlds", 4), ("drones", 4)]
-    assert len({line["bytes_a_world"] for line in lines}) == 1
-    assert picture.stat().st_size > 1000
-
-
 def test_limits_prints_the_least_possible_time_and_the_ratio_to_it(monkeypatch, benchmarks, capsys):
     import limits
 
@@ -204,13 +201,6 @@ def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
     assert limits.count_work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
 
 
-def test_versus_crazyflow_runs_swarm_without_crazyflow(run):
-    arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
-    (line,) = run("versus_crazyflow.py", *arguments)
-    assert line["ratio"] > 0
-    assert (line["n_worlds"], line["n_drones"]) == (2, 3)
-
-
 def test_a_gradient_is_timed_like_a_flight(benchmarks):
     import contestant
 
@@ -230,16 +220,6 @@ def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
     loop._sim.data = loop._sim.data.replace(states=loop._sim.data.states.replace(pos=jnp.zeros((2, 1, 3))))
     with pytest.raises(SystemExit, match="crashed"):
         loop.require_flying()
-
-
-@pytest.mark.parametrize(
-    "script", ["step.py", "compile.py", "scaling.py", "limits.py", "train.py", "versus_crazyflow.py"]
-)
-def test_main_scripts_print_their_help(script, run, capsys):
-    with pytest.raises(SystemExit) as end:
-        run(script, "--help")
-    assert end.value.code == 0
-    assert "--device" in capsys.readouterr().out
 
 
 def write_results(train, out, successes, **changes):
@@ -363,27 +343,6 @@ def test_a_training_that_fails_stops_no_other_and_finished_ones_are_not_repeated
     assert again == [{"finished": 2, "to_train": 0}, lines[-1]]
 
 
-def test_mppi_prints_the_rate_of_commands(run):
-    (line,) = run("mppi.py", "--samples", "16", "--horizon", "5", "--repeats", "2")
-    assert line["commands_per_s"] > 0
-    assert (line["samples"], line["horizon"], line["engine"]) == (16, 5, "fused")
-
-
-def test_mocap_prints_the_time_of_a_frame(run):
-    (line,) = run("mocap.py", "--objects", "50", "--freq", "240", "--seconds", "1")
-    assert line["frames"] > 100
-    assert line["lost"] == 0
-    assert line["frame_ms"] > 0
-
-
-def test_live_prints_the_factor_and_the_lateness(run):
-    fast, timed = run("live.py", "--seconds", "0.3", "--drones", "2", "--only", "max", "jitter")
-    assert fast["factor"] > 0
-    assert fast["late"] == 0
-    assert 0 < timed["factor"] < 1.2
-    assert timed["worst_ms"] > 0
-
-
 def test_controllers_are_compared_on_the_same_flights(run):
     small = ["--drones", "cf21B_500", "hb_x500", "--attitudes", "1", "--worlds", "4", "--repeats", "1"]
     flown, cost = run("controllers.py", "--controllers", "geometric", *small)
@@ -392,43 +351,6 @@ def test_controllers_are_compared_on_the_same_flights(run):
     assert "error_attitude" not in flown  # it takes states only
     assert flown["pushed"] == pytest.approx(0.289, abs=0.02)
     assert cost["steps_per_s"] > 0
-
-
-def test_plugins_are_timed_against_a_step_without(run):
-    lines = run("plugins.py", "--worlds", "4", "--cases", "imu", "complementary", "--repeats", "1")
-    assert [line["case"] for line in lines] == ["none", "imu", "complementary"]
-    assert lines[0]["ratio"] == 1
-
-
-def test_the_flight_stack_is_timed_against_its_references(run):
-    lines = run("flight_stack.py", "--worlds", "4", "--cases", "geometric", "rod", "--repeats", "1", "--operations")
-    assert [(line["case"], line["reference"]) for line in lines] == [
-        ("state", "state"), ("rotor", "rotor"), ("geometric", "state"), ("rod", "rotor")
-    ]  # fmt: skip
-    assert all(line["ratio"] > 0 and line["operations"]["mul"] > 0 for line in lines)
-
-
-def test_cars_are_timed_without_and_beside_drones(run):
-    lines = run("vehicles.py", "--worlds", "4", "--cases", "drive", "path", "beside_drone", "--repeats", "1")
-    assert [(line["case"], line["alone"]) for line in lines] == [
-        ("drive", True),
-        ("path", True),
-        ("beside_drone", False),
-    ]
-    assert all(line["steps_per_s"] > 0 for line in lines)
-
-
-def test_first_results_are_measured_without_and_with_a_cache(run):
-    lines = run("first_results.py", "--repeat", 1, "--cases", "step")
-    assert [line["cache"] for line in lines] == ["off", "on"]
-    assert all(line["cpu_s"] > 0 for line in lines)
-
-
-def test_gradients_are_timed_together_with_the_steps_that_they_differentiate(run):
-    (line,) = run("gradient.py", "--worlds", "4", "--controls", "rotor_vel", "--steps", "3", "--repeats", "1")
-    assert line["steps_per_s"] == pytest.approx(12 / line["gradient_s"], rel=0.01)
-    assert line["forward_passes"] == pytest.approx(line["gradient_s"] / line["forward_s"], rel=0.01)
-    assert line["jvp_passes"] == pytest.approx(line["jvp_s"] / line["forward_s"], rel=0.01)
 
 
 def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tmp_path):

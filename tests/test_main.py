@@ -16,18 +16,7 @@ from pictures import read_frames
 
 from crazysim import Sim, errors
 from crazysim.__main__ import EXTRAS, main
-from crazysim.commands import (
-    airframe,
-    demo,
-    demo_flight,
-    identify,
-    info,
-    live,
-    replay,
-    show,
-    training,
-    validate,
-)
+from crazysim.commands import airframe, demo, demo_flight, identify, info, live, replay, show, training, validate
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
 

@@ -165,12 +165,6 @@ def test_the_wheel_holds_scene_airframes_and_type_marker(tmp_path):
     assert not [name for name in names if name.startswith("tests")]
 
 
-def test_the_readme_begins_with_what_it_is_and_is_not():
-    lines = (ROOT / "README.md").read_text().split("\n## ")[0]
-    assert "drone simulator" in lines
-    assert "not the firmware-in-the-loop simulator of the same name" in lines.replace("\n", " ")
-
-
 def yaml_of(path):
     return yaml.safe_load((ROOT / path).read_text())
 

@@ -69,9 +69,7 @@ def test_keys_of_any_kind_are_the_same_seed(env, reset):
     for rng in (jax.random.PRNGKey(3), keys, jax.random.key_data(keys)):
         np.testing.assert_array_equal(reset(rng).obs, state.obs)
     assert len(np.unique(state.obs[:, 6])) == N_WORLDS
-    with pytest.raises(
-        ValueError, match=r"expected one key, or one for each of the 3 worlds, got keys of shape \(4,\)"
-    ):
+    with pytest.raises(ValueError, match=r"one key, or one for each of the 3 worlds, got keys of shape \(4,\)"):
         env.reset(jax.random.split(jax.random.key(0), 4))
     with pytest.raises(ValueError, match=r"key data of shape \(4, 2\)"):
         env.reset(jax.random.split(jax.random.PRNGKey(0), 4))
@@ -120,12 +118,10 @@ def test_entries_of_wrappers_are_kept(env, reset):
 
 
 def test_wrong_input_is_an_error(drone_env, env, reset):
-    with pytest.raises(ConfigError, match="expected a random key, got 0"):
+    with pytest.raises(ConfigError, match="random key, got 0"):
         env.reset(0)
     with pytest.raises(ConfigError, match="without AutoReset"):
         BraxEnv(AutoReset(drone_env))
     state = reset(jax.random.key(0))
-    with pytest.raises(
-        ValueError, match=r"expected an action of shape \(3, 8\) = \(n_worlds, action_size\), got \(8,\)"
-    ):
+    with pytest.raises(ValueError, match=r"action of shape \(3, 8\) = \(n_worlds, action_size\), got \(8,\)"):
         env.step(state, jnp.zeros(8))

@@ -36,29 +36,13 @@ def assert_equal(unsharded, sharded, n_devices=4):
         np.testing.assert_array_equal(x, y, err_msg=name)
 
 
-def add_wrappers(env):
-    return EpisodeStatistics(ActionDelay(ObservationNoise(env, {"pos": 0.01}), 1))
-
-
 @pytest.mark.long("compiles each environment for one device and for four")
-@pytest.mark.parametrize(
-    ("task", "wrap", "options"),
-    [
-        ("hover", add_wrappers, {"randomize": "crazyflie"}),
-        pytest.param(
-            "swarm",
-            lambda env: env,
-            {},
-            marks=pytest.mark.slow("the case hover also has wrappers; Race is tested below"),
-        ),
-    ],
-    ids=["hover", "swarm"],
-)
-def test_law_10_worlds_on_four_devices_are_those_of_one(task, wrap, options, mesh):
+def test_law_10_worlds_on_four_devices_are_those_of_one(mesh):
     """Episodes, steps, wrappers and statistics: random numbers depend on the world, not on the device."""
 
     def fly_on_mesh(mesh):
-        env = AutoReset(wrap(make(task, N_WORLDS, seconds=0.1, mesh=mesh, **options)))
+        env = make("hover", N_WORLDS, seconds=0.1, mesh=mesh, randomize="crazyflie")
+        env = AutoReset(EpisodeStatistics(ActionDelay(ObservationNoise(env, {"pos": 0.01}), 1)))
         reset, step, restart = jax.jit(env.reset), jax.jit(env.step), jax.jit(env.restart)
         state = reset(jax.random.key(0))
         for kind, argument in sequence(10, state.action.shape):

@@ -1,7 +1,6 @@
 """The step and the rollout of an environment: the same on every engine, and split only where ``explain`` says so."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,6 @@ from crazysim import Sim
 from crazysim.core.pipeline import append_fn
 from crazysim.engine.backends import fused
 from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, leaf
-from crazysim.engine.sharding import world_mesh
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
@@ -77,21 +75,14 @@ def normalised_hover(engine):
     return AutoReset(envs.Normalize(envs.make("hover", N_WORLDS, seconds=0.3, engine=engine)), "SameStep")
 
 
-@functools.cache
-def make_reference(make):
-    """Return the state after a reset, and the compiled step, of the engine that others are compared with."""
-    env = make("plain")
-    return jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
-
-
 @pytest.mark.long("compiles each case for two engines")
 @pytest.mark.parametrize(
     ("make", "engine"),
-    [(noisy_hover, "fused"), (lopsided_hover, "fused"), (swarm, "fused"), (normalised_hover, "fused"),
-     (noisy_hover, "lanes"), (normalised_hover, "lanes"), (swarm, "interpret")],
-)  # fmt: skip
+    [(noisy_hover, "fused"), (lopsided_hover, "fused"), (swarm, "interpret"), (normalised_hover, "lanes")],
+)
 def test_an_engine_steps_an_environment_like_the_reference(make, engine):
-    env, (state, reference_step) = make(engine), make_reference(make)
+    env, reference = make(engine), make("plain")
+    state, reference_step = jax.jit(reference.reset)(jax.random.key(0)), jax.jit(reference.step)
     assert env.explain().startswith(f"engine: {engine}")
     assert ("splits the step" in env.explain()) == (make is normalised_hover)
     step = jax.jit(env.step)
@@ -440,7 +431,7 @@ def test_law_09_stages_have_names_of_their_own():
     sim = envs.make("hover", 1, engine="interpret").sim
     append_fn(sim.step_pipeline, lambda data: data, "observe")
     env = envs.DroneEnv(sim, Hover())
-    with pytest.raises(ConfigError, match="expected stages of different names, got observe twice"):
+    with pytest.raises(ConfigError, match="stages of different names, got observe twice"):
         env.explain()
 
 
@@ -455,25 +446,3 @@ def test_a_rollout_in_rows_takes_commands_of_every_level():
             fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
             final_states.append(jax.jit(fly)(sim.data))
         assert_close(*final_states)
-
-
-@pytest.mark.long("compiles a step for one device and for two")
-def test_law_10_worlds_over_devices_step_by_the_same_kernel_to_the_same_numbers():
-    def fly_on(**devices):
-        sim, task = Sim(4, control="attitude", **devices), Hover(seconds=0.06)
-        task.install(sim)
-        env = AutoReset(envs.DroneEnv(sim, task))
-        start_state = state = jax.jit(env.reset)(jax.random.key(0))
-        step, action = jax.jit(env.step), np.random.default_rng(0).uniform(-1, 1, (4, 1, 4)).astype(np.float32)
-        for _ in range(5):
-            state = step(state, action)
-        policy = lambda obs, memory, key: (jnp.asarray(action), memory, ())  # noqa: E731
-        _, _, recorded = jax.jit(lambda state: envs.rollout(env, state, policy, jax.random.key(1), 3))(state)
-        assert env.explain().startswith("engine: fused")
-        return start_state, state, recorded
-
-    unsharded, sharded = fly_on(), fly_on(mesh=world_mesh(jax.devices()[:2]))
-    assert all(len(x.devices()) == 2 for x in (sharded[0].obs["pos"], sharded[1].obs["pos"]))
-    for x, y in zip(*map(jax.tree.leaves, (unsharded, sharded)), strict=True):
-        if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-            np.testing.assert_array_equal(x, y)

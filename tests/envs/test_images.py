@@ -26,7 +26,7 @@ DEPTH = {"depth": "depth"}
 @pytest.fixture(scope="module")
 def envs_with_and_without_images():
     """Return environments with automatic resets, with and without images, whose episodes end after two steps."""
-    base = make("avoid", 3, seconds=0.04, n_boxes=1, n_poles=3)
+    base = make("avoid", 3, seconds=0.04, n_boxes=1, n_poles=3, engine="interpret")
     return AutoReset(CameraImages(base, Camera(**SIZE, max_depth=5.0), DEPTH)), AutoReset(base)
 
 
@@ -131,29 +131,22 @@ def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode(
     assert np.ptp(images, axis=0).max() > 1e-3
 
 
+def scale_all(obs, _):
+    return {name: 2 * x for name, x in obs.items()}
+
+
 def test_law_09_wrong_images_are_refused():
     base = make("hover", 2, engine="interpret")
-    with pytest.raises(ConfigError, match=r"expected depth_image as width and height in pixels, got '16x12'"):
-        make("hover", 2, depth_image="16x12")
     for call, message in [
-        (
-            lambda: make("hover", 2, depth_image=(0, 12), engine="interpret"),
-            "expected width of Camera to be finite and at least 1",
-        ),
-        (lambda: CameraImages(base, "fpv_cam"), "expected a camera or lidar, got 'fpv_cam'"),
-        (lambda: make("hover", camera=["fpv_cam"], engine="interpret"), "expected camera as a list of plugins"),
-        (lambda: CameraImages(base, Camera(freq=20)), "expected freq of 'camera' to divide freq = 50 Hz, got 20 Hz"),
-        (lambda: CameraImages(CameraImages(base, Camera()), Camera(9, 7)), "got images 'camera.depth' twice"),
-        (lambda: CameraImages(base, Camera(200_000, 200_000)), "got 2 images of 200000 x 200000 pixels, which need"),
+        (lambda: make("hover", 2, depth_image="16x12"), "depth_image as width and height .*'16x12'"),
+        (lambda: make("hover", 2, depth_image=(0, 12), engine="interpret"), "width of Camera"),
+        (lambda: CameraImages(base, "fpv_cam"), "camera or lidar, got 'fpv_cam'"),
+        (lambda: make("hover", camera=["fpv_cam"], engine="interpret"), "camera as a list of plugins"),
+        (lambda: CameraImages(base, Camera(freq=20)), "freq of 'camera' to divide .* 50 Hz, got 20 Hz"),
+        (lambda: CameraImages(CameraImages(base, Camera()), Camera(9, 7)), "'camera.depth' twice"),
+        (lambda: CameraImages(base, Camera(200_000, 200_000)), "2 images of 200000 x 200000 pixels"),
+        (lambda: CameraImages(base, Camera(), {"depth": "pos"}), "different names for images .*'pos'"),
+        (lambda: Observe(CameraImages(base, Camera(), DEPTH), scale_all), "images unchanged .*'depth'"),
     ]:
         with pytest.raises(ConfigError, match=message):
-            call()
-    for wrap, message in [
-        (lambda env: CameraImages(env, Camera(), {"depth": "pos"}),
-         "expected different names for images and other obs.*, got 'pos'"),
-        (lambda env: Observe(CameraImages(env, Camera(), DEPTH), lambda obs, _: {k: 2 * x for k, x in obs.items()}),
-         "expected images unchanged in functions of one world, got a new 'depth'"),
-    ]:  # fmt: skip
-        env = wrap(base)
-        with pytest.raises(ConfigError, match=message):
-            env.step(env.reset(jax.random.key(0)), jnp.zeros((2, 1, 4)))
+            call().step(call().reset(jax.random.key(0)), jnp.zeros((2, 1, 4)))

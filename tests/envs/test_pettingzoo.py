@@ -5,7 +5,6 @@ import sys
 
 import numpy as np
 import pytest
-from cases import trees_equal
 
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
@@ -37,18 +36,6 @@ def test_pettingzoos_own_test(env, capsys):
 
 def test_pettingzoos_own_test_of_seeds(drone_env):
     parallel_seed_test(lambda: DroneParallelEnv(drone_env), num_cycles=10)
-
-
-def test_seeds_lead_to_the_same_episodes(env):
-    first, _ = env.reset(seed=5)
-    after = env.step(zeros(env))
-    next_one, _ = env.reset()
-    again, _ = env.reset(seed=5)
-    assert trees_equal(first, again)
-    assert trees_equal(env.step(zeros(env)), after)
-    assert trees_equal(env.reset()[0], next_one)
-    assert not trees_equal(first, next_one)
-    assert not trees_equal(env.reset(seed=6)[0], first)
 
 
 def test_every_drone_has_its_own_observations_and_reward(env):
@@ -86,55 +73,44 @@ def test_an_episode_ends_for_all(env):
         *_, truncated, _ = env.step(zeros(env))
     assert truncated == {"drone_0": True, "drone_1": True}
     assert env.agents == []
-    with pytest.raises(ConfigError, match="expected a running episode, got none: "):
+    with pytest.raises(ConfigError, match="running episode, got none: "):
         env.step({})
 
 
-@pytest.mark.parametrize("seed", [-1, True, 1.5])
-def test_wrong_seeds_are_refused(env, seed):
-    with pytest.raises(ConfigError, match=r"expected one integer from 0 to 2\^63 - 1 as seed of all worlds"):
-        env.reset(seed=seed)
+GOOD = np.zeros(4)
 
 
-def test_options_that_pettingzoos_own_test_does_not_pass_are_refused(env):
-    for options in ({"colour": 1}, {"reset_mask": [True]}, "all"):
-        with pytest.raises(ConfigError, match="expected options of reset as a dict with 'options', got"):
-            env.reset(options=options)
-
-
-def test_wrong_actions_are_refused(env):
+@pytest.mark.parametrize(
+    ("actions", "error", "message"),
+    [
+        ({"drone_0": GOOD}, ConfigError, "none of drone_1"),
+        ({"drone_0": GOOD, "drone_1": GOOD, "drone_7": GOOD}, KeyError, "drone_0, drone_1, got one of drone_7"),
+        ({"drone_0": GOOD, "drone_1": np.zeros(3)}, ValueError, r"drone_1 of shape \(4,\), got \(3,\)"),
+        ({"drone_0": GOOD * np.nan, "drone_1": GOOD}, ConfigError, "finite action of drone_0"),
+        ({"drone_0": "up", "drone_1": GOOD}, ConfigError, "drone_0 .*got 'up'"),
+        ({1: GOOD, "drone_2": GOOD}, KeyError, "got one of 1"),
+        ([GOOD, GOOD], ConfigError, "a dict with an action of every drone"),
+    ],
+)
+def test_wrong_actions_are_refused(env, actions, error, message):
     env.reset(seed=0)
-    good = np.zeros(4)
-    for actions, error, message in (
-        ({"drone_0": good}, ConfigError, "expected an action of every drone, got none of drone_1"),
-        (
-            {"drone_0": good, "drone_1": good, "drone_7": good},
-            KeyError,
-            "expected actions of drone_0, drone_1, got one of drone_7",
-        ),
-        ({"drone_0": good, "drone_1": np.zeros(3)}, ValueError, r"drone_1 of shape \(4,\), got \(3,\)"),
-        ({"drone_0": good * np.nan, "drone_1": good}, ConfigError, "expected a finite action of drone_0"),
-        ({"drone_0": "up", "drone_1": good}, ConfigError, "expected action of drone_0 as a number or array, got 'up'"),
-        ({1: good, "drone_2": good}, KeyError, "got one of 1"),
-        ([good, good], ConfigError, "expected a dict with an action of every drone"),
-    ):
-        with pytest.raises(error, match=message):
-            env.step(actions)
+    with pytest.raises(error, match=message):
+        env.step(actions)
 
 
-def test_wrong_settings_are_refused(drone_env):
-    with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
-        DroneParallelEnv(make("hover", 2))
-    with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
-        make_parallel("hover", n_worlds=2)
-    with pytest.raises(ConfigError, match="without AutoReset"):
-        DroneParallelEnv(AutoReset(drone_env))
-    with pytest.raises(ConfigError, match="got 'ascii'"):
-        DroneParallelEnv(drone_env, "ascii")
+def test_wrong_settings_and_resets_are_refused(drone_env, env):
     fresh = make_parallel("hover", n_drones=2)
-    for ask in (fresh.state, fresh.render, lambda: fresh.step({})):
-        with pytest.raises(ConfigError, match="reset"):
-            ask()
+    for call, message in (
+        (lambda: DroneParallelEnv(make("hover", 2)), r"2 worlds\. Make it with n_worlds=1"),
+        (lambda: make_parallel("hover", n_worlds=2), r"2 worlds\. Make it with n_worlds=1"),
+        (lambda: DroneParallelEnv(AutoReset(drone_env)), "without AutoReset"),
+        (lambda: DroneParallelEnv(drone_env, "ascii"), "got 'ascii'"),
+        *((call, "reset") for call in (fresh.state, fresh.render, lambda: fresh.step({}))),
+        *((lambda seed=seed: env.reset(seed=seed), "as seed of all worlds") for seed in (-1, True, 1.5)),
+        *((lambda x=x: env.reset(options=x), "options of reset") for x in ({"colour": 1}, {"reset_mask": [1]}, "all")),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            call()
 
 
 @pytest.mark.usefixtures("opengl")

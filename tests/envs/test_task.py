@@ -38,14 +38,14 @@ def test_an_environment_needs_the_task_installed(installed):
     sim = Sim(control="attitude")
     if installed is not None:
         installed.install(sim)
-    with pytest.raises(ConfigError, match=r"expected a simulation in which task 'land' is installed.*install\(sim\)"):
+    with pytest.raises(ConfigError, match=r"simulation in which task 'land' is installed.*install\(sim\)"):
         DroneEnv(sim, Land())
 
 
 def test_the_name_of_a_task_is_refused_where_a_task_is_expected():
-    with pytest.raises(ConfigError, match="expected actions as Actions, got 3"):
+    with pytest.raises(ConfigError, match="actions as Actions, got 3"):
         make("hover", actions=3)
-    with pytest.raises(ConfigError, match="expected a Task, got 'hover'"):
+    with pytest.raises(ConfigError, match="Task, got 'hover'"):
         DroneEnv(Sim(control="attitude"), "hover")
 
 
@@ -67,11 +67,9 @@ def test_goals_are_set_for_all_for_each_world_and_for_each_drone():
         np.testing.assert_allclose(after.obs["difference_to_goal"], expected - after.data.states.pos, atol=1e-6)
     assert step._cache_size() == 1
     for wrong in (full[:2, 0], full[:, 0, :2], full[None], full[0, 0, 0], full[:2]):
-        with pytest.raises(
-            ConfigError, match=r"expected goals of shape \(3,\), .* = \(3, 2, 3\), got .*Use \(1, n_drones, 3\)"
-        ):
+        with pytest.raises(ConfigError, match=r"goals of shape \(3,\), .* = \(3, 2, 3\), got .*Use \(1, n_drones, 3\)"):
             env.set_goal(state, wrong)
-    with pytest.raises(ConfigError, match="expected pos to be finite"):
+    with pytest.raises(ConfigError, match="pos to be finite"):
         env.set_goal(state, [0.0, np.nan, 1.0])
 
 
@@ -207,28 +205,21 @@ def two_drones():
 
 
 WRONG_METHODS = {
-    "flat": ("observe", lambda s, d: {"height": d.states.pos[:, 2]},
-             r"observation 'height' of shape \(n_drones, k\) = \(2, k\), got shape \(2,\) .*x\[:, None\]"),
-    "of the world": ("observe", lambda s, d: {"ok": d.states.pos, "all": d.states.pos.ravel()},
-                     r"observation 'all' of shape \(n_drones, k\) = \(2, k\), got shape \(6,\)"),
-    "matrix": ("observe", lambda s, d: {"m": jnp.zeros((2, 3, 3))},
-               r"observation 'm' of .*got shape \(2, 3, 3\) .*x.reshape\(n_drones, -1\)"),
-    "no dict": ("observe", lambda s, d: d.states.pos, r"observe to return a dict .*, got shape \(2, 3\)"),
-    "none": ("observe", lambda s, d: {"x": None}, "observation 'x' of .*got a NoneType"),
-    "no terms": ("rewards", lambda s, d, a, b: {}, "rewards to return a dict .*, got an empty dict"),
-    "column": ("rewards", lambda s, d, a, b: {"good": d.states.pos[:, 0], "bad": d.states.pos[:, :1]},
-               r"reward term 'bad' of shape \(n_drones,\) = \(2,\), got shape \(2, 1\)"),
-    "one for all": ("rewards", lambda s, d, a, b: {"any": jnp.sum(d.states.pos)},
-                    r"reward term 'any' of shape \(n_drones,\) = \(2,\), got shape \(\) .*jnp.full"),
-    "info of the world": ("info", lambda s, d: {"wind": d.states.pos[0]},
-                          r"info 'wind' of shape \(\) or \(n_drones, ...\) = \(2, ...\), got shape \(3,\)"),
-    "of actions": ("rewards", lambda s, d, a, b: {"a": a}, r"reward term 'a' of .* got shape \(2, 4\)"),
-    "no info": ("info", lambda s, d: None, "info to return a dict .*, got a NoneType"),
-    "error": ("error", lambda s, d: d.states.pos, r"error of shape \(n_drones,\) = \(2,\), got shape \(2, 3\)"),
-    "ends for each": ("terminated", lambda s, d: d.states.pos[:, 2] < 0,
-                      r"terminated of type bool and shape \(\), got shape \(2,\) .*jnp.any"),
-    "ends as a number": ("terminated", lambda s, d: jnp.float32(0), "terminated of type bool .*float32"),
-}  # fmt: skip
+    "flat": ("observe", lambda s, d: {"height": d.states.pos[:, 2]}, r"'height' .*\(2,\) .*x\[:, None\]"),
+    "of the world": ("observe", lambda s, d: {"ok": d.states.pos, "all": d.states.pos.ravel()}, r"'all' .*\(6,\)"),
+    "matrix": ("observe", lambda s, d: {"m": jnp.zeros((2, 3, 3))}, r"'m' .*\(2, 3, 3\) .*x.reshape"),
+    "no dict": ("observe", lambda s, d: d.states.pos, r"observe to return a dict .*\(2, 3\)"),
+    "none": ("observe", lambda s, d: {"x": None}, "'x' .*NoneType"),
+    "no terms": ("rewards", lambda s, d, a, b: {}, "rewards to return a dict .*empty"),
+    "column": ("rewards", lambda s, d, a, b: {"bad": d.states.pos[:, :1]}, r"term 'bad' .*\(2, 1\)"),
+    "one for all": ("rewards", lambda s, d, a, b: {"any": jnp.sum(d.states.pos)}, r"'any' .*\(\) .*jnp.full"),
+    "of actions": ("rewards", lambda s, d, a, b: {"a": a}, r"term 'a' .*\(2, 4\)"),
+    "info of the world": ("info", lambda s, d: {"wind": d.states.pos[0]}, r"info 'wind' .*got shape \(3,\)"),
+    "no info": ("info", lambda s, d: None, "info to return a dict .*NoneType"),
+    "error": ("error", lambda s, d: d.states.pos, r"error of .*\(2, 3\)"),
+    "ends for each": ("terminated", lambda s, d: d.states.pos[:, 2] < 0, r"terminated .*bool .*\(2,\) .*jnp.any"),
+    "ends as a number": ("terminated", lambda s, d: jnp.float32(0), "terminated .*bool .*float32"),
+}
 """Name of a method of a task, a wrong one in its place, and words of the error."""
 
 
@@ -236,8 +227,7 @@ WRONG_METHODS = {
 def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
     method, fn, words = WRONG_METHODS[case]
     wrong = type("Wrong", (Still,), {method: fn})()
-    DroneEnv(two_drones, Still())
-    with pytest.raises(ConfigError, match=f"task 'still': expected {words}"):
+    with pytest.raises(ConfigError, match=f"task 'still': expected .*{words}"):
         DroneEnv(two_drones, wrong)
 
 

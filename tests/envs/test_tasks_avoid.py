@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import Sim
 from crazysim.engine.stage import vmap_worlds
-from crazysim.envs import DroneEnv, make
+from crazysim.envs import DroneEnv
 from crazysim.envs.tasks.avoid import CELL_JITTER, CELL_WIDTH, HEIGHT, Avoid
 
 N_WORLDS = 2048
@@ -121,18 +121,3 @@ def test_hits_disable_and_arriving_is_a_success(start_state):
     near = np.asarray(after.obs["drones_near"])
     np.testing.assert_array_equal(near[8, 1], 0)
     assert np.linalg.norm(near[9, 1]) > 0.7
-
-
-def test_an_episode_is_truncated_when_its_time_is_over(start_state):
-    env, state, step = start_state
-    core = state.data.core
-    late = core.replace(steps=np.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
-    after = step(state.replace(data=state.data.replace(core=late)), state.action)
-    assert np.all(after.truncated)
-    assert not np.any(after.terminated)
-
-
-@pytest.mark.parametrize("options", [{"n_poles": -1}, {"n_poles": 0, "n_boxes": 0}, {"n_seen": 0}, {"n_boxes": 1.5}])
-def test_wrong_numbers_of_obstacles_are_errors(options):
-    with pytest.raises(ConfigError, match=r"n_poles|n_seen of Avoid|n_boxes of Avoid as a whole number"):
-        make("avoid", 1, **options)

@@ -5,18 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, rotation
+from crazysim import rotation
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import PrivilegedObservation, make
-from crazysim.envs.tasks.forest import (
-    CEILING,
-    EDGE_DISTANCE,
-    HALF_WIDTH,
-    HEIGHT,
-    N_PRIVILEGED_TREES,
-    VIEW_RANGE,
-    Forest,
-)
+from crazysim.envs.tasks.forest import CEILING, EDGE_DISTANCE, HALF_WIDTH, HEIGHT, N_PRIVILEGED_TREES, VIEW_RANGE
 
 N_WORLDS, N_OBSERVED_TREES = 64, 6
 
@@ -166,17 +158,3 @@ def test_speed_is_rewarded_up_to_its_setting_and_trees_nearby_cost(start_state):
     np.testing.assert_allclose([near, far], [-0.3 * np.exp(-1), -0.3 * np.exp(-3)], rtol=1e-3)
     over = place_drones(state, start, flight_over_before=jnp.ones((N_WORLDS, 1), bool)).data
     assert not any(np.any(x) for x in vmap_worlds(env.task.rewards)(over, action, action).values())
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"density": 2.0}, "expected obstacles that fit into their cells of 0.707 m"),
-        ({"radii": (0.3, 0.1)}, "expected the smallest before the largest size"),
-        ({"speed": 0.0}, "expected speed of Forest to be positive, at most 20, got 0.0"),
-        ({"trees_seen": 13}, "expected trees_seen of Forest .*12, got 13"),
-    ],
-)
-def test_law_09_wrong_settings_are_refused(options, message):
-    with pytest.raises(ConfigError, match=message):
-        Forest(**options)

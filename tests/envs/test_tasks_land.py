@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError, Sim
+from crazysim import Sim
 from crazysim.engine.stage import vmap_worlds
-from crazysim.envs import DroneEnv, make
+from crazysim.envs import DroneEnv
 from crazysim.envs.tasks.land import Land
 from crazysim.train.evaluation import evaluate
 
@@ -135,16 +135,3 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
     metrics = evaluate(env, jax.tree_util.Partial(follow))
     assert metrics["success"] == metrics["crashed"] == 0.5
     assert metrics["error"] < 0.27
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"speed": -1}, "speed of Land to be from 0 to 10, got -1"),
-        ({"radius": 2.0}, "radius of Land to be from 0.05 to 0.5, got 2.0"),
-        ({"speed": "x"}, "got 'x'"),
-    ],
-)
-def test_wrong_pads_are_errors(options, message):
-    with pytest.raises(ConfigError, match=message):
-        make("land", 1, **options)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import Sim
 from crazysim.engine.stage import vmap_worlds
-from crazysim.envs import DroneEnv, make
+from crazysim.envs import DroneEnv
 from crazysim.envs.tasks.swarm import Swarm, separation
 
 N_WORLDS, N_DRONES = 2048, 4
@@ -115,19 +115,3 @@ def test_goals_can_be_a_formation():
     zeros, rewards = np.zeros((64, 4, 4), np.float32), jax.jit(vmap_worlds(task.rewards))
     rewards_apart, rewards_near = rewards(data, zeros, zeros), rewards(near, zeros, zeros)
     assert np.all((np.asarray(rewards_near["crowding"]) - rewards_apart["crowding"])[:, 0] < -2)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"n_drones": 1}, "at least two drones in a swarm, got 1"),
-        ({"formation": [(0, 0, 1)]}, r"got shape \(1, 3\)"),
-        ({"formation": [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1.5)]}, r"places \[0, 3\]"),
-        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "at least 0.2 m above the floor, got 0.1 m"),
-        ({"formation": "abc"}, "got 'abc'"),
-        ({"n_seen": 0}, "n_seen of Swarm to be finite and at least 1, got 0"),
-    ],
-)
-def test_wrong_numbers_and_formations_are_errors(options, message):
-    with pytest.raises(ConfigError, match=message):
-        make("swarm", 1, **options)

@@ -149,16 +149,12 @@ def test_a_step_transfers_no_arrays_and_is_traced_once(next_step):
 @pytest.mark.parametrize(
     ("action", "error", "message"),
     [
-        (np.zeros((3, 5)), ValueError, r"expected actions of shape \(3, 4\), got \(3, 5\)"),
-        (jnp.zeros((2, 4)), ValueError, r"expected actions of shape \(3, 4\), got \(2, 4\)"),
-        (np.zeros(4), ValueError, r"expected actions of shape \(3, 4\), got \(4,\)"),
-        ("up", ConfigError, r"expected actions as an array of numbers \(3, 4\), got 'up'"),
-        ({"drone": np.zeros(4)}, ConfigError, "expected actions as an array of numbers"),
-        (
-            np.array([[0.0] * 4, [np.nan] * 4, [0, 0, 0, np.inf]]),
-            ConfigError,
-            r"expected finite actions, got NaN or infinity in world\(s\) \[1, 2\]",
-        ),
+        (np.zeros((3, 5)), ValueError, r"\(3, 4\), got \(3, 5\)"),
+        (jnp.zeros((2, 4)), ValueError, r"\(3, 4\), got \(2, 4\)"),
+        (np.zeros(4), ValueError, r"\(3, 4\), got \(4,\)"),
+        ("up", ConfigError, r"\(3, 4\), got 'up'"),
+        ({"drone": np.zeros(4)}, ConfigError, "array of numbers"),
+        (np.array([[0.0] * 4, [np.nan] * 4, [0, 0, 0, np.inf]]), ConfigError, r"finite actions, .* \[1, 2\]"),
     ],
 )
 def test_wrong_actions_are_errors(next_step, action, error, message):
@@ -179,47 +175,38 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "error", "message"),
+    ("kwargs", "message"),
     [
-        ({"seed": [1, 2, 3]}, ConfigError, r"expected one integer from 0 to 2\^63 - 1 as seed of all worlds"),
-        ({"seed": 1.5}, ConfigError, "as seed of all worlds, each of which draws its own numbers, got 1"),
-        ({"seed": True}, ConfigError, "as seed of all worlds, .*, got True"),
-        ({"seed": -1}, ConfigError, "as seed of all worlds, .*, got -1"),
-        ({"seed": 2**63}, ConfigError, "as seed of all worlds, .*, got 9223372036854775808"),
-        ({"options": {"colour": 1}}, ConfigError, "options of reset as a dict with 'reset_mask', got .*colour"),
-        ({"options": "all"}, ConfigError, "expected options of reset as a dict with 'reset_mask', got 'all'"),
-        ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
-        ({"options": {"reset_mask": np.ones(3)}}, ValueError, r"expected a mask of shape \(3,\) and bool"),
-        (
-            {"seed": 1, "options": {"reset_mask": np.ones(3, bool)}},
-            ConfigError,
-            "expected a seed or a reset_mask, got both",
-        ),
+        *(({"seed": seed}, "as seed of all worlds, .*got") for seed in ([1, 2, 3], 1.5, True, -1, 2**63)),
+        ({"options": {"colour": 1}}, "'reset_mask', got .*colour"),
+        ({"options": "all"}, "'reset_mask', got 'all'"),
+        ({"options": {"reset_mask": [True]}}, r"mask of .*\(1,\)"),
+        ({"options": {"reset_mask": np.ones(3)}}, r"mask of .*\(3,\) and bool"),
+        ({"seed": 1, "options": {"reset_mask": np.ones(3, bool)}}, "a seed or a reset_mask, got both"),
     ],
 )
-def test_wrong_resets_are_errors(next_step, kwargs, error, message):
+def test_wrong_resets_are_errors(next_step, kwargs, message):
     next_step.reset(seed=0)
-    with pytest.raises(error, match=message):
+    with pytest.raises(ValueError, match=message):
         next_step.reset(**kwargs)
 
 
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"render_mode": "ascii"}, "expected render_mode None, rgb_array or human, got 'ascii'"),
-        ({"autoreset_mode": "sometimes"}, "autoreset_mode is 'sometimes'; it must be one of 'NextStep'"),
-        ({"render_worlds": [2]}, r"expected render_worlds as a list of worlds from 0 to 1, got \[2\]"),
-        ({"render_worlds": 0}, "expected render_worlds as a list of worlds from 0 to 1, got 0"),
-        ({"render_size": (0, 480)}, "expected positive integers as width and height of an image, got 0 x 480"),
-        ({"render_size": 480}, "expected render_size as width and height"),
-        ({"numpy": "no"}, "expected numpy as True or False, got 'no'"),
-        ({"color": "red"}, "task 'hover' has no option 'color'"),
-        ({"color": "red"}, "effects, randomize, camera, depth_image, sim_freq; the simulation has"),
+        ({"render_mode": "ascii"}, "render_mode .*'ascii'"),
+        ({"autoreset_mode": "sometimes"}, "autoreset_mode .*'NextStep'"),
+        ({"render_worlds": [2]}, r"render_worlds .*\[2\]"),
+        ({"render_worlds": 0}, "render_worlds .*got 0"),
+        ({"render_size": (0, 480)}, "image, got 0 x 480"),
+        ({"render_size": 480}, "render_size as width and height"),
+        ({"numpy": "no"}, "numpy .*got 'no'"),
+        ({"color": "red"}, "no option 'color'.* camera, depth_image, sim_freq; the simulation has"),
         ({"n_world": 2}, "did you mean n_worlds"),
-        ({"n_worlds": 4}, "expected num_envs, got n_worlds=4"),
-        ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
-        ({"seconds": 2.0, "max_episode_steps": 5}, "expected max_episode_steps or seconds, got 5 and 2.0: both"),
-        ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
+        ({"n_worlds": 4}, "num_envs, got n_worlds=4"),
+        ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'"),
+        ({"seconds": 2.0, "max_episode_steps": 5}, "max_episode_steps or seconds, .*both"),
+        ({"freq": 300}, "freq that divides .*500 Hz, got 300 Hz"),
     ],
 )
 def test_wrong_settings_are_errors(kwargs, message):
@@ -234,7 +221,7 @@ def test_an_unknown_task_is_an_error():
 
 def test_a_step_before_the_first_reset_is_an_error():
     env = make_vector("hover", 1)
-    with pytest.raises(ConfigError, match=r"expected a reset of all worlds before the first reset_mask, got none"):
+    with pytest.raises(ConfigError, match=r"reset of all worlds before the first reset_mask, got none"):
         env.reset(options={"reset_mask": [False]})
     with pytest.raises(ConfigError, match="reset"):
         env.step(np.zeros((1, 4)))
@@ -341,7 +328,7 @@ def test_one_world_is_an_environment_that_gymnasium_accepts():
     check_env(env.unwrapped, skip_render_check=True)
     first = env.reset(seed=5)[0]
     for seed in (-1, True):
-        with pytest.raises(ConfigError, match="expected one integer from 0"):
+        with pytest.raises(ConfigError, match="one integer from 0"):
             env.unwrapped.reset(seed=seed)
     vec = gymnasium.make_vec(ID, num_envs=1, seconds=1.0, autoreset_mode="Disabled")
     vector_obs = vec.reset(seed=5)[0]
@@ -373,14 +360,5 @@ def test_several_drones_have_an_axis_and_share_their_mean_reward():
     _, reward, terminated, _, info = env.step(env.action_space.sample())
     assert (reward.shape, terminated.shape, info["error"].shape) == ((3,), (3,), (3, 2))
     np.testing.assert_allclose(reward, np.asarray(env.state.reward).mean(axis=1), rtol=1e-6)
-    with pytest.raises(ValueError, match=r"expected actions of shape \(3, 2, 4\)"):
+    with pytest.raises(ValueError, match=r"actions of shape \(3, 2, 4\)"):
         env.step(np.zeros((3, 4)))
-
-
-def test_construction_and_the_first_reset_share_a_trace(envs, monkeypatch):
-    """Spaces have the shapes of a reset, which is traced for them and not again where it is called."""
-    traces, real = [], AutoReset.reset
-    monkeypatch.setattr(AutoReset, "reset", lambda *args: traces.append(1) or real(*args))
-    env = DroneVectorEnv(envs["NextStep"].env.env)
-    env._reset_fn.trace(jax.random.key(3))
-    assert len(traces) == 1

@@ -52,20 +52,6 @@ def random_steps(env, state, n, seed=0):
     return states
 
 
-def test_wrappers_around_automatic_resets_are_errors(env):
-    auto = AutoReset(env)
-    randomize = lambda e: RandomizeWith(e, lambda d, k: d)  # noqa: E731
-    for wrap in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), randomize):
-        with pytest.raises(ConfigError, match="without AutoReset, got one with it"):
-            wrap(auto)
-
-
-def test_a_wrapper_has_the_attributes_of_its_environment(env):
-    wrapped = FrameStack(EpisodeStatistics(env), 2)
-    for name in ("sim", "task", "actions", "n_substeps", "max_steps"):
-        assert getattr(wrapped, name) is getattr(env, name)
-
-
 class Recorder(Wrapper):
     """Records calls of its hooks, and the shapes of their arguments."""
 
@@ -126,7 +112,7 @@ def test_hooks_change_actions_and_remember(env):
 
 def test_wrappers_that_step_the_environment_themselves_are_refused():
     """As wrappers of Gymnasium do."""
-    with pytest.raises(ConfigError, match=r"expected hooks for one world, got Counting\.step\. Override before_step"):
+    with pytest.raises(ConfigError, match=r"hooks for one world, got Counting\.step\. Override before_step"):
 
         class Counting(Wrapper):
             def step(self, state, action):
@@ -169,18 +155,6 @@ def test_randomised_episodes_are_observed_through_other_wrappers(env):
     np.testing.assert_allclose(a.obs["pos"][..., 2] - plain.obs["pos"][..., 2], 0.5, rtol=1e-5)
     distance = np.linalg.norm(a.obs["difference_to_goal"][..., -3:], axis=-1)
     np.testing.assert_allclose(a.info["error"], distance, rtol=1e-5)
-
-
-@pytest.mark.parametrize("n", [0, -1, 1.5, True, "2"])
-def test_lengths_are_positive_whole_numbers(env, n):
-    for wrapper in (FrameStack, ActionDelay):
-        with pytest.raises(ConfigError, match="positive whole number"):
-            wrapper(env, n)
-
-
-def test_an_unknown_mode_is_an_error_that_names_all(env):
-    with pytest.raises(ConfigError, match="'NextStep', 'SameStep', 'Disabled'"):
-        AutoReset(env, "sometimes")
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
@@ -288,11 +262,6 @@ def test_noise_of_two_wrappers_is_independent(env):
     assert np.abs(noise[0] - noise[1]).min() > 1e-4
 
 
-def test_noise_on_an_unknown_observation_is_refused(env):
-    with pytest.raises(ConfigError, match=r"expected names of observations, ang_vel, .* got colour"):
-        ObservationNoise(env, {"pos": 0.1, "colour": 0.1}).reset(jax.random.key(0))
-
-
 def test_frames_are_stacked_oldest_first(env):
     wrapped = FrameStack(env, 3)
     state, plain = wrapped.reset(jax.random.key(0)), env.reset(jax.random.key(0))
@@ -330,7 +299,7 @@ def test_delayed_actions_arrive_after_their_steps(env):
 def test_a_wrong_action_is_refused_around_every_wrapper(env):
     for wrapped in (env, ActionDelay(env, 2)):
         state = wrapped.reset(jax.random.key(0))
-        with pytest.raises(ValueError, match=r"expected actions of shape \(4, 1, 4\) = .*, got \(4, 4\)"):
+        with pytest.raises(ValueError, match=r"actions of shape \(4, 1, 4\) = .*, got \(4, 4\)"):
             wrapped.step(state, jnp.zeros((4, 4)))
 
 
@@ -365,35 +334,29 @@ def test_only_restarted_worlds_are_randomised_again(randomized, randomized_state
     assert trees_equal(select_state(new, ~FIRST_WORLD), select_state(randomized_state, ~FIRST_WORLD))
 
 
-def test_randomisation_does_not_depend_on_the_number_of_worlds(randomized_state):
-    """Law 10."""
-    two = jax.jit(RandomizeWith(make("hover", 2), draw_masses, params=("mass",)).reset)(jax.random.key(0))
-    np.testing.assert_allclose(two.data.params.mass, randomized_state.data.params.mass[:2], rtol=1e-6)
-
-
-def test_parameters_that_cannot_be_randomised_are_errors(env):
-    with pytest.raises(ConfigError, match=r"expected parameters of first_principles, mass.* got colour"):
-        RandomizeWith(env, draw_masses, params=("mass", "colour"))
-    with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
-        jax.eval_shape(RandomizeWith(env, draw_masses).reset, jax.random.key(0))
+def replace_mass(data, key):
+    return data.replace(params=data.params.replace(mass=jnp.float32(0.03)))
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda env: Observe(env, None), "expected a function"),
+        (lambda env: Observe(env, None), "a function"),
         (lambda env: Observe(env, lambda obs, data: 1).reset(KEY), "a dict of names to arrays, got 1"),
         (lambda env: Observe(env, lambda obs, data: {}).reset(KEY), "a dict of names to arrays"),
         (lambda env: Observe(env, lambda obs, data: {"z": data.states.pos[:, 2]}).reset(KEY), r"\(n_drones, k\)"),
-        (lambda env: RandomizeWith(env, None), "expected a function"),
+        (lambda env: RandomizeWith(env, None), "a function"),
         (lambda env: RandomizeWith(env, lambda data, key: None).reset(KEY), "to return the data"),
-        (
-            lambda env: RandomizeWith(
-                env, lambda data, key: data.replace(params=data.params.replace(mass=jnp.float32(0.03))), ("mass",)
-            ).reset(KEY),
-            r"keep the shape \(1, 1\) of params.mass, got \(\). Use jnp.broadcast_to",
-        ),
+        (lambda env: RandomizeWith(env, replace_mass, ("mass",)).reset(KEY), r"\(1, 1\) of params.mass.*broadcast_to"),
+        (lambda env: RandomizeWith(env, draw_masses, params=("mass", "colour")), "mass.* got colour"),
+        (lambda env: RandomizeWith(env, draw_masses).reset(KEY), "params.mass .*all worlds share it.*params="),
         (lambda env: Normalize(env, 5), "stats as a dict"),
+        (lambda env: ObservationNoise(env, {"pos": 0.1, "colour": 0.1}).reset(KEY), "observations, .* got colour"),
+        (lambda env: AutoReset(env, "sometimes"), "'NextStep', 'SameStep', 'Disabled'"),
+        *((lambda env, n=n: FrameStack(env, n), "positive whole number") for n in (0, -1, 1.5, True, "2")),
+        (lambda env: ActionDelay(env, 0), "positive whole number"),
+        (lambda env: EpisodeStatistics(AutoReset(env)), "without AutoReset"),
+        (lambda env: AutoReset(AutoReset(env)), "without AutoReset"),
         (lambda env: env.reset(0), r"random key, got 0.*jax.random.key\(0\)"),
         (lambda env: env.reset(jax.random.PRNGKey(0)), "wrap_key_data"),
         (lambda env: fly(env, key=0), "random key, got 0"),

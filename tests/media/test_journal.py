@@ -11,7 +11,7 @@ from pictures import read_frames
 from waiting import wait_for
 
 from crazysim.errors import ConfigError
-from crazysim.media import Film, Flight, Recorder, View
+from crazysim.media import Flight, Recorder
 from crazysim.media.journal import CHUNK_HEADER, Journal, is_journal, read_journal
 from crazysim.sim import Sim
 
@@ -51,10 +51,10 @@ def test_a_damaged_chunk_ends_the_file(journal_path):
 
 
 def test_wrong_files_are_errors(journal_path, tmp_path):
-    with pytest.raises(ConfigError, match="expected a new file"):
+    with pytest.raises(ConfigError, match="new file"):
         Journal(journal_path)
     assert list(read_journal(journal_path)) == CHUNKS, "the old journal stays"
-    with pytest.raises(ConfigError, match="expected a file that can be created"):
+    with pytest.raises(ConfigError, match="file that can be created"):
         Journal(tmp_path / "nowhere" / "x")
     other = tmp_path / "other"
     other.write_text("else")
@@ -120,9 +120,3 @@ def test_a_film_survives_the_end_of_its_process(tmp_path):
     subprocess.run([sys.executable, "-c", KILLED_PROGRAM, film, "400", "ffmpeg"], check=True)
     (path,) = tmp_path.glob("film.mp4.*.part")  # the earlier one is removed
     assert len(read_frames(path, 48, 64)) > 200
-
-
-def test_a_closed_film_has_all_frames(tmp_path):
-    with Film(tmp_path / "film.mp4", View(width=64, height=48), fps=10) as film:
-        film.write(np.zeros((48, 64, 3), np.uint8), 30)
-    assert len(read_frames(tmp_path / "film.mp4", 48, 64)) == 30

@@ -16,8 +16,6 @@ from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
 from crazysim.envs.statistics import RunningStats
 from crazysim.train import Network, dagger, ppo
-from crazysim.train import config as configs
-from crazysim.train.checkpoint import read
 from crazysim.train.config import TrainConfig
 from crazysim.train.convolution import Image, convolve, find_images, scale_depth
 from crazysim.train.evaluation import evaluate
@@ -25,23 +23,11 @@ from crazysim.train.export import describe, to_c, to_onnx
 from crazysim.train.networks import Policies, Policy, choose_network, init_mlp, init_weights, unroll
 from crazysim.train.seeds import take_seed
 from crazysim.train.show import color_depth, film
-from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
+from crazysim.train.training import load_policy, train
 
 SMALL_CONFIG = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,), "convolution": (2, 3)}
 OPTIONS = {"seconds": 0.1, "depth_image": (5, 4)}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def shared_environments():
-    """Let runs with equal options share environments and their compiled functions."""
-
-    def freeze(**options):
-        return {name: tuple(x) if isinstance(x, list) else x for name, x in options.items()}
-
-    shared = functools.cache(make)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(configs, "make", lambda task, n_worlds, **options: shared(task, n_worlds, **freeze(**options)))
-        yield
+pytestmark = pytest.mark.usefixtures("shared_environments")
 
 
 @pytest.fixture(scope="module")
@@ -192,49 +178,15 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 
 
-@pytest.mark.parametrize("options", [{}, {"depth_image": (5, 4)}])
-def test_a_film_has_maps_from_above_if_policies_observe_images(tmp_path, monkeypatch, meta, options):
-    class StoppedError(Exception):
-        """Raised instead of filming."""
-
-    views = []
-
-    def open_film(path, view, **_):
-        views.append(view)
-        raise StoppedError
-
-    monkeypatch.setattr("crazysim.train.show.Film", open_film)
-    env = make("hover", 1, engine="interpret", **options)
-    with pytest.raises(StoppedError):
-        film(env, make_policy(meta, memory=0, channels=(2,)), tmp_path / "film.gif", worlds=1)
-    assert views[0].top_view == bool(options)
-
-
-def train_quietly(folder, iterations=2, **options):
-    """Train hover with images, a tiny convolution and a privileged critic."""
-    config = SMALL_CONFIG | {"iterations": iterations, "memory": 3, "critic": "privileged"}
-    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
-    return train(config, folder, evaluation_worlds=8, log=lambda line: None, progress=False, **options)
-
-
 @pytest.mark.long("compiles a training")
-def test_a_run_with_a_convolution_resumes_bit_for_bit_and_its_policy_comes_back(tmp_path):
-    whole = train_quietly(tmp_path / "whole")
-
-    def interrupt(i, _):
-        if i == 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_quietly(tmp_path / "cut", on_iteration=interrupt)
-    train_quietly(tmp_path / "cut", resume=True)
-    actual, reference = (read(tmp_path / name / CHECKPOINT_FILE)[0] for name in ("cut", "whole"))
-    for name, x in actual.items():
-        np.testing.assert_array_equal(x, reference[name], err_msg=name)
-    policy, config, meta = load_policy(tmp_path / "whole")
+def test_the_policy_of_a_run_with_a_convolution_comes_back(tmp_path):
+    config = SMALL_CONFIG | {"iterations": 2, "memory": 3, "critic": "privileged"}
+    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
+    result = train(config, tmp_path, evaluation_worlds=8, log=lambda line: None, progress=False)
+    policy, config, meta = load_policy(tmp_path)
     assert config.config["convolution"] == [2, 3]
     assert meta["images"]["depth"]["width"] == 5
-    assert evaluate(whole.env, policy)["reward"] == evaluate(whole.env, whole.policy)["reward"]
+    assert evaluate(result.env, policy)["reward"] == evaluate(result.env, result.policy)["reward"]
     start = policy.stats.is_scaled().argmin()
     np.testing.assert_array_equal(policy.stats.mean[start : start + 20], 0)
     assert np.all(policy.stats.mean[:start] != 0)
@@ -276,17 +228,18 @@ def test_law_09_convolutions_that_do_not_fit_are_refused(env):
     def init_learner(env, **config):
         jax.eval_shape(lambda key: ppo.init(AutoReset(env), (ppo.Config(minibatches=1, **config),), key), keys)
 
+    def create(algorithm, network=None):
+        TrainConfig.create("hover", algorithm, options=OPTIONS, config={"convolution": (2,)}, network=network)
+
     keys = jax.random.key(0)[None]
-    with pytest.raises(ConfigError, match=r"expected an image among the observations .*, got ang_vel, .*Use depth_im"):
-        init_learner(env.env, convolution=(2,))
-    with pytest.raises(ConfigError, match=r"expected a critic of one drone with a convolution, got 'all_drones'"):
-        init_learner(env, convolution=(2,), critic="all_drones")
-    with pytest.raises(ConfigError, match=r"expected convolution as the channels of the layers, got 8\. Use for"):
-        ppo.Config(convolution=8)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"convolution\[1\] is 0; it must be a positive"):
-        ppo.Config(convolution=(2, 0))
     network = Network(lambda key, n: init_mlp(key, (n, 2), 1.0), lambda weights, obs, memory: (obs, memory))
-    with pytest.raises(ConfigError, match=r"expected no convolution with a custom network, got \[2\]\. Put it"):
-        TrainConfig.create("hover", options=OPTIONS, config={"convolution": (2,)}, network=network)
-    with pytest.raises(ConfigError, match=r"expected hyperparameters of apg, got convolution"):
-        TrainConfig.create("hover", "apg", options=OPTIONS, config={"convolution": (2,)})
+    for call, message in (
+        (lambda: init_learner(env.env, convolution=(2,)), r"an image among the observations .*Use depth_im"),
+        (lambda: init_learner(env, convolution=(2,), critic="all_drones"), "critic of one drone .*'all_drones'"),
+        (lambda: ppo.Config(convolution=8), r"convolution as the channels .*got 8\. Use"),
+        (lambda: ppo.Config(convolution=(2, 0)), r"convolution\[1\] is 0"),
+        (lambda: create("ppo", network), r"no convolution with a custom network"),
+        (lambda: create("apg"), r"hyperparameters of apg, got convolution"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            call()

@@ -129,24 +129,6 @@ def test_hosts_with_other_settings_stop_together(tmp_path):
     assert not (tmp_path / "out" / CHECKPOINT_FILE).exists()
 
 
-VERSION_PROGRAM = """
-import sys, jax, crazysim
-from crazysim.train.hosts import require_same_versions
-crazysim.__version__ = f"0.{sys.argv[2]}"
-jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]), cluster_detection_method="deactivate")
-require_same_versions()
-"""
-
-
-def test_hosts_with_other_versions_are_an_error(tmp_path):
-    address = free_address()
-    command = (sys.executable, "-c", VERSION_PROGRAM, address)
-    for process in [Process(tmp_path, str(i), *command, str(i)) for i in range(2)]:
-        status, text = process.end()
-        assert status == 1
-        assert "expected the same versions on all hosts, got crazysim = '0.0' on host 0 and '0.1' on host 1" in text
-
-
 def test_a_coordinator_that_does_not_answer_is_an_error_with_its_address(tmp_path):
     address = free_address()
     arguments = training_arguments(

@@ -17,6 +17,7 @@ from crazysim.envs import TASKS, references, registry
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import UnknownNameError
 from crazysim.train.config import TrainConfig
+from crazysim.train.show import film
 from crazysim.train.training import load_policy
 
 SOURCE = """
@@ -70,23 +71,9 @@ def forget_tasks(monkeypatch):
 def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):
     """By commands only, from the folder of the run."""
     monkeypatch.chdir(tmp_path)
-    small_options = [f"{k}={list(v) if isinstance(v, tuple) else v}" for k, v in SMALL.items()]
-    assert (
-        main(
-            [
-                "train",
-                "my_tasks.py:High",
-                "--worlds",
-                "4",
-                "--set",
-                "seconds=0.4",
-                "--no-film",
-                "--config",
-                *small_options,
-            ]
-        )
-        == 0
-    )
+    small_options = " ".join(f"{k}={[*v] if isinstance(v, tuple) else v}" for k, v in SMALL.items())
+    options = f"--worlds 4 --set seconds=0.4 --no-film --config {small_options}"
+    assert main(["train", "my_tasks.py:High", *options.split()]) == 0
     assert "high by ppo, seed 0: 2 iterations" in capsys.readouterr().out
     forget_tasks(monkeypatch)
     folder = str(tmp_path / "out" / "high")
@@ -111,9 +98,7 @@ def test_code_that_only_a_run_names_is_not_executed(file, tmp_path, monkeypatch,
     policy, config, _ = load_policy(tmp_path / "run")
     assert policy({name: np.zeros(n) for name, n in policy.interface.sizes.items()}).shape == (4,)
     for _ in range(2):
-        with pytest.raises(
-            ConfigError, match=r"expected a task that you have named .*my_tasks\.py:High.*--task FILE\.py:High"
-        ):
+        with pytest.raises(ConfigError, match=r"task that you have named .*my_tasks\.py:High.*--task FILE\.py:High"):
             config.make_env(1)
     (tmp_path / "moved.py").write_text(SOURCE)
     moved = load_policy(tmp_path / "run", task=f"{tmp_path / 'moved.py'}:High")[1]
@@ -132,7 +117,7 @@ def test_a_list_that_others_can_write_is_not_used(file, own_list, monkeypatch):
     assert own_list.stat().st_mode & 0o077 == 0
     forget_tasks(monkeypatch)
     own_list.chmod(0o666)
-    with pytest.raises(ConfigError, match="expected a task that you have named"):
+    with pytest.raises(ConfigError, match="task that you have named"):
         TrainConfig(f"{file}:High", "ppo", 0, 4, {}, {}).make_env(1)
 
 
@@ -152,7 +137,7 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
     assert config.title == "low"
     forget_tasks(monkeypatch)
     assert config.make_env(2).task.depth == 0.3  # from this file, which another process finds by its path
-    with pytest.raises(ConfigError, match=r"expected depth = 0\.3 as in .*, got 0\.1"):
+    with pytest.raises(ConfigError, match=r"depth = 0\.3 as in .*, got 0\.1"):
         train.run(Low(seconds=0.4), tmp_path / "run", resume=True)
     state = result.env.reset(jax.random.key(0))
     drone_obs = {name: np.asarray(x)[0, 0] for name, x in state.obs.items()}
@@ -163,7 +148,7 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
 
     train.run(Local(seconds=0.4), tmp_path / "local", log=list, **QUIET)
     forget_tasks(monkeypatch)
-    with pytest.raises(ConfigError, match="expected a task that you have named"):
+    with pytest.raises(ConfigError, match="task that you have named"):
         load_policy(tmp_path / "local")[1].make_env(1)
 
 
@@ -210,7 +195,6 @@ def test_a_script_trains_its_own_class(file, tmp_path):
 
 def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
     """A ring of marks around the middle of the picture, which one mark per drone would not fill."""
-    from crazysim.train.show import film
 
     class Ringed(Low):
         """Low, in a ring."""
@@ -228,8 +212,6 @@ def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
 
 
 def test_a_film_stands_still_where_an_episode_has_ended_and_says_so(monkeypatch):
-    from crazysim.train.show import film
-
     heights, texts = [], []
 
     class Frames:
@@ -262,12 +244,31 @@ def test_a_film_stands_still_where_an_episode_has_ended_and_says_so(monkeypatch)
     assert len(set(heights[:-n_crashed])) == len(heights) - n_crashed > 5
 
 
-@pytest.mark.parametrize("camera", [None, {"elevation": -30}, {"lookat": (0, 0, 1), "distance": 2.0}])
-def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distance(
-    tmp_path, monkeypatch, opengl, camera
-):
-    from crazysim.train.show import film
+class StoppedError(Exception):
+    """Raised instead of filming."""
 
+
+@pytest.fixture
+def view_of_film(monkeypatch, opengl):
+    """Return a function that returns the view with which a film of an environment begins."""
+    views = []
+
+    def open_film(path, view, **_):
+        views.append(view)
+        raise StoppedError
+
+    monkeypatch.setattr("crazysim.train.show.Film", open_film)
+
+    def begin_film(env, worlds):
+        with pytest.raises(StoppedError):
+            film(env, lambda obs: jnp.zeros((env.sim.n_worlds, 1, 4)), "film.gif", worlds=worlds)
+        return views[-1]
+
+    return begin_film
+
+
+@pytest.mark.parametrize("camera", [None, {"elevation": -30}, {"lookat": (0, 0, 1), "distance": 2.0}])
+def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distance(view_of_film, camera):
     class Wide(Low):
         """Low, with a target far away."""
 
@@ -280,17 +281,8 @@ def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distanc
         def camera(self, n_drones):
             return camera
 
-    views = []
-
-    def open_film(path, view, **_):
-        views.append(view)
-        raise NotImplementedError
-
-    monkeypatch.setattr("crazysim.train.show.Film", open_film)
     env = envs.make(Wide(seconds=0.04))
-    with pytest.raises(NotImplementedError):
-        film(env, lambda obs: jnp.zeros((1, 1, 4)), tmp_path / "wide.gif", worlds=1)
-    view = views[0]
+    view = view_of_film(env, 1)
     assert view.cam_config == (camera or {"elevation": -20})
     if camera and "distance" in camera:
         assert view.hold is None
@@ -298,24 +290,16 @@ def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distanc
         np.testing.assert_array_equal(view.hold(env.sim, 0), [[-3.0, -3.0, 1.0], [0.0, 4.0, 0.0], [0.0, 5.0, 0.0]])
 
 
-def test_the_worlds_of_a_film_are_wider_than_high(tmp_path, monkeypatch, opengl):
-    from crazysim.train.show import film
-
-    sizes = []
-
-    class StoppedError(Exception):
-        """Raised instead of filming."""
-
-    def open_film(path, view, **_):
-        sizes.append(view.tile_size)
-        raise StoppedError
-
-    monkeypatch.setattr("crazysim.train.show.Film", open_film)
+def test_the_worlds_of_a_film_are_wider_than_high(view_of_film):
     env = envs.make(Low(seconds=0.04), n_worlds=6)
-    for worlds in (1, 2, 3, 4, 5, 6):
-        with pytest.raises(StoppedError):
-            film(env, lambda obs: jnp.zeros((6, 1, 4)), tmp_path / "low.gif", worlds=worlds)
-    assert all(1.3 < width / height < 1.4 for width, height in sizes)
+    for worlds in range(1, 7):
+        width, height = view_of_film(env, worlds).tile_size
+        assert 1.3 < width / height < 1.4
+
+
+@pytest.mark.parametrize("options", [{}, {"depth_image": (5, 4)}])
+def test_a_film_has_maps_from_above_if_policies_observe_images(view_of_film, options):
+    assert view_of_film(envs.make("hover", engine="interpret", **options), 1).top_view == bool(options)
 
 
 def test_an_installed_package_lists_its_tasks(monkeypatch):
@@ -333,32 +317,23 @@ def test_an_installed_package_lists_its_tasks(monkeypatch):
     assert TASKS["of_a_package"].id in gymnasium.registry
 
 
-def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
+def test_law_09_wrong_places_names_and_settings_are_errors(file, tmp_path):
     text_file = tmp_path / "task.txt"
     text_file.touch()
-    for reference, message in (
-        (f"{tmp_path / 'no.py'}:High", "expected a file with a task, got .*no.py': No such file"),
-        (f"{file}:Hihg", "expected the name of a task in .*, got 'Hihg'; it defines High"),
-        (f"{file}:Hover2", "it defines High"),
-        (f"{text_file}:High", "expected the file of a task to end with .py, got .*task.txt'. Rename it"),
-        ("no_such_module:High", "expected a module with a task, got 'no_such_module'"),
-        (Hover, r"expected the name of a task or a task, got <class.*Task\(\)"),
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name")
+    for call, message in (
+        (lambda: envs.make(f"{tmp_path / 'no.py'}:High"), "a file with a task, got .*no.py': No such file"),
+        (lambda: envs.make(f"{file}:Hihg"), "got 'Hihg'; it defines High"),
+        (lambda: envs.make(f"{text_file}:High"), "end with .py, got .*task.txt'. Rename it"),
+        (lambda: envs.make("no_such_module:High"), "a module with a task, got 'no_such_module'"),
+        (lambda: envs.make(Hover), r"a task, got <class.*Task\(\)"),
+        *((lambda n=n: envs.register(n, Low), "lower case letters") for n in ("hover", "Two Hoops", "a:b", 3)),
+        (lambda: envs.register("low", int), "a subclass of Task, got <class 'int'>"),
+        (lambda: train.run("hover", tmp_path / "x", options={"pos": jnp.zeros(3)}), "options that a checkpoint can"),
+        (lambda: train.run("hover", tmp_path / "x", iterations=1), r"got iterations\. .* belong in config="),
     ):
         with pytest.raises(ConfigError, match=message):
-            envs.make(reference)
-    for name in ("hover", "Two Hoops", "a:b", 3):
-        with pytest.raises(ConfigError, match="expected a name of lower case letters"):
-            envs.register(name, Low)
-    with pytest.raises(ConfigError, match="expected a subclass of Task, got <class 'int'>"):
-        envs.register("low", int)
-    (tmp_path / "broken.py").write_text("import nothing_of_this_name")
+            call()
     with pytest.raises(ModuleNotFoundError, match="nothing_of_this_name"):
         envs.make(f"{tmp_path / 'broken.py'}:Any")
-    with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
-        train.run("hover", tmp_path / "x", options={"pos": jnp.zeros(3)})
-
-
-def test_a_hyperparameter_among_the_settings_is_an_error_that_says_where_it_belongs(tmp_path):
-    with pytest.raises(ConfigError, match=r"settings among .*, got iterations\. Hyperparameters belong in config="):
-        train.run("hover", tmp_path / "run", iterations=1)
-    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "x").exists()

@@ -248,7 +248,7 @@ def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, 
     with pytest.raises(ConfigError, match=r"from 24 numbers .*wind 3.* got one from 21 to 4"):
         write(policy, path, more)
     broken = [(w, b.at[0].set(jnp.nan)) for w, b in policy.layers]
-    with pytest.raises(ConfigError, match="expected finite weights, got NaN or infinity"):
+    with pytest.raises(ConfigError, match="finite weights, got NaN or infinity"):
         write(policy.replace(layers=broken), path, meta)
     assert not path.exists()
 
@@ -257,14 +257,14 @@ def test_a_custom_network_with_the_weights_of_a_gru_is_an_error(tmp_path, policy
     """Its outputs are not those of the built-in network, although its weights have the same type."""
     policy_with_memory = with_memory(policy, 3)
     network = Network(policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
-    with pytest.raises(ConfigError, match="expected a policy with the built-in network, got one with a custom"):
+    with pytest.raises(ConfigError, match="policy with the built-in network, got one with a custom"):
         to_c(policy_with_memory.replace(network=network), tmp_path / "policy.h", meta)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["", "2fast", "fly away", "a-b", "é"])
 def test_an_invalid_c_name_is_refused(tmp_path, policy, meta, name):
-    with pytest.raises(ConfigError, match="expected the name of a C function"):
+    with pytest.raises(ConfigError, match="name of a C function"):
         to_c(policy, tmp_path / "policy.h", meta, name)
 
 

@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from crazysim import ConfigError
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import make
 
@@ -106,9 +105,3 @@ def test_the_roof_is_the_top_of_the_car(env, start_state, roof_motion):
     data = start_state.data
     height = (np.asarray(roof_motion(data)[0]) - data.plugins["cars"].pos)[..., 2]
     np.testing.assert_allclose(height, top.pos[2] + top.shape.size[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("speed", [-1, 4.0, "x"])
-def test_a_speed_out_of_range_is_an_error(speed):
-    with pytest.raises(ConfigError, match=r"expected speed of Chase (to be from 0 to 3|as a number), got"):
-        make("chase", 1, speed=speed)

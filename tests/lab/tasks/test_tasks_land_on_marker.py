@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim, rotation
+from crazysim import rotation
 from crazysim.envs import PrivilegedObservation, make
-from crazysim.lab.tasks.target_camera import TargetCamera
 
 CONTACT_HEIGHT = 0.066
 """Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
@@ -101,16 +100,3 @@ def test_only_the_critic_observes_the_position_of_the_marker(env, state_before):
     hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
     assert privileged.shape[-1] - hover.shape[-1] == 6
     assert env.image_formats()["segmentation"]["unit"] == "1"
-
-
-@pytest.mark.parametrize("options", [{"radius": 0.7}, {"speed": -1.0}])
-def test_law_09_wrong_settings_are_refused(options):
-    with pytest.raises(ConfigError, match=r"expected (radius|speed) of LandOnMarker"):
-        make("land_on_marker", 1, **options)
-
-
-def test_law_09_a_camera_without_targets_is_refused():
-    with pytest.raises(
-        ConfigError, match=r"expected target of 'camera' as the name of objects.*without an object 'pad:0'"
-    ):
-        TargetCamera(target="pad").image_fn(Sim())

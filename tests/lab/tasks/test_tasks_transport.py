@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import Sim
 from crazysim.engine.pytree import PyTree
 from crazysim.engine.stage import vmap_worlds
-from crazysim.envs import DroneEnv, make
+from crazysim.envs import DroneEnv
 from crazysim.lab.tasks.transport import Transport, gate_axis, is_behind
 from crazysim.train.evaluation import evaluate
 
@@ -188,20 +188,3 @@ def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_t
     assert metrics["crashed"] < 0.05
     assert metrics["error"] < 0.1
     assert idle["success"] == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"opening": 0.5},
-            r"expected opening from 0.55 m \(length of rod or cable \+ 0.25 m\) to 1.6 m, got 0.5",
-        ),
-        ({"length": 1.0}, "expected opening from 1.25 m"),
-        ({"swing": -0.1}, "swing of Transport to be from 0 to 1, got -0.1"),
-        ({"mass": -1.0}, "mass"),
-    ],
-)
-def test_wrong_openings_lengths_and_masses_are_errors(options, message):
-    with pytest.raises(ConfigError, match=message):
-        make("transport", 1, **options)
