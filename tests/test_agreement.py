@@ -1,4 +1,4 @@
-"""All stages of a step: every engine computes the same as ``plain``.
+"""All stages of a step: every engine computes the same as ``plain``, and worlds do not depend on each other.
 
 ``tests/envs/test_env_step.py`` has the sweep over environments.
 """
@@ -18,21 +18,33 @@ from crazysim import Plugin, plugins
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.engine import Step
 from crazysim.engine.backends import kernel
+from crazysim.engine.pytree import scopes
 from crazysim.plugins.sensors.image_sensor import ImageSensor
 
 ENGINES = ("interpret", *COMPILED_ENGINES)
 N_STEPS = 20
 """Number of steps of each simulation; all sensors and controllers have ticks within them."""
-LONG_ON_LANES = ("sensors", "load", "bodies", "controllers", "complementary", "impact")
+FEWER = 3
+"""Number of worlds of the engines; ``plain`` has more."""
+LONG_ON_LANES = ("sensors", "load", "bodies", "controllers", "complementary", "impact", "effects", "collisions")
 """Simulations that take XLA more than 5 s to compile for ``lanes``."""
 NOT_ON_LANES = ("kalman", "eskf", "terrain")
 """Simulations that take XLA more than 30 s to compile for ``lanes``."""
+OTHER_WORLDS = ("stages of all scopes",)
+"""Simulations whose worlds depend on each other."""
+ONE_SIZE = ("randomize", "fleet", "populations", "populations of equal sizes", "many members", *OTHER_WORLDS)
+"""Simulations with a fixed number of worlds."""
 
 
 @pytest.mark.long("compiles every stage of the package for every engine")
 @pytest.mark.parametrize("name", sweep.CASES)
 def test_every_engine_agrees_with_plain(name):
-    compare(name, [engine for engine in ENGINES if engine != "lanes" or name not in LONG_ON_LANES + NOT_ON_LANES])
+    """Law 10 too: engines have fewer worlds, which draw the same numbers."""
+    engines = [engine for engine in ENGINES if engine != "lanes" or name not in LONG_ON_LANES + NOT_ON_LANES]
+    sim, step = compare(name, engines)
+    assert (step.plan(sim.data).program.unfused_stages == ()) == (name not in sweep.SPLIT_CASES)
+    if name not in OTHER_WORLDS:
+        assert_bad_worlds_change_no_other(sim, step)
 
 
 @pytest.mark.slow("XLA compiles a minute in all; lanes of the other simulations have the same operations")
@@ -53,14 +65,38 @@ def test_counters_and_indices_have_a_kernel_in_float64(name, x64):
 
 
 def compare(name, engines):
-    """Compare a flight on some engines with the flight on the reference."""
+    """Compare a flight on some engines with the flight on the reference; return simulation and step of the last."""
     sim = sweep.CASES[name]()
     expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(N_STEPS))
+    if name not in ONE_SIZE:
+        sim = sweep.CASES[name](n_worlds=FEWER)
+    expected = select_worlds(expected, np.arange(sim.n_worlds))
     for engine in engines:
         step = Step(sim.step_pipeline, engine)
         assert step.plan(sim.data).engine == engine
         result = step(sim.data, jnp.int32(N_STEPS))
-        sweep.assert_agree(result, expected, sweep.TOLERANCES.get(name, sweep.ROUNDING), engine)
+        actual = select_worlds(result, np.arange(sim.n_worlds))
+        sweep.assert_agree(actual, expected, sweep.TOLERANCES.get(name, sweep.ROUNDING), engine)
+    return sim, step
+
+
+def select_worlds(data, worlds):
+    """Return the numbers of some worlds, by their place in the data."""
+    leaves = zip(jax.tree.leaves_with_path(data), jax.tree.leaves(scopes(data)), strict=True)
+    return {jax.tree_util.keystr(path): x[worlds] for (path, x), scope in leaves if scope not in ("shared", "opaque")}
+
+
+def assert_bad_worlds_change_no_other(sim, step):
+    """Law 7: NaN in the velocities of world 1 flags this world, and changes no bit of another one."""
+    good, states = step(sim.data, jnp.int32(N_STEPS)), sim.data.states
+    is_bad = np.arange(sim.n_worlds)[:, None, None] == 1
+    bad_states = states.replace(vel=jax.device_put(np.where(is_bad, np.nan, states.vel).astype(np.float32)))
+    bad = step(sim.data.replace(states=bad_states), jnp.int32(N_STEPS))
+    others = np.flatnonzero(np.arange(sim.n_worlds) != 1)
+    assert not good.core.nonfinite.any()
+    np.testing.assert_array_equal(np.flatnonzero(bad.core.nonfinite), [1])
+    for name, x in select_worlds(bad, others).items():
+        np.testing.assert_array_equal(x, select_worlds(good, others)[name], err_msg=name)
 
 
 def test_every_plugin_and_controller_is_in_the_sweep():

@@ -1,7 +1,5 @@
 """Following trajectories in the step: setpoints at ticks, starts, rates, uploads, resets, overlays."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,30 +162,6 @@ def test_resets_restore_slots_starts_and_indices():
         np.testing.assert_array_equal(a, b)
 
 
-def test_starts_and_rates_can_be_changed():
-    sim = build()
-    plugin = sim.add(Follow([EIGHT, UP], start=START))
-    plugin.assign(sim, start=2.0, rate=RATE)
-    record = sim.data.plugins["follow"]
-    start, rate, index = (np.asarray(x)[..., 0] for x in (record.start, record.rate, record.index))
-    np.testing.assert_allclose(start, np.full((3, 2), 2.0))
-    np.testing.assert_allclose(rate, RATE)
-    np.testing.assert_array_equal(index, [[0, 1]] * 3)
-    with pytest.raises(ConfigError, match="index"):
-        plugin.assign(sim, index=2)
-
-
-def test_settings_change_without_compiling():
-    sim = build(engine="interpret")
-    plugin = sim.add(Follow([EIGHT, UP], start=START, rate=1.0))
-    sim.step(5)
-    plan = sim.step_fn.plan(sim.data)
-    sim.replace(dataclasses.replace(plugin, start=START + 1, rate=2.0))
-    sim.step(5)
-    assert sim.step_fn.plan(sim.data) is plan
-    np.testing.assert_allclose(np.asarray(sim.data.plugins["follow"].start)[..., 0], START + 1)
-
-
 def test_trajectories_have_gradients_through_the_step():
     sim = build(n_worlds=1, n_drones=1, controller="pid")  # whose derivative compiles sooner than the default's
     plugin = sim.add(Follow(UP))
@@ -212,38 +186,3 @@ def test_the_path_ahead_and_the_setpoints_are_drawn(flight):
     sim.plugins.draw(0)
     assert len(overlays) == 2 + 40 + 40
     overlays.clear()
-
-
-@pytest.mark.parametrize(
-    "settings, message",
-    [
-        ({"index": 2}, "index"),
-        ({"index": -1}, "index"),
-        ({"start": np.nan}, "start"),
-        ({"rate": 0.0}, "rate"),
-        ({"rate": np.ones((2, 2))}, "rate"),
-        ({"n_slots": 1}, "n_slots"),
-        ({"n_slots": 2.5}, "n_slots"),
-        ({"max_pieces": 3}, "max_pieces"),
-    ],
-)
-def test_wrong_settings_are_errors(settings, message):
-    with pytest.raises(ConfigError, match=message):
-        build().add(Follow([EIGHT, UP], **settings))
-
-
-def test_wrong_levels_trajectories_and_uploads_are_errors():
-    with pytest.raises(ConfigError, match="control='state'"):
-        Sim(control="attitude").add(Follow(EIGHT))
-    with pytest.raises(ConfigError, match="at least one"):
-        build().add(Follow([]))
-    with pytest.raises(ConfigError, match="at least one trajectory, each of one vehicle, got 3"):
-        build().add(Follow(3))
-    with pytest.raises(ConfigError, match="at least one"):
-        build().add(Follow([Trajectory.stack([EIGHT, UP])]))
-    sim = build()
-    plugin = sim.add(Follow([UP, UP]))
-    with pytest.raises(ConfigError, match="slot from 0 to 1"):
-        plugin.upload(sim, 2, UP)
-    with pytest.raises(ConfigError, match="at most 1 pieces"):
-        plugin.upload(sim, 0, EIGHT)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from cases import with_states
 
-from crazysim import ConfigError, Radar, Sim
+from crazysim import Radar, Sim
 from crazysim.lab.plugins.radar import lobe_curves, lobe_margin
 
 LOBES = [(10.0, 1.3, 1.0, 0.0), (6.0, 2.5, 0.6, 0.3), (8.0, 0.0, 1.0, 0.0), (8.0, 2.0, 0.7, -0.2)]
@@ -72,17 +72,3 @@ def test_the_lobe_is_drawn_in_red_where_it_detects():
         overlays.clear()
     sim.add(Radar((0, 0, 4.0)), name="hidden").draw(sim, 0)
     assert len(sim.scene.renderer.overlays) == 0
-
-
-@pytest.mark.parametrize("kwargs, message", [
-    ({"pos": (0, 0)}, "expected pos"),
-    ({"pos": np.zeros((0, 3))}, "expected pos"),
-    ({"pos": (0, 0, np.nan)}, "expected pos"),
-    ({"pos": (0, 0, 0), "max_range": -1.0}, "max_range of Radar to be positive"),
-    ({"pos": (0, 0, 0), "max_range": (1.0, 2.0)}, "max_range as one number, or one per radar"),
-    ({"pos": (0, 0, 0), "exponent": -1.0}, "exponent"),
-    ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt of Radar to be from -1.5708 to 1.5708"),
-])  # fmt: skip
-def test_law_09_wrong_settings(kwargs, message):
-    with pytest.raises(ConfigError, match=message):
-        Sim().add(Radar(**kwargs))

@@ -261,14 +261,3 @@ def test_law_09_wrong_settings():
     fitted = Sim(dynamics="so_rpy")
     with pytest.raises(ConfigError, match="acts on single rotors"):
         fitted.add(RotorJet())
-
-
-def test_the_load_of_a_jet_is_removed_after_the_jet():
-    sim, plugin = build()
-    with pytest.raises(ConfigError, match=r"Use sim.remove\('rotor_jet'\) first"):
-        sim.remove("load")
-    sim.step()
-    assert np.asarray(plugin.read(sim.data).force).any()
-    sim.remove("rotor_jet")
-    sim.remove("load")
-    sim.step()

@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 
 from crazysim.lab.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
 from crazysim.plugins.vehicles import CarState, single_track
@@ -70,17 +69,7 @@ def test_derivatives_are_those_of_the_gym():
         np.testing.assert_allclose(np.concatenate(rate, axis=-1), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_batch_has_the_derivatives_of_single_states():
-    x, u, _ = (np.array(column, float) for column in zip(*GYM, strict=True))
-    params = CommonRoadParams.create()
-    batch = [np.asarray(a) for a in gym_rates(state_of(x), np.float32(u), params)]
-    for i in range(len(x)):
-        for a, b in zip(batch, gym_rates(state_of(x[i]), np.float32(u[i]), params), strict=True):
-            np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)  # XLA rounds a batch in another order
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_single_track_tends_to_the_gym_at_small_angles(seed):
+def test_single_track_tends_to_the_gym_at_small_angles():
     """The models agree to first order in slip, steering angle and yaw rate: the difference is of order three."""
     with jax.enable_x64(True):
         gym = jax.tree.map(np.asarray, CommonRoadParams.create())
@@ -93,7 +82,7 @@ def test_single_track_tends_to_the_gym_at_small_angles(seed):
             steer_max=np.ones(1), steer_rate_max=np.ones(1), steer_bandwidth=np.ones(1), slip_speed=np.zeros(1),
             trailer=None,
         )  # fmt: skip
-        slip, steer, yaw_rate = np.random.default_rng(seed).uniform(-1, 1, 3)
+        slip, steer, yaw_rate = np.random.default_rng(0).uniform(-1, 1, 3)
         speed, sizes, errors = 4.0, 0.1 * 0.5 ** np.arange(4), []
         for size in sizes:
             b, d, w = (np.array([size * x]) for x in (slip, steer, 4 * yaw_rate))

@@ -11,7 +11,6 @@ from cases import build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactResponse, FreeBodies, Sim, Terrain
-from crazysim.engine.stage import stage
 
 FREQ = 500
 
@@ -194,15 +193,6 @@ def test_a_stack_that_falls_on_its_corner_comes_to_rest():
     assert np.abs(body.ang_vel).max() < 2e-2
 
 
-def test_the_height_of_a_bounce_follows_from_the_restitution():
-    """From 0.5 m with restitution 0.7 it rises to 0.49 of that height, up to 5 % for the fall in one step."""
-    sim, plugin = build(1, 0.05, 0.2, pos=(1, 0, 0.55), restitution=0.7)
-    pos, _ = track(sim, plugin, 1.2, steps_per_pose=1)
-    z = pos[:, 0, 2] - 0.05
-    first = int(np.argmax(z < 2e-2))
-    np.testing.assert_allclose(z[first + 20 :].max(), 0.49 * 0.5, rtol=0.05)
-
-
 def test_bounces_as_in_mujoco():
     """Times and heights of the first three bounces from 0.5 m with restitution 0.7.
 
@@ -324,32 +314,6 @@ def test_a_box_and_a_drone_ride_on_a_moving_platform_as_in_mujoco():
         np.testing.assert_allclose(pos[-1, :, 1:], pos[0, :, 1:], atol=1e-5)
 
 
-def test_drones_and_bodies_push_each_other():
-    """A drone flies along x into a ball in the air and passes momentum on to it."""
-    sim, plugin = build(1, 0.1, 0.02, pos=(0.3, 0, 5.0), drone_pos=(0.0, 0.0, 5.0))
-    sim.data = with_states(sim.data, vel=[2.0, 0, 0])
-    mass = float(np.ravel(sim.data.params.mass)[0])
-    sim.step(75)
-    ball, drone = (np.asarray(x.vel)[0, 0, 0] for x in (plugin.read(sim.data), sim.data.states))
-    assert ball > 1.0
-    assert drone < 1.9
-    np.testing.assert_allclose(0.02 * ball + mass * drone, 2 * mass, rtol=0.08)  # less the drone's drag over 0.15 s
-
-
-def test_an_object_moved_by_the_user_pushes_a_body():
-    sim = Sim(control="rotor_vel", engine="plain")
-    pusher = sim.scene.add("box", "pusher", size=(0.2, 0.2, 0.2), pos=(0, 0, 0.1))
-    plugin = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), pos=(0.25, 0, 0.1), drones=False))
-    leave_out_drones(sim)
-    for k in range(100):
-        sim.data = pusher.set_pose(sim.data, [0.002 * (k + 1), 0, 0.1], vel=[0.2, 0, 0])
-        sim.step(5)
-    body = plugin.read(sim.data)
-    np.testing.assert_allclose(np.asarray(body.pos)[0, 0], [0.4, 0, 0.1], atol=3e-3)
-    # between two poses of the object friction may brake for five steps
-    np.testing.assert_allclose(np.asarray(body.vel)[0, 0, 0], 0.2, atol=5 * 0.6 * 9.81 / FREQ)
-
-
 @pytest.mark.long("compiles contacts of a scene of its own")
 def test_objects_of_any_kind_carry_bodies():
     sim = Sim(control="rotor_vel", engine="plain")
@@ -394,31 +358,6 @@ def test_law_10_and_05_resets_and_the_scene():
     sim.data = with_states(sim.data, pos=fallen[1, 0])
     index = report.object_names.index("bodies:0")
     assert np.asarray(sim.contact_report().objects)[1, 0, index]
-
-
-def test_law_01_worlds_do_not_see_each_other():
-    """Two boxes of the first world collide or are far from each other: the second world moves the same way."""
-    near, far = [[1, 0, 0.1], [1.05, 0, 0.35]], [[1, 0, 0.1], [4, 0, 0.5]]
-    sim, plugin = build(2, pos=np.array([near, far]), n_worlds=2)
-    start, ends = sim.data, []
-    for first in (near, far):
-        pos = np.asarray([first, far], np.float32)
-        sim.data = plugin.write(start, plugin.read(start).replace(pos=jnp.asarray(pos)))
-        sim.step(200)
-        ends.append(np.asarray(plugin.read(sim.data).pos))
-    assert np.abs(ends[0][0] - ends[1][0]).max() > 0.1
-    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-6)
-    np.testing.assert_allclose(ends[1][0], ends[1][1], atol=1e-6)
-
-
-def test_law_07_nonfinite_values_stay_in_their_world():
-    sim, plugin = build(2, pos=[[1, 0, 0.5], [2, 0, 0.5]], n_worlds=2, drones=True)
-    record = plugin.read(sim.data)
-    pos = np.array(record.pos)
-    pos[0, 0, 0] = np.nan
-    sim.data = plugin.write(sim.data, record.replace(pos=jnp.asarray(pos)))
-    sim.step(50)
-    assert np.isfinite(np.asarray(plugin.read(sim.data).pos)[1]).all()
 
 
 @pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
@@ -471,53 +410,6 @@ def test_law_08_gradients_equal_central_differences(x64):
     assert 0.05 < float(central) < 0.13
 
 
-def test_a_stage_of_the_user_pushes_the_bodies():
-    sim, plugin = build(2, pos=[[1, 0, 0.5], [2, 0, 0.5]], drone_pos=(-3.0, 0.0, 1.0), drones=False)
-
-    @stage("bodies")
-    def lift(data):
-        body = plugin.read(data)
-        return plugin.write(data, body.replace(force=jnp.asarray([0.0, 0.0, 9.81]) * body.mass))
-
-    sim.step_pipeline = {"lift": lift, **sim.step_pipeline}
-    sim.build_step_fn()
-    sim.step(100)
-    np.testing.assert_allclose(np.asarray(plugin.read(sim.data).pos)[0, :, 2], 0.5, atol=1e-4)
-
-
-@pytest.mark.parametrize("args, kwargs, message", [
-    ((0,), {}, "expected members"),
-    ((2,), {"size": [0.1]}, "a list of 2"),
-    ((1,), {"size": (0.1, 0.2)}, "expected size"),
-    ((1,), {"size": -0.1}, "expected size"),
-    ((1,), {"mass": 0.0}, "mass of FreeBodies to be from 1e-06 to 1e.06, got 0.0"),
-    ((1,), {"mass": "a"}, "expected mass of FreeBodies as a number"),
-    ((1,), {"size": "big"}, "expected size as a number"),
-    ((1,), {"rgba": "red"}, "expected rgba of FreeBodies as a number or array, got 'red'"),
-    ((1,), {"iterations": 0}, "iterations of FreeBodies to be from 1 to 1000, got 0"),
-    ((1,), {"softness": np.nan}, "softness"),
-    ((10**7,), {}, "at most 100000 members of FreeBodies"),
-    ((2000,), {}, "at most 1000 bodies"),
-    ((400,), {}, "at most 250000 contact points in a world, got [0-9]* of 400 bodies"),
-    ((1,), {"friction": -1.0}, "expected friction"),
-    ((1,), {"restitution": 1.5}, "expected restitution"),
-    ((1,), {"quat": (0, 0, 0, 0)}, "expected quat"),
-    ((1,), {"pos": (0, np.nan, 0)}, "expected pos of FreeBodies to be finite"),
-    ((2,), {"pos": np.zeros((3, 3))}, "expected pos"),
-    ((3,), {"vel": np.zeros((2, 3))}, "expected vel with 1 dimensions"),
-    ((3,), {"mass": [0.1, 0.2]}, "expected mass with 1 dimensions"),
-    ((1,), {"softness": 0.001}, "softness"),
-    ((1,), {"objects": "nothing"}, "nothing"),
-])  # fmt: skip
-def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, message):
-    sim = Sim()
-    with pytest.raises(ConfigError, match=message):
-        sim.add(FreeBodies(*args, **kwargs))
-    assert sim.data.plugins == {}
-    assert sim.data.objects is None
-    assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy"]
-
-
 def test_law_09_bodies_that_stayed_in_the_scene_are_used_again_only_in_the_same_number():
     sim, _ = build(2)
     with pytest.raises(ConfigError, match="expected 2 objects 'bodies', which are in the scene already, got 3"):
@@ -527,9 +419,3 @@ def test_law_09_bodies_that_stayed_in_the_scene_are_used_again_only_in_the_same_
         sim.add(FreeBodies(3))
     sim.add(FreeBodies(2))
     assert sim.data.objects.names == ("bodies:0", "bodies:1")
-
-
-def test_law_09_a_second_plugin_of_free_bodies_is_an_error():
-    sim, _ = build(1)
-    with pytest.raises(ConfigError, match="expected one FreeBodies"):
-        sim.add(FreeBodies(["Ball_0"], name="more"))

@@ -13,6 +13,8 @@ from crazysim.engine import Step
 
 RADIUS = 0.03
 LENGTH = 0.4
+BOX = (0.06, 0.08, 0.05)
+"""Lengths of loads that hit from all sides, m."""
 
 
 def build(n_worlds=1, n_drones=1, height=3.0, **kwargs):
@@ -95,16 +97,6 @@ def test_a_swing_ends_at_an_obstacle_with_the_restitution():
     assert (x[-1, restitution == 0.5] < -0.02).all()
 
 
-def test_without_a_response_a_load_swings_through_a_wall():
-    sim = build()
-    fix_drones(sim)
-    load = sim.add(SlungLoad(mass=0.1, length=LENGTH, size=RADIUS))
-    sim.scene.add("wall", pos=[0.05 + RADIUS, 0, 0], thickness=0.1, height=2.7)
-    sim.data = with_load(load, sim.data, vel=[1.5, 0, 0])
-    sim.step(60)
-    assert load_motion(load, sim)[0][0, 0] > 0.1
-
-
 def test_a_released_load_slides_on_a_box_until_friction_stops_it():
     """The load slides by v^2 / (2 mu g)."""
     sim = build()
@@ -149,12 +141,11 @@ def energy(load, data, mass):
     return 0.5 * (translational.sum((1, 2)) + rotational)
 
 
-@pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
+def test_law_08_a_load_that_hits_a_drone_keeps_momentum(x64, rng):
     """Released loads hit two drones from all sides. The contact stage by itself keeps momentum and adds no energy."""
     n = 60
     sim = remove_gravity(build(n, 2))
-    load = sim.add(SlungLoad(mass=0.2, size=size))
+    load = sim.add(SlungLoad(mass=0.2, size=BOX))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
     step = Step({"hit": sim.step_pipeline["contact_response_of_load_and_drones"]}, "interpret")
     quat = rng.normal(size=(n, 2, 4))
@@ -201,13 +192,12 @@ def test_two_loads_head_on(x64):
     np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
 
 
-@pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng):
+def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(x64, rng):
     """Three released loads and three empty hooks overlap. The contact stage keeps momentum and adds no energy."""
     n = 60
     sim = remove_gravity(build(n, 3))
     load_mass = np.broadcast_to([0.1, 0.2, 0.3], (n, 3))
-    hook = sim.add(Hook(mass=load_mass, hook_mass=0.05, size=size, ring=0.1, load_at=[0, 0, 1.0]))
+    hook = sim.add(Hook(mass=load_mass, hook_mass=0.05, size=BOX, ring=0.1, load_at=[0, 0, 1.0]))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
     step = Step({"hit": sim.step_pipeline["contact_response_between_load"]}, "interpret")
     mass = np.array([0.1, 0.2, 0.3, 0.05, 0.05, 0.05])[:, None]
@@ -375,14 +365,3 @@ def test_the_bounce_has_gradients(x64):
     assert now > 0.1
     for x in jax.tree.leaves(gradient):
         assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
-
-
-def test_removing_the_load_leaves_the_response():
-    sim = build(height=1.0, engine="interpret")
-    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
-    sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
-    sim.add(ContactResponse())
-    sim.add(ContactLog())
-    sim.remove(load)
-    sim.step(10)
-    assert np.isfinite(sim.data.states.pos).all()

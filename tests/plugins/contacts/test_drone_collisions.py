@@ -5,7 +5,7 @@ import pytest
 from cases import with_params, with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError, DroneCollisions, Sim
+from crazysim import DroneCollisions, Sim
 
 
 def build(n_worlds=2, n_drones=2, engine="auto", **kwargs):
@@ -53,14 +53,13 @@ def test_an_overlap_is_removed_without_a_velocity():
     np.testing.assert_allclose(np.diff(np.asarray(states.vel)[0], axis=0), 0, atol=1e-4)
 
 
-@pytest.mark.parametrize("iterations", [10, 100])
-def test_law_08_impacts_of_any_attitude_add_no_energy(iterations, rng):
+def test_law_08_impacts_of_any_attitude_add_no_energy(rng):
     """Rotating drones with restitution 1 and friction.
 
     Energies are measured in the frame of the mean velocity, which only gravity changes.
     """
     n_worlds, n_drones = 64, 3
-    sim, _ = build(n_worlds, n_drones, restitution=1.0, iterations=iterations)
+    sim, _ = build(n_worlds, n_drones, restitution=1.0)
     start = np.array([[0.2 * i, 0.0, 20.0] for i in range(n_drones)])
     vel = 0.3 * rng.normal(size=(n_worlds, n_drones, 3)) - 2 * np.arange(n_drones)[:, None] * [1, 0, 0]
     sim.data = with_states(
@@ -84,32 +83,3 @@ def test_law_08_impacts_of_any_attitude_add_no_energy(iterations, rng):
     changes = np.array(energies) / energies[0] - 1
     assert changes.max() < 0.02, "the integration of fast spins adds this much"
     assert changes[-1].min() < -0.3, "they collide, with friction"
-
-
-def test_resets_clear_the_impulses():
-    sim, plugin = build(engine="interpret")
-    sim.data = with_states(
-        sim.data, pos=np.array([[0, 0, 20.0], [0.02, 0, 20.0]]), vel=np.array([[1, 0, 0], [0, 0, 0]])
-    )
-    sim.step(2)
-    assert np.abs(np.asarray(plugin.read(sim.data).impulse)).max() > 0
-    sim.reset()
-    assert not np.asarray(plugin.read(sim.data).normal_impulse).any()
-    assert np.isfinite(np.asarray(sim.data.states.pos)).all()
-
-
-@pytest.mark.parametrize("kwargs, message", [
-    ({"friction": -1.0}, "friction"),
-    ({"restitution": 2.0}, "restitution"),
-    ({"softness": 0.0}, "softness"),
-    ({"softness": np.nan}, "softness"),
-    ({"iterations": 0}, "iterations of DroneCollisions to be from 1 to 1000, got 0"),
-])  # fmt: skip
-def test_law_09_wrong_settings(kwargs, message):
-    with pytest.raises(ConfigError, match=message):
-        build(**kwargs)
-
-
-def test_law_09_one_drone_cannot_collide():
-    with pytest.raises(ConfigError, match="at least two drones"):
-        Sim().add(DroneCollisions())

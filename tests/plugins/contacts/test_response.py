@@ -1,23 +1,22 @@
 """Contact response: resting, sliding, bouncing and landing, against closed forms and C MuJoCo."""
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, ContactResponse, Sim
+from crazysim import ContactResponse, Sim
 from crazysim.engine import Step
-from crazysim.engine.stage import as_stages, stage
+from crazysim.engine.stage import stage
 
 HALF_HEIGHT = 0.02
 """Half the height of the collision box of a cf21B_500, m."""
 GRAVITY = 9.81
 
 
-def build(n_worlds=1, objects=(), engine="auto", integrator="euler", **settings):
+def build(n_worlds=1, objects=(), **settings):
     """Return a simulation of drones in a vacuum with motors off, for which the closed forms hold."""
-    sim = Sim(n_worlds=n_worlds, control="rotor_vel", engine=engine, integrator=integrator)
+    sim = Sim(n_worlds=n_worlds, control="rotor_vel")
     for kind, options in objects:
         sim.scene.add(kind, **options)
     sim.add(ContactResponse(**settings))
@@ -29,16 +28,6 @@ def build(n_worlds=1, objects=(), engine="auto", integrator="euler", **settings)
 
 def set_states(sim, **states):
     sim.data = sim.data.replace(states=sim.data.states.replace(**{k: np.float32(v) for k, v in states.items()}))
-
-
-def track(sim, n, every=1):
-    """Return pos, vel, quat and ang_vel once in ``every`` steps, with the time as their first axis."""
-    states = []
-    for _ in range(n // every):
-        sim.step(every)
-        s = sim.data.states
-        states.append([np.asarray(x, np.float64) for x in (s.pos, s.vel, s.quat, s.ang_vel)])
-    return [np.stack(x) for x in zip(*states, strict=True)]
 
 
 def test_a_drone_on_the_floor_rests():
@@ -81,15 +70,20 @@ def test_friction_stops_a_slide():
     assert np.abs(sim.data.states.vel).max() < 1e-4
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
-def test_the_height_of_a_bounce_follows_from_the_restitution(restitution):
-    sim = build(restitution=restitution)
-    set_states(sim, pos=[[[0, 0, 0.5 + HALF_HEIGHT]]])
-    z = track(sim, 600)[0][:, 0, 0, 2] - HALF_HEIGHT
-    first_contact = int(np.argmax(z < 0.002))
-    apex = z[first_contact + 20 :].max()
+def test_the_height_of_a_bounce_follows_from_the_restitution():
+    restitution = np.array([0.0, 0.5, 0.8])
+    sim = build(3)
+    response = sim.data.plugins["contact_response"].replace(restitution=np.float32(restitution)[:, None, None])
+    sim.data = sim.data.replace(plugins={"contact_response": response})
+    set_states(sim, pos=[[[0, 0, 0.5 + HALF_HEIGHT]]] * 3)
+    heights = []
+    for _ in range(600):
+        sim.step()
+        heights.append(np.asarray(sim.data.states.pos)[:, 0, 2] - HALF_HEIGHT)
+    heights = np.array(heights)
+    apexes = [z[int(np.argmax(z < 0.002)) + 20 :].max() for z in heights.T]
     # Within the 6 mm of the fall in one step: contact acts at the end of the step in which the drone reached the floor.
-    assert apex == pytest.approx(restitution**2 * 0.5, rel=0.03, abs=0.007)
+    np.testing.assert_allclose(apexes, restitution**2 * 0.5, rtol=0.03, atol=0.007)
 
 
 def kinetic_energy(data):
@@ -130,44 +124,15 @@ def test_a_contact_creates_no_energy(rng):
     assert (now - (1 + 1e-4) * before - push).max() < 0
 
 
-@pytest.fixture(scope="module")
-def course_sim():
-    """Return a simulation of 12 drones between a wall and a pole, with an integrator that keeps their energy."""
+@pytest.mark.long("compiles contacts with a box and a cylinder")
+def test_drones_bounce_off_a_wall_and_a_pole():
     course = [("wall", {"pos": [1, 0, 0], "height": 6}), ("pole", {"pos": [-1, 0, 0], "height": 6.0})]
-    return build(12, course, integrator="rk4")
-
-
-def test_tumbling_drones_lose_energy_as_they_bounce(course_sim, rng):
-    """The sum of potential and kinetic energy falls."""
-    sim, n = course_sim, 12
-    sim.reset()
-    sim.replace(ContactResponse(restitution=0.6))
-    quat = rng.normal(size=(n, 1, 4))
-    set_states(
-        sim,
-        pos=rng.uniform([-0.9, -0.3, 0.3], [0.9, 0.3, 1.0], (n, 1, 3)),
-        quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
-        vel=2 * rng.normal(size=(n, 1, 3)),
-    )
-    mass, energy = float(sim.data.params.mass[0]), []
-    for _ in range(200):
-        energy.append(kinetic_energy(sim.data)[:, 0] + mass * GRAVITY * np.asarray(sim.data.states.pos)[:, 0, 2])
-        sim.step(5)
-    energy = np.array(energy)
-    gained = (energy[1:] - np.minimum.accumulate(energy, axis=0)[:-1]).max()
-    assert gained < 0.5 * mass * 0.25**2 + 0.02 * energy.max()
-    assert (energy[-1] < 0.7 * energy[0]).all()
-
-
-def test_drones_bounce_off_a_wall_and_a_pole(course_sim):
-    sim = course_sim
-    sim.reset()
-    sim.replace(ContactResponse(restitution=0.5, friction=0.0))
-    set_states(sim, pos=[[[0.7, 0, 3]], [[-0.7, 0, 3]]] * 6, vel=[[[2, 0, 0]], [[-2, 0, 0]]] * 6)
+    sim = build(2, course, restitution=0.5, friction=0.0)
+    set_states(sim, pos=[[[0.7, 0, 3]], [[-0.7, 0, 3]]], vel=[[[2, 0, 0]], [[-2, 0, 0]]])
     sim.step(200)
-    vel = np.asarray(sim.data.states.vel)[:2, 0, 0]
+    vel = np.asarray(sim.data.states.vel)[:, 0, 0]
     np.testing.assert_allclose(vel, [-1, 1], rtol=0.01)
-    x = np.asarray(sim.data.states.pos)[:2, 0, 0]
+    x = np.asarray(sim.data.states.pos)[:, 0, 0]
     assert x[0] < 1 - 0.025 - 0.07
     assert x[1] > -1 + 0.015 + 0.07
 
@@ -221,28 +186,6 @@ def test_drop_and_slide_as_in_mujoco():
     assert np.abs(sim.data.states.vel).max() < 1e-3
 
 
-def test_the_place_where_a_drone_stops_has_a_gradient():
-    """The derivative of that place by the initial speed equals the difference quotient."""
-    sim = build(friction=0.5)
-    stages = as_stages(sim.step_pipeline)
-    data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[0, 0, HALF_HEIGHT + 0.01]]])))
-
-    def step(data, _):
-        for apply in stages:
-            data = apply(data)
-        return data, None
-
-    def end(speed):
-        thrown = data.replace(states=data.states.replace(vel=jnp.array([[[1.0, 0, 0]]]) * speed))
-        return jax.lax.scan(step, thrown, length=150)[0].states.pos[0, 0, 0]
-
-    end_and_slope = jax.jit(lambda speed: jax.jvp(end, (speed,), (1.0,)))
-    slope = end_and_slope(1.0)[1]
-    difference = (end_and_slope(1.05)[0] - end_and_slope(0.95)[0]) / 0.1
-    assert np.isfinite(slope)
-    assert float(slope) == pytest.approx(float(difference), rel=0.15)
-
-
 def test_the_impulse_is_reported():
     sim = build(2)
     set_states(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
@@ -250,23 +193,3 @@ def test_the_impulse_is_reported():
     weight = float(sim.data.params.mass[0]) * GRAVITY
     impulse = np.asarray(sim.data.plugins["contact_response"].impulse)[0, 0]
     np.testing.assert_allclose(impulse * 500, [0, 0, weight], atol=0.02 * weight)
-
-
-def test_law_09_wrong_settings_are_errors():
-    sim = Sim()
-    for settings, words in (
-        ({"friction": -1}, "expected friction of ContactResponse to be from 0 to 1000, got -1"),
-        ({"friction": np.inf}, "friction of ContactResponse to be from 0 to 1000, got inf"),
-        ({"restitution": 1.5}, "from 0 to 1"),
-        ({"softness": 1e-3}, "softness to be from two steps, 0.004 s, to 10, got 0.001"),
-        ({"softness": np.nan}, "softness of ContactResponse to be positive, at most 10, got nan"),
-        ({"iterations": 0}, "iterations of ContactResponse to be from 1 to 1000, got 0"),
-        ({"iterations": 2.5}, "iterations of ContactResponse as a whole number, got 2.5"),
-        ({"iterations": 10**9}, "iterations of ContactResponse to be from 1 to 1000, got 1000000000"),
-        ({"objects": "tree"}, "got 'tree'"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            sim.add(ContactResponse(**settings))
-    sim.add(ContactResponse())
-    with pytest.raises(ConfigError, match="already"):
-        sim.add(ContactResponse())

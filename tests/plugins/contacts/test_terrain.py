@@ -9,7 +9,7 @@ import pytest
 from cases import with_states
 from pictures import encode_png
 
-from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, RangeFinder, Sim, SlungLoad, Terrain, Wind
+from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, Sim, SlungLoad, Terrain, Wind
 from crazysim.core.integration import FLOOR_HEIGHT, Integrator
 from crazysim.core.pipeline import remove_fn
 from crazysim.plugins.contacts import terrain as terrain_module
@@ -177,15 +177,6 @@ def test_ground_effect_and_wind_use_the_height_above_ground():
     assert abs(vels[0][..., 0]).min() > 1e-3
 
 
-def test_range_finders_measure_terrain():
-    sim, _ = build(n_drones=1)
-    finder = sim.add(RangeFinder([(0, 0, -1.0)]))
-    sim.step()
-    ground = ground_height(sim.data, sim.data.states.pos)
-    height = np.asarray(sim.data.states.pos)[..., 2:] - np.asarray(ground)
-    np.testing.assert_allclose(finder.read(sim.data).distance, height, atol=1e-4)
-
-
 def test_large_tables_of_heights_are_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
     ends = []
     for max_values in (10**6, 1):
@@ -258,29 +249,3 @@ def test_heights_can_be_replaced():
     assert float(np.asarray(sim.contact_report(drones=False).floor_distance).max()) < 0
     sim.remove("terrain")
     assert "clip_floor_pos" in sim.step_pipeline
-
-
-@pytest.mark.parametrize("args, kwargs, message", [
-    ((np.zeros(4), SIZE), {}, "two or more rows and columns"),
-    ((np.full((3, 3), np.nan), SIZE), {}, "finite"),
-    ((np.zeros((3, 3)), (1.0, 1.0, 1.0)), {}, "size as 2 positive lengths"),
-    ((np.zeros((3, 3)), (1.0, -1.0)), {}, "size of Terrain to be positive"),
-    ((np.zeros((3, 3)), SIZE), {"pos": (0, 0)}, r"pos of Terrain of shape \(3,\), got \(2,\)"),
-    ((np.full((3, 3), -0.1), SIZE), {}, "floor=False"),
-    ((np.ones((3, 3)), SIZE), {"name": "floor"}, "expected a new name"),
-])  # fmt: skip
-def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, message):
-    sim = Sim()
-    n_geoms = len(sim.scene.spec.worldbody.geoms)
-    with pytest.raises(ConfigError, match=message):
-        sim.add(Terrain(*args, **kwargs))
-    assert sim.data.plugins == {}
-    assert len(sim.scene.spec.worldbody.geoms) == n_geoms
-    assert "clip_floor_pos" in sim.step_pipeline
-
-
-def test_law_09_terrain_after_contact_response_is_an_error():
-    sim = Sim()
-    sim.add(ContactResponse())
-    with pytest.raises(ConfigError, match="terrain before contact response"):
-        sim.add(Terrain(np.ones((3, 3)), SIZE))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import Battery, ConfigError, Sim, load_airframe
+from crazysim import Battery, ConfigError, Sim
 from crazysim.dynamics import supported_drones
 from crazysim.plugins.effects import battery
 
@@ -134,15 +134,6 @@ def test_drones_of_a_fleet_have_their_own_batteries():
     np.testing.assert_allclose(np.ravel(record(sim).full_speed_voltage[1]), [3.1257, 4 * 3.7], atol=1e-4)
 
 
-def test_law_09_an_airframe_without_a_battery_needs_arguments():
-    tables = {key: load_airframe("cf21B_500").tables[key] for key in ("rigid_body", "rotors", "drag")}
-    sim = Sim(drone=tables, control="rotor_vel")
-    with pytest.raises(ConfigError, match=r"has no value 'battery.capacity'. Add capacity to its table \[battery\]"):
-        sim.add(Battery())
-    sim.add(Battery(0.3, 0.1))
-    np.testing.assert_array_equal(record(sim).n_cells, [1])
-
-
 def test_above_full_speed_voltage_nothing_is_limited():
     strong = build(resistance=1e-3, full_speed_voltage=3.0)
     plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
@@ -181,16 +172,3 @@ def test_law_07_gradients_are_finite_at_any_charge_and_power():
         max_power = np.asarray(battery.open_circuit_voltage(charge, 1)) ** 2 / 2
         for power in (0 * max_power, max_power, 10 * max_power):
             assert np.isfinite(slopes(charge, power)).all()
-
-
-@pytest.mark.parametrize("kwargs, message", [
-    ({"capacity": 0.0}, "capacity.*positive"),
-    ({"resistance": 0.0}, "resistance.*positive"),
-    ({"efficiency": 1.2}, "efficiency"),
-    ({"charge": 1.01}, "charge of Battery to be from 0 to 1, got 1.01"),
-    ({"n_cells": 0}, "n_cells"),
-    ({"n_cells": 1.5}, "n_cells of Battery as a whole number"),
-])  # fmt: skip
-def test_law_09_wrong_settings_are_errors(kwargs, message):
-    with pytest.raises(ConfigError, match=message):
-        build(**kwargs)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, Downwash, Sim
+from crazysim import Downwash, Sim
 from crazysim.plugins.effects import downwash
 
 # Worlds: drones above each other, side by side, one tilted by 90 degrees (thrust along x), all at one point.
@@ -157,11 +157,3 @@ def test_drones_with_fitted_models_have_jets():
     sim.add(Downwash())
     air = air_velocity(sim, sim.data)
     np.testing.assert_allclose(air[0, 1, 2], -jet_speed(0.5, 0, 0.959471532998666 * thrust), rtol=1e-4)
-
-
-def test_law_09_wrong_radii_and_models_without_drag_are_errors():
-    sim = Sim()
-    with pytest.raises(ConfigError, match=r"propeller_radius.*positive"):
-        sim.add(Downwash(propeller_radius=0.0))
-    with pytest.raises(ConfigError, match="Downwash acts through drag"):
-        Sim(dynamics="so_rpy").add(Downwash())

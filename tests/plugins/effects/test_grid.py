@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.plugins.effects.grid import Grid, interpolate, is_inside, load_wind_grid
+from crazysim.plugins.effects.grid import interpolate, is_inside, load_wind_grid
 
 
 def test_interpolation_is_that_of_numpy_axis_by_axis(rng):
@@ -103,15 +103,3 @@ def test_law_09_files_that_are_no_wind_are_errors_before_memory_is_allocated(tmp
         load_wind_grid(path)
     assert tracemalloc.get_traced_memory()[1] < 10 * 2**20
     tracemalloc.stop()
-
-
-@pytest.mark.parametrize("grid, message", [
-    (Grid(np.zeros((2, 2, 2))), r"values of shape \(n_x, n_y, n_z, 3\), got \(2, 2, 2\)"),
-    (Grid(np.zeros((2, 2, 2, 2))), "values of shape"),
-    (Grid(np.zeros((2, 2, 2, 3)), (0, 0)), "an origin of shape"),
-    (Grid(np.zeros((2, 2, 2, 3)), spacing=0.0), "spacing of field to be positive"),
-    (Grid(np.full((2, 2, 2, 3), np.nan)), "finite"),
-])  # fmt: skip
-def test_law_09_wrong_grids(grid, message):
-    with pytest.raises(ConfigError, match=message):
-        grid.checked("field", 3)

@@ -2,10 +2,9 @@
 
 import jax
 import numpy as np
-import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, GroundEffect, Sim
+from crazysim import GroundEffect, Sim
 from crazysim.plugins.effects import ground_effect
 
 R = 0.0275
@@ -62,10 +61,3 @@ def test_law_07_gradients_are_finite_on_the_floor():
     slope = jax.jit(jax.grad(lambda x: ground_effect.thrust_gain(x[:1], x[1:2], x[2:])[0]))
     for z in (0.0, -0.001, 0.01):
         assert np.isfinite(slope(np.float32([z, 1.0, R]))).all()
-
-
-def test_law_09_models_without_rotors_and_wrong_radii_are_errors():
-    with pytest.raises(ConfigError, match="first_principles"):
-        Sim(dynamics="so_rpy").add(GroundEffect())
-    with pytest.raises(ConfigError, match="propeller_radius of GroundEffect to be positive, got -1"):
-        Sim().add(GroundEffect(-1.0))

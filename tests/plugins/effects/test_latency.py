@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from cases import FITTED_DYNAMICS, LEVELS, hover_command, hover_rotor_state, repeat_command, with_states
+from cases import hover_command, hover_rotor_state, repeat_command, with_states
 
-from crazysim import ConfigError, Latency, MotorFailure, Sim
+from crazysim import Latency, MotorFailure, Sim
 
 DELAY = np.array([[0, 1], [3, 7], [7, 2]])
 """Delay of the commands of each drone, steps. (n_worlds, n_drones)"""
@@ -37,7 +37,7 @@ def build(control, dynamics="first_principles", engine="auto"):
 
 @pytest.mark.parametrize(
     "control, dynamics",
-    [(c, "first_principles") for c in LEVELS] + [("attitude", "so_rpy"), ("state", FITTED_DYNAMICS[-1])],
+    [(c, "first_principles") for c in ("state", "attitude", "rotor_vel")] + [("attitude", "so_rpy")],
 )
 def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
     """With a delay of k steps a drone flies as if the initial command had been sent k times before the others."""
@@ -139,22 +139,3 @@ def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
     assert (
         speed[1:].min() - speed[0] > 1000
     )  # rpm; a failed rotor loses 1,500 in these 10 ms, the others 300 before the command arrives
-
-
-@pytest.mark.parametrize("kwargs, message", [
-    ({"delay": -1}, "delay of Latency to be from 0 to 100000, got -1"),
-    ({"delay": np.nan}, "delay of Latency as a whole number or array, got nan"),
-    ({"delay": np.inf}, "got inf"),
-    ({"delay": "late"}, "got 'late'"),
-    ({"delay": 10**9}, "got 1000000000"),
-    ({"delay": 1, "max_delay": 10**9}, "max_delay of Latency to be from 0 to 100000, got 1000000000"),
-    ({"delay": 1.5}, "delay of Latency as a whole number or array, got 1.5"),
-    ({"delay": 6, "max_delay": 5}, "delay.*from 0 to 5"),
-    ({"delay": [1, 2]}, r"delay as whole.*got shape \(2,\)"),
-    ({"delay": 1, "max_delay": 2.5}, "max_delay of Latency as a whole number, got 2.5"),
-])  # fmt: skip
-def test_law_09_wrong_delays_are_errors(kwargs, message):
-    sim = Sim(n_worlds=3, n_drones=3)
-    with pytest.raises(ConfigError, match=message):
-        sim.add(Latency(**kwargs))
-    assert not sim.data.plugins

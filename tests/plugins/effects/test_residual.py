@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Residual, RotorAerodynamics, Sim
+from crazysim import ConfigError, Residual, Sim
 from crazysim.plugins.effects.residual import N_INPUTS
 
 RNG = np.random.default_rng(3)
@@ -83,27 +83,6 @@ def test_the_wrench_is_that_of_the_coefficients():
     np.testing.assert_allclose(ang_acc, wrench[..., 3:] / np.diag(np.asarray(p.J)), rtol=2e-3, atol=2e-3)
 
 
-def test_an_airframe_without_a_residual_is_an_error():
-    with pytest.raises(ConfigError, match=r"table \[residual\].*Use 'crazysim identify LOG.*cf21B_500_idsia"):
-        Sim(drone="cf21B_500").add(Residual())
-
-
-def test_residuals_of_different_sizes_are_errors():
-    with pytest.raises(ConfigError, match="number of hidden units"):
-        Sim(1, 2, drone=[drone(linear=LINEAR), drone(linear=LINEAR, hidden=HIDDEN, output=OUTPUT)]).add(Residual())
-
-
-def test_an_airframe_with_another_body_does_not_inherit_the_residual():
-    heavier = {"base": drone(linear=LINEAR), "rigid_body": {"mass": 0.05}}
-    with pytest.raises(ConfigError, match="not inherited"):
-        Sim(drone=heavier, control="rotor_vel").add(Residual())
-
-
-def test_hidden_without_output_is_an_error():
-    with pytest.raises(ConfigError, match="hidden and output together"):
-        Sim(control="rotor_vel").add(Residual(linear=LINEAR, hidden=HIDDEN))
-
-
 def test_aero_identified_adds_the_residual_of_the_airframe():
     sim = Sim(drone=drone(linear=LINEAR), aero="identified", control="rotor_vel")
     np.testing.assert_allclose(sim.data.plugins["residual"].linear, LINEAR, rtol=1e-6)
@@ -111,11 +90,3 @@ def test_aero_identified_adds_the_residual_of_the_airframe():
         Sim(drone="cf2x_L250", aero="identified")
     with pytest.raises(ConfigError, match=r"expected aero='identified' or None, got True. Use plugins=\[Rotor"):
         Sim(aero=True)
-
-
-def test_only_coefficients_that_were_fitted_with_rotor_aerodynamics_are_combined_with_it():
-    sim = Sim(drone=drone(linear=LINEAR), control="rotor_vel")
-    sim.add(RotorAerodynamics())
-    sim.add(Residual(linear=LINEAR))
-    with pytest.raises(ConfigError, match="RotorAerodynamics 'rotor_aerodynamics' and Residual 'residual'"):
-        sim.replace(Residual())

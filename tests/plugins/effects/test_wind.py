@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import with_states
 
-from crazysim import ConfigError, Sim, Wind
+from crazysim import Sim, Wind
 from crazysim.plugins.effects import wind
 
 SQRT_HALF = np.sqrt(0.5)
@@ -49,20 +49,6 @@ def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady_wind_sim):
     sim.step()
     fall = np.asarray(sim.data.plugins["wind"].velocity) - [0, 0, DT * 9.81]
     np.testing.assert_allclose(sim.data.states.vel, fall, rtol=1e-6, atol=1e-8)  # float32
-    sim.data = before
-
-
-def test_the_force_of_the_user_stays_and_is_added(steady_wind_sim):
-    sim, before = steady_wind_sim, steady_wind_sim.data
-    force = np.float32([0.1, -0.2, 0.3])
-    vel = []
-    for f in (0 * force, force):
-        sim.data = with_states(before, force=f)
-        sim.step(3)
-        vel.append(np.asarray(sim.data.states.vel))
-        np.testing.assert_array_equal(sim.data.states.force, np.broadcast_to(f, (2, 2, 3)))
-    # three steps, less drag of up to 0.57 per s; float32
-    np.testing.assert_allclose(vel[1] - vel[0], np.broadcast_to(3 * DT * force / 0.0434, (2, 2, 3)), rtol=3e-3)
     sim.data = before
 
 
@@ -130,40 +116,6 @@ def test_uneven_steps_keep_the_variance(rng):
             np.testing.assert_allclose(F[:, :2] @ P @ F[:, :2].T + np.outer(F[:, 2], F[:, 2]), P, atol=1e-15)
 
 
-def test_law_10_gusts_do_not_depend_on_the_number_of_worlds():
-    gusts = []
-    for n_worlds in (2, 3):
-        sim = build((1.0, 0, 0), n_worlds=n_worlds, speed_20ft=8.0)
-        sim.step(5)
-        gusts.append(np.asarray(sim.data.plugins["wind"].gust))
-    np.testing.assert_array_equal(gusts[0], gusts[1][:2])
-    assert len(np.unique(gusts[1][..., 0])) == 6
-
-    before = gusts[1]
-    sim.reset(np.array([False, True, False]))
-    np.testing.assert_array_equal(np.asarray(sim.data.plugins["wind"].gust)[::2], before[::2])
-    sim.step()
-    after = np.asarray(sim.data.plugins["wind"].gust)
-    assert np.abs(after[1]).min() > 1e-3, "a new episode begins with gusts"
-    assert not np.isclose(after[1], before[1], rtol=1e-3).any()
-
-
-@pytest.mark.parametrize("dynamics, drone, velocity, message", [
-    ("so_rpy", "cf21B_500", (1, 0, 0), "Wind acts through drag"),
-    ("first_principles", "bumblebee", (1, 0, 0), "Wind acts through drag"),
-    ("first_principles", "cf21B_500", 3.0, r"expected velocity as real numbers of shape \(3,\).*got shape \(\)"),
-    ("first_principles", "cf21B_500", np.zeros((2, 1, 2)), "expected velocity"),
-    ("first_principles", "cf21B_500", (np.nan, 0, 0), "finite"),
-])  # fmt: skip
-def test_law_09_wrong_winds_are_errors(dynamics, drone, velocity, message):
-    sim = Sim(n_worlds=2, dynamics=dynamics, drone=drone, control="attitude")
-    stages = dict(sim.step_pipeline)
-    with pytest.raises(ConfigError, match=message):
-        sim.add(Wind(velocity))
-    assert sim.step_pipeline == stages
-    assert not sim.data.plugins
-
-
 def test_profiles_by_hand():
     """ln(3.048 / 0.04572) / ln(6.096 / 0.04572) at 10 ft, Category C; (10 / 80)^0.2 of a turbine's hub."""
     one = np.ones(1, np.float32)
@@ -188,15 +140,3 @@ def test_the_mean_wind_grows_with_height(profile, factor):
     expected.step()
     np.testing.assert_allclose(sim.data.states.vel, expected.data.states.vel, rtol=1e-5)
     assert factor < 0.8
-
-
-@pytest.mark.parametrize("profile, message", [
-    ({"roughness": 0.05, "exponent": 0.2}, "got both"),
-    ({"roughness": 0.0}, "positive"),
-    ({"roughness": 7.0}, "a roughness below the reference height"),
-    ({"exponent": -0.1}, "exponent"),
-    ({"exponent": 0.1, "reference_height": 0.0}, "reference_height"),
-])  # fmt: skip
-def test_law_09_wrong_profiles(profile, message):
-    with pytest.raises(ConfigError, match=message):
-        build((1.0, 0, 0), **profile)

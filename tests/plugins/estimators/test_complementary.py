@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim, rotation
+from crazysim import Sim, rotation
 from crazysim.lab.validate import firmware_filters
-from crazysim.plugins.estimators import Complementary, complementary
-from crazysim.plugins.sensors import IMU
+from crazysim.plugins.estimators import complementary
 
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
@@ -67,10 +66,3 @@ def test_gradients_of_the_estimate_equal_central_differences(x64):
     x, h = jnp.array([0.3, -0.2, 0.1, 1.0, 2.0, 12.0]), 1e-5
     slope = [(loss(x + d) - loss(x - d)) / (2 * h) for d in h * jnp.eye(6)]
     np.testing.assert_allclose(jax.grad(loss)(x), slope, rtol=1e-6, atol=1e-9)
-
-
-def test_levels_and_sensors_that_the_filter_does_not_support_are_errors():
-    with pytest.raises(ConfigError, match="estimates no position"):
-        Sim(control="state", estimator="complementary")
-    with pytest.raises(ConfigError, match="a TimeOfFlight or one of each"):
-        Sim(control="attitude", estimator=Complementary([IMU()]))

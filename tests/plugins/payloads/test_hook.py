@@ -20,13 +20,12 @@ def build(height=5.0, integrator="euler", **settings):
     return sim, sim.add(Hook.bumblebee(**{"in_scene": False} | settings))
 
 
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
-def test_picking_up_keeps_momentum(integrator, x64):
+def test_picking_up_keeps_momentum(x64):
     """Without a mass of the hook, P = (q.u - q.v) / (1/m + 1/m_L), and q' = (I - q q^T) (u - v) / L.
 
     P is the impulse along the rod's direction q, u and v are the velocities of load and drone, L is the rod's length.
     """
-    sim, hook = build(integrator=integrator, hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
+    sim, hook = build(integrator="rk4", hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
     sim.data = with_states(hook.command(sim.data, True), vel=np.array([0.1, 0.0, 0.0]))
     record = hook.read(sim.data)
     u = np.array([0.2, 0.1, -0.2])
@@ -70,11 +69,10 @@ def test_conditions_of_picking_up_and_release():
     np.testing.assert_allclose(np.linalg.norm(after.tip_pos - np.asarray(sim.data.states.pos)), 0.4, atol=1e-4)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
-def test_a_hinge_keeps_the_rod_in_its_plane_and_turns_the_drone(integrator, x64):
+def test_a_hinge_keeps_the_rod_in_its_plane_and_turns_the_drone(x64):
     ends = {}
     for dof in (1, 2):
-        sim, hook = build(500.0, dof=dof, damping=0.0, integrator=integrator)
+        sim, hook = build(500.0, dof=dof, damping=0.0, integrator="rk4")
         record = hook.read(sim.data)
         push = broadcast_like([0.5, 0.4, 0.0], record.vel)
         sim.data = hook.write(sim.data, record.replace(vel=push, tip_vel=push))
@@ -97,16 +95,6 @@ def test_law_09_commands_that_are_neither_true_nor_false_are_errors():
     for grip in (True, np.ones(shape, bool), np.bool_(False), [True]):
         data = hook.command(sim.data, grip)
         np.testing.assert_array_equal(hook.read(data).grip, np.broadcast_to(grip, shape))
-
-
-def test_wrong_settings_are_errors():
-    for settings, message in (
-        ({"dof": 3}, "dof"),
-        ({"load_at": (1, 2)}, "load_at"),
-        ({"mass": -1}, "mass"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            build(**settings)
 
 
 def test_a_load_on_the_floor_stays_at_rest(x64):

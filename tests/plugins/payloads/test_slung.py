@@ -10,7 +10,7 @@ import pytest
 from cases import INTEGRATORS, broadcast_like, build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError, Downwash, Sim, Wind
+from crazysim import Downwash, Sim, Wind
 from crazysim.plugins.payloads import SlungLoad, direction
 from crazysim.plugins.payloads.link import LinkParams, end_relative_motion
 
@@ -85,8 +85,7 @@ def test_law_08_energy_below_a_joint_off_the_centre_grows_with_the_step(x64):
     assert growth[0] / growth[1] == pytest.approx(4, rel=0.2)
 
 
-@pytest.mark.parametrize("cable", [False, True])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(("integrator", "cable"), [*((integrator, False) for integrator in INTEGRATORS), ("rk4", True)])
 def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
     """A pendulum below a hovering body of 1e9 kg: 60 s at 500 Hz in float32, with amplitudes up to 2.5 rad."""
     sim = build(8, integrator=integrator, height=2.0)
@@ -191,16 +190,11 @@ def test_the_order_of_convergence_is_that_of_the_integrator(x64):
         assert abs(slope - order) < 0.4, (integrator, errors)
 
 
-@pytest.mark.parametrize("cable", [False, True])
-def test_law_08_gradients_are_central_differences(cable, x64):
-    """Gradients are in forward mode for a rod, and in reverse mode for a cable."""
+def test_law_08_gradients_are_central_differences(x64):
     sim = build(height=2.0, engine="plain")
-    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=True, in_scene=False))
     sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
-    step, data = (
-        build_stagewise_step(sim) if cable else sim.build_step_fn(),
-        sim.data,
-    )  # each compiles sooner in its mode
+    step, data = build_stagewise_step(sim), sim.data
 
     def end(x):
         record = load.read(data)
@@ -210,10 +204,7 @@ def test_law_08_gradients_are_central_differences(cable, x64):
 
     x = np.array([LOAD, 0.4, 0.3, 0.2, -0.1])
 
-    def forward(x):
-        return jax.vmap(lambda change: jax.jvp(end, (x,), (change,)), out_axes=(None, 0))(np.eye(5))
-
-    value_and_gradient = jax.jit(jax.value_and_grad(end) if cable else forward)
+    value_and_gradient = jax.jit(jax.value_and_grad(end))
     gradient = np.asarray(value_and_gradient(x)[1])
     for k, d in enumerate(1e-5 * np.eye(5)):
         np.testing.assert_allclose(
@@ -221,10 +212,9 @@ def test_law_08_gradients_are_central_differences(cable, x64):
         )
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_law_07_no_nan(integrator):
+def test_law_07_no_nan():
     """Five drones for 10 s: upside down below the load, a load at its attachment, fast rotation, on the floor."""
-    for cable in (False, True):
+    for cable, integrator in ((False, "rk4"), (True, "euler")):
         sim = build(5, integrator=integrator, height=0.5, engine="auto")
         load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, cable=cable, damping=0.001, drag=0.05, in_scene=False))
         quat = np.tile([0, 0, 0, 1.0], (5, 1, 1))
@@ -241,52 +231,6 @@ def test_law_07_no_nan(integrator):
             sim.step(500)
             for x in jax.tree.leaves((sim.data.states, load.read(sim.data))):
                 assert np.isfinite(x).all()
-
-
-def test_law_07_no_nan_in_gradients():
-    """Gradients of two steps by all states, on the floor with the load at its attachment."""
-    sim = build(2, height=0.0, engine="plain")
-    load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=0.3, in_scene=False))
-    data = with_load(load, sim.data, pos=np.asarray(sim.data.states.pos))
-
-    def advance(data):
-        for stage in sim.step_pipeline.values():
-            data = stage(data)
-        return data
-
-    @jax.jit
-    def gradient_and_next(data):
-        """Return gradients of the sum of all states after a step, and the data after it."""
-
-        def total(data):
-            after = advance(data)
-            numbers = jax.tree.leaves((after.states, load.read(after)))
-            return sum(jnp.sum(x) for x in numbers if jnp.issubdtype(x.dtype, jnp.floating)), after
-
-        return jax.grad(total, allow_int=True, has_aux=True)(data)
-
-    for _ in range(2):
-        gradient, data = gradient_and_next(data)
-        for x in jax.tree.leaves((gradient.states, gradient.plugins["load"])):
-            assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
-
-
-def test_law_01_a_world_flies_like_a_single_world():
-    """Loads have different masses."""
-    masses = np.array([[0.0, 0.1], [0.2, 0.3]])
-    sim = build(2, 2, height=2.0)
-    load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
-    sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
-    sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
-    sim.step(50)
-    heights = np.asarray(load.read(sim.data).pos)[..., 2]
-    single_sim = build(1, 1, height=2.0)
-    load = single_sim.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
-    single_sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
-    single_sim.step(50)
-    rise = np.asarray(load.read(single_sim.data).pos)[0, 0, 2]
-    np.testing.assert_allclose(heights[1, 0], rise, atol=1e-5)
-    np.testing.assert_allclose(heights[1, 1], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
 
 
 def test_a_released_load_comes_to_rest_on_the_floor(x64):
@@ -342,29 +286,6 @@ def test_loads_are_objects_of_the_scene():
     sim.step()
     sim.sync(1)
     np.testing.assert_allclose(sim.mj_data.mocap_pos[body], np.asarray(load.read(sim.data).pos)[1, 0], atol=1e-6)
-
-
-def test_law_09_wrong_settings_are_errors():
-    sim = build()
-    for settings, message in (
-        ({"mass": -1.0}, "mass"), ({"mass": 0.1, "length": 0.0}, "length"), ({"mass": 0.1, "size": (1, 2)}, "size"),
-        ({"mass": 0.1, "cable": True, "restitution": 2.0}, "restitution"), ({"mass": [1.0, 2.0]}, "mass"),
-    ):  # fmt: skip
-        with pytest.raises(ConfigError, match=message):
-            sim.add(SlungLoad(**settings, in_scene=False))
-    sim.add(SlungLoad(mass=0.1, in_scene=False))
-    with pytest.raises(ConfigError, match="at most one plugin"):
-        sim.add(SlungLoad(mass=0.1, name="second", in_scene=False))
-
-
-def test_other_values_compile_nothing():
-    sim = build(engine="interpret")
-    load = sim.add(SlungLoad(mass=0.1, in_scene=False))
-    sim.step()
-    before = sim.step_fn
-    sim.replace(SlungLoad(mass=0.3, length=0.5, in_scene=False))
-    assert sim.step_fn is before
-    assert float(load.read(sim.data).mass[0]) == pytest.approx(0.3)
 
 
 def test_zeros_of_an_attachment_cost_no_operations_until_they_change():

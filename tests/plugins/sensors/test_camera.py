@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, ConfigError, Lidar, RangeFinder, Sim, Terrain, rotation
+from crazysim import Camera, RangeFinder, Sim, Terrain, rotation
 
 SIZE = {"width": 9, "height": 6}
 
@@ -104,41 +104,3 @@ def test_sensors_of_landed_drones_see_the_ground(ground):
     distance = np.asarray(ranges.read(sim.data).distance)[:, 0]
     np.testing.assert_allclose(distance[0], [0, 4, 4, 4], atol=2e-3)
     assert distance[1, 3] < 2e-3
-
-
-def test_before_the_first_image_the_age_is_infinite():
-    sim = Sim(2, control="attitude")
-    camera = sim.add(Camera(2, 2))
-    assert (np.asarray(camera.age(sim.data)) == np.inf).all()
-    sim.step()
-    assert (np.asarray(camera.age(sim.data)) == 0).all()
-    sim.reset(np.array([False, True]))
-    np.testing.assert_array_equal(np.asarray(camera.age(sim.data))[:, 0], [0, np.inf])
-
-
-def test_law_09_wrong_cameras_are_errors():
-    sim = Sim(n_worlds=2, control="attitude")
-    for call, words in (
-        (lambda: Camera(0, 4), "expected width of Camera to be finite and at least 1"),
-        (lambda: Camera(4, 4.5), "height of Camera"),
-        (lambda: Camera(fovy=180.0), "fovy of Camera"),
-        (lambda: Camera(outputs=()), "expected outputs of 'camera' as a list of 'depth', 'distance'"),
-        (lambda: Camera(outputs=("rgb",)), "got ('rgb',)"),
-        (lambda: Camera(outputs="depth"), "got 'depth'"),
-        (lambda: Camera(outputs=[[1], [2, 3]]), "got [[1], [2, 3]]"),
-        (lambda: Lidar(outputs=[[1], [2, 3]]), "got [[1], [2, 3]]"),
-        (lambda: Camera(latency=-1.0), "latency of Camera"),
-        (lambda: sim.add(Camera(freq=333)), "Use the nearest rate below, 250 Hz"),
-        (lambda: sim.add(Camera(latency=1.0)), "expected a latency of 'camera' of at most 63 images"),
-        (lambda: sim.add(Camera(4, 3, latency=np.int16(100), freq=50)), "expected a latency of 'camera' of at most 63"),
-        (lambda: sim.add(Camera(10**6, 10**6)), "got 2 images of 1000000 x 1000000 pixels, which need"),
-        (
-            lambda: sim.depth("fpv_cam", 10**6, 10**6),
-            "got 2 images of 1000000 x 1000000 pixels, which need 29802.3 GiB",
-        ),
-        (lambda: Camera().read(sim.data), "expected data with a record of plugin 'camera', got records of none"),
-    ):
-        with pytest.raises(ConfigError) as error:
-            call()
-        assert words in str(error.value), error.value
-    assert not sim.plugins

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, ConfigError, Lidar, Sim, rotation
+from crazysim import Camera, Lidar, Sim, rotation
 from crazysim.plugins.sensors import Distortion, StereoNoise
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.006, "k3": 0.01}
@@ -56,24 +56,7 @@ def test_depth_has_a_resolution_and_a_smallest_value(wall_images):
     np.testing.assert_allclose(depth / 0.05, np.round(depth / 0.05), atol=1e-3)
 
 
-def test_pixels_behind_an_edge_are_holes_where_the_second_imager_does_not_see_them():
-    """A near strip in front of a far wall hides f b (1 / near - 1 / far) pixels on its left, and none on its right."""
-    sim = Sim(control="attitude")
-    sim.scene.add("wall", pos=[5.05, 0, -20], length=80, height=80, mocap=False)
-    sim.scene.add("box", pos=[1.05, 0.0, 5], size=[0.1, 0.1, 20], mocap=False)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.float32([[[0, 0, 5]]])))
-    settings = {"baseline": 0.1, "disparity_noise": 0.0, "resolution": 0.0, "min_depth": 0.0}
-    for has_holes in (True, False):
-        camera = Camera(201, 3, fovy=2.0, pos=(0, 0, 0), noise=StereoNoise(**settings, has_holes=has_holes))
-        depth = np.asarray(jax.jit(camera.image_fn(sim))(sim.data)["depth"])[0, 0, 1]
-        is_near = np.flatnonzero(np.abs(depth - 1) < 0.01)
-        hidden = camera.focal * 0.1 * (1 / 1.0 - 1 / 5.0) if has_holes else 0
-        holes = np.flatnonzero(depth == 0)
-        assert len(holes) == pytest.approx(min(hidden, is_near[0]), abs=1)
-        assert (holes < is_near[0]).all()
-
-
-@pytest.mark.parametrize("width", [20, 60, 120])
+@pytest.mark.parametrize("width", [20, 80])
 def test_holes_are_the_pixels_that_rays_of_c_mujoco_from_the_second_imager_do_not_reach(width):
     sim = Sim(2, control="attitude")
     rng = np.random.default_rng(0)
@@ -217,24 +200,3 @@ def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inside_of_a_geom_around
         sim.mj_model, sim.mj_data, [0.03, 0, 0], inner.rays[0, 0], None, 1, 1, np.zeros(1, np.int32), None
     )
     assert far == pytest.approx(1.0, rel=1e-5)
-
-
-def test_law_09_wrong_noise_lenses_and_patterns_are_errors():
-    for call, words in (
-        (lambda: Camera(noise=0.1), "expected noise of Camera as StereoNoise"),
-        (lambda: StereoNoise(baseline=0.0), "baseline of StereoNoise"),
-        (lambda: StereoNoise(disparity_noise=np.nan), "disparity_noise of StereoNoise"),
-        (lambda: Distortion(k1="wide"), "k1 of Distortion"),
-        (lambda: Camera(fovy=120.0, distortion=Distortion(k1=-0.5)).rays, "which folds the image at"),
-        (lambda: Lidar(outputs=("depth",)), "expected outputs of a lidar without 'depth'"),
-        (lambda: Lidar(elevation=()), "expected at least one elevation and azimuth"),
-        (lambda: Lidar(elevation=(95.0,)), "elevation of Lidar"),
-        (lambda: Lidar(dropout=1.5), "dropout of Lidar"),
-        (
-            lambda: Sim().add(Lidar(np.zeros(10**5), np.zeros(10**6))),
-            "got 1 images of 1000000 x 100000 pixels, which need",
-        ),
-    ):
-        with pytest.raises(ConfigError) as error:
-            call()
-        assert words in str(error.value), error.value

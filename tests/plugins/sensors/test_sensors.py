@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import Battery, ConfigError, Plugin, RangeFinder, Sim, rotation
-from crazysim.envs import DroneEnv, make
+from crazysim import Battery, Plugin, RangeFinder, Sim, rotation
+from crazysim.envs import make
 from crazysim.plugins import sensors
 from crazysim.plugins.sensors.barometer import pressure_altitude, pressure_at
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, sweep_angle
@@ -246,34 +246,6 @@ def test_satellite_navigation_wanders():
     np.testing.assert_allclose(vel.std(axis=0), 0.1, rtol=std_tolerance(N))
 
 
-@pytest.mark.parametrize("plugin, message", [
-    (lambda: sensors.UWB([(0, 0, 0)], tdoa=True), "expected anchors as at least 2"),
-    (lambda: sensors.UWB([(0, 0)]), "expected anchors"),
-    (lambda: sensors.UWB([(0, 0, 0)], outliers=2.0), "expected outliers"),
-    (lambda: sensors.Lighthouse([(0, 0, 2.0)], [(0, 0, 0)] * 2), "expected rpy of shape"),
-    (lambda: sensors.GPS(drift_time=0.0), "expected drift_time"),
-    (lambda: sensors.BatteryVoltage(), "a Battery named"),
-    (lambda: sensors.MultiRanger(), "a RangeFinder named"),
-    (lambda: sensors.RotorSpeeds(n_rotors=6), "expected n_rotors = 4"),
-    (lambda: sensors.MotionCapture(-1.0), "expected noise"),
-    (lambda: sensors.MotionCapture(freq=333), "expected freq of 'motion_capture'"),
-    (lambda: sensors.OpticalFlow(resolution=0.0), "expected resolution"),
-    (lambda: sensors.TimeOfFlight(max_range=0.0), "expected max_range"),
-    (lambda: sensors.Barometer(altitude=2e4), "expected altitude"),
-    (lambda: sensors.Magnetometer(1e-5), "expected field"),
-    (lambda: sensors.Magnetometer((0, 20, -45)), r"expected field in tesla.*Use 20e-6 for 20 microtesla"),
-    (lambda: sensors.IMU(delay="late"), "expected delay of IMU as a number or array, got 'late'"),
-])  # fmt: skip
-def test_law_09_wrong_settings(plugin, message):
-    with pytest.raises(ConfigError, match=message):
-        build(plugin())
-
-
-def test_a_multi_ranger_has_the_rays_of_its_range_finder():
-    with pytest.raises(ConfigError, match="expected n_rays = 1"):
-        build(RangeFinder(directions=[(0, 0, 1)]), sensors.MultiRanger())
-
-
 def test_observations_of_other_plugins_use_measured_states():
     """A plugin observes measured states in place of the true ones; observations of sensors do not change."""
     sim = build(sensors.MotionCapture(pos=(0, 0, 0.5)), RangeFinder(directions=[(0, 0, -1)]))
@@ -308,25 +280,3 @@ def test_a_task_observes_measurements_by_one_argument():
         np.testing.assert_array_equal(states[0].reward, states[1].reward)
         states = [env.step(state, action) for env, state in zip(envs, states, strict=True)]
     assert "imu" in str(envs[1].explain())
-
-
-@pytest.mark.parametrize("options, message", [
-    ({"sensors": sensors.IMU()}, r"expected sensors as a list of plugins, got IMU.*Use sensors=\[IMU"),
-    ({"sensors": "imu"}, "expected sensors as a list of plugins, got 'imu'"),
-    ({"effects": Battery()}, "expected effects as a list of plugins"),
-    ({"sensors": [sensors.MotionCapture()], "estimator": "kalman"}, r"no plugin 'motion_capture'.*estimator=Kalman"),
-])  # fmt: skip
-def test_law_09_wrong_sensors_of_a_task(options, message):
-    with pytest.raises(ConfigError, match=message):
-        make("hover", **options)
-
-
-def test_law_09_measured_needs_a_sensor():
-    env = make("hover")
-    with pytest.raises(ConfigError, match="with a sensor of states"):
-        DroneEnv(env.sim, env.task, measured=True)
-
-
-def test_telemetry_needs_pole_pairs():
-    with pytest.raises(ConfigError, match="expected pole_pairs to be positive"):
-        sensors.RotorSpeeds.telemetry(0)

@@ -65,13 +65,12 @@ def end_of(name, car, start, command, duration):
     return jax.tree.map(np.asarray, _end(name, car, start, np.array(command), round(500 * duration)))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_for_small_slip_the_model_tends_to_the_published_one(seed):
+def test_for_small_slip_the_model_tends_to_the_published_one():
     """The equations of the lab's simulator assume small slip angles: the difference is of order three."""
     with jax.enable_x64(True):
         car = jax.tree.map(lambda x: np.asarray(x, np.float64), CarParams.create(load_vehicle("f1tenth_ros"), 500))
         car = car.replace(grip=np.full(2, np.inf), slip_speed=np.full(1, 1e-9))
-        rng, errors, sizes = np.random.default_rng(seed), [], 0.1 * 0.5 ** np.arange(4)
+        rng, errors, sizes = np.random.default_rng(0), [], 0.1 * 0.5 ** np.arange(4)
         d, side, delta, turn = rng.uniform(-1, 1, 4)
         for size in sizes:
             vx, vy, steer, w = 3.0, 3.0 * size * side, size * delta, 5 * size * turn
