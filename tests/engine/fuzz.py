@@ -82,7 +82,6 @@ SPECIAL_NUMBERS = np.float32(
 
 
 def draw_inputs(rng: np.random.Generator) -> Inputs:
-    """Return inputs: ordinary numbers in a third of the worlds, ties in the next, special numbers in the last."""
     fields: list[dict] = [{}, {}, {}]
     for letter, shapes in SHAPES.items():
         for shape in shapes:
@@ -108,7 +107,6 @@ def inputs_by_name(g: Inputs) -> dict:
 
 
 def input_shapes(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shapes and types of the inputs of a program, for one drone or one world."""
     batch_shape = () if scope == "drone" else (N_DRONES,)
     return {
         letter + "".join(map(str, s)): jax.ShapeDtypeStruct((*batch_shape, *s), DTYPES[letter])
@@ -130,8 +128,6 @@ class Case:
         return jax.eval_shape(self.program.values, input_shapes(self.scope))
 
     def stage(self, name: str) -> Stage:
-        """Return a stage that writes all values of the program under a name."""
-
         def write(data):
             results = data.plugins["results"]
             floats, others = pack_values(
@@ -143,7 +139,6 @@ class Case:
         return Stage(write, self.scope, name=name)
 
     def empty_slots(self, name: str) -> dict:
-        """Return arrays for the values that the stage writes, for all worlds."""
         results = self.avals[len(self.program.inputs) :]
         n_floats = sum(aval.size for aval in results if jnp.issubdtype(aval.dtype, jnp.floating))
         n_others = sum(aval.size for aval in results) - n_floats
@@ -161,7 +156,6 @@ class Case:
         return [keeps_sign_of_zero(functools.partial(_apply_to_values, line), self.avals[: n + j]) for j, line in lines]
 
     def unpack_values(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
-        """Return the values of the lines, for all worlds, from arrays that the stage has written."""
         values, offsets = [], [0, 0]
         for aval in self.avals[len(self.program.inputs) :]:
             k = 0 if jnp.issubdtype(aval.dtype, jnp.floating) else 1
@@ -226,7 +220,6 @@ class Fuzzer:
         self.refused: collections.Counter[str] = collections.Counter()
 
     def draw(self, n: int) -> list[Case]:
-        """Return random programs."""
         cases = []
         for _ in range(n):
             scope = "drone" if self.rng.random() < 0.8 else "world"
@@ -234,7 +227,6 @@ class Fuzzer:
         return cases
 
     def check(self, cases: Sequence[Case]) -> Iterator[Finding]:
-        """Run programs on all engines, and yield the findings."""
         self.counts["programs"] += len(cases)
         yield from self._check(list(cases))
 
@@ -281,7 +273,6 @@ class Fuzzer:
         return self.data.replace(plugins=plugins), stages
 
     def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
-        """Return the values of each line of each program on an engine, for all worlds."""
         data, stages = self._build_stages(cases)
         results = Step(stages, engine, self.platform, device=self.device)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
@@ -322,7 +313,6 @@ class Fuzzer:
                 break
 
     def _first_difference(self, case: Case, engine: str, plain: list, other_results: list) -> Finding | None:
-        """Return the first difference that rounding does not explain, or None."""
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other_results, strict=True)):
@@ -369,7 +359,6 @@ def _text(x) -> str:
 
 
 def main() -> None:
-    """Run the fuzzer from the command line."""
     parser = argparse.ArgumentParser(
         description="Compare the engines on random programs.",
         epilog="5,000 programs on a GPU: python tests/engine/fuzz.py --programs 5000 --seed 1 --device gpu. Where a "

@@ -34,7 +34,6 @@ class Program:
     """Expressions; the values of the lines follow the inputs."""
 
     def values(self, inputs_by_name: dict) -> list:
-        """Return all values: the inputs, and the results of the lines."""
         values = [inputs_by_name[name] for name in self.inputs]
         for line in self.lines:
             values.append(evaluate(line, values))
@@ -53,7 +52,6 @@ def _compiled(line: str, n: int) -> Callable:
 
 
 def evaluate(line: str, values: Sequence):
-    """Return the value of a line."""
     return _compiled(line, len(values))(*values)
 
 
@@ -67,7 +65,6 @@ class Draw:
         """Shape of the value that was chosen last."""
 
     def choice(self, options: Sequence):
-        """Return a random option."""
         return options[int(self.rng.integers(len(options)))]
 
     def int(self, low: int, high: int) -> int:
@@ -90,7 +87,6 @@ class Draw:
         return f"v{self.choice(fits)}" if fits else self.value(kinds)
 
     def axis(self) -> int:
-        """Return a random axis of the value chosen last."""
         n = len(self.shape)
         return self.int(-n, n - 1) if n else 0
 
@@ -465,7 +461,6 @@ def scatters(d: Draw) -> str:
 
 
 def _windowed_scatter(d: Draw, x: str) -> str:
-    """Return a scatter of windows with explicit dimension numbers."""
     rows = d.value("i", 1, 1)
     mode = d.choice(["clip", "fill", "promise_in_bounds"])
     kind = d.choice(["", "_add", "_mul", "_min", "_max", "_sub"])

@@ -178,7 +178,6 @@ def find_alternatives(eqn, args: Sequence, out) -> tuple[Any, tuple[float, ...]]
 
 
 def _disturbed_results(fn, values: list[np.ndarray], n_lanes: int):
-    """Return results of a function with disturbed arithmetic. (N_SAMPLES, n_lanes, ...)"""
     rng = np.random.default_rng(0)
     samples = [jnp.broadcast_to(x, (N_SAMPLES, *x.shape)) for x in values]
     batched_fn = jax.vmap(fn, axis_size=n_lanes)

@@ -262,7 +262,6 @@ RANDOM_CASES = {"random_bits": random_bits, "random_numbers": random_numbers}
 
 
 def make_inputs():
-    """Return inputs that differ from drone to drone."""
     rng = np.random.default_rng(0)
     shape = (N_WORLDS, N_DRONES)
     x = rng.uniform(-3, 3, (*shape, 6))
@@ -280,7 +279,6 @@ def make_inputs():
 
 
 def drone_shapes(g):
-    """Return the shapes and types of the inputs of one drone."""
     scope_letters = Inputs("d", "d", "d", "d", "d", "shared", "d")
     n_batch_axes = {"d": 2, "shared": 0}
     return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[n_batch_axes[s] :], x.dtype), scope_letters, g)

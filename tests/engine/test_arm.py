@@ -38,7 +38,6 @@ int main() {
 
 
 def run_on_arm(folder, source, n_lanes, n_steps, inputs, outputs):
-    """Return the outputs of a kernel that is compiled for ARM and emulated."""
     (folder / "kernel.cpp").write_text(source)
     (folder / "driver.cpp").write_text(DRIVER)
     flags = [flag for flag in native.COMPILER_FLAGS if flag not in ("-march=native", "-shared")]

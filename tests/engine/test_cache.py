@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from disks import full_disk
 from hypothesis import given
+from hypothesis import settings as examples
 from hypothesis import strategies as st
 from jax._src import compilation_cache
 
@@ -210,9 +211,9 @@ RESULT = np.sin(X) @ X + 7
 
 
 @pytest.mark.long("compiles its program after each damage")
+@examples(max_examples=examples.default.max_examples // 3)
 @given(st.lists(damages, min_size=1, max_size=3))
 def test_a_damaged_program_is_compiled_again_and_replaced(chosen):
-    """There is no warning, and the next process loads the new file."""
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         patch.setenv(cache.CACHE_VARIABLE, folder)
         configured = jax.config.jax_compilation_cache_dir
@@ -331,14 +332,6 @@ def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, mo
     assert capsys.readouterr().err == ""
 
 
-def test_a_command_runs_where_the_folder_cannot_be_used(settings, monkeypatch, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "file"))
-    enable_for_command()
-    assert jax.config.jax_compilation_cache_dir is None
-    assert capsys.readouterr().err.startswith("compiled programs are not kept: expected a folder")
-
-
 def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path):
     autotuning = "xla_gpu_per_fusion_autotune_cache_dir"  # folder of XLA's measurements on GPUs
     for folder in ("crazysim", autotuning):
@@ -358,15 +351,14 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
 
 
 @pytest.mark.long("three processes import JAX")
-@pytest.mark.parametrize("first_import", ["", "import jax"])
-def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path, first_import):
+def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path):
     """For each program that it reads, XLA writes errors about features of the CPU unless its log level is set."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     environment["TF_CPP_MIN_LOG_LEVEL"] = "1"  # as JAX sets it, for the children of a process that has imported it
 
     def run(name):
-        command = [sys.executable, "-c", first_import + PROGRAM, name]
+        command = [sys.executable, "-c", f"import jax{PROGRAM}", name]
         return subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
 
     folder = tmp_path / "crazysim" / "jax"

@@ -12,8 +12,6 @@ from crazysim.engine.backends import ffi_handlers
 
 @pytest.fixture(scope="module")
 def scaled():
-    """Return a compiled function of x, a factor and a text: a handler computes factor * x + length of the text."""
-
     def handle(call):
         n, factor = call.attribute("n"), call.attribute("factor")
         if factor < 0:

@@ -125,7 +125,6 @@ def test_a_kernel_computes_the_gradient(x64, monkeypatch):
 @pytest.mark.long("compiles kernels with many tangents")
 @needs_compiler
 def test_a_kernel_computes_tangents(x64):
-    """Tangents in one direction and in many, with respect to numbers of drones and to shared numbers."""
     ((fast, step, data), (plain, *_)), point = make_losses(n_steps=3, n_drones=2)
     jacobian = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731
     mass = data.params.mass
@@ -143,7 +142,6 @@ def test_a_kernel_computes_tangents(x64):
 @pytest.mark.long("compiles second derivatives")
 @needs_compiler
 def test_second_derivatives_are_those_of_lanes(x64):
-    """Forward over forward, and forward over reverse."""
     pairs, (cmd, vel) = make_losses(n_worlds=1, n_steps=1, dynamics="so_rpy")
 
     def second_derivatives(losses):
@@ -186,22 +184,8 @@ def test_programs_without_a_kernel_are_differentiated_on_lanes(x64):
     assert "a loop of 3000 iterations is too long to be reversed" in explain(step, data)
 
 
-def undeclared_stage(data):
-    """Push drones, in a stage of all worlds."""
-    return data.replace(states=data.states.replace(force=1e-2 * jnp.sin(data.states.pos)))
-
-
-@pytest.mark.long("compiles a gradient in two engines")
-@needs_compiler
-def test_a_step_that_splits_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), point = make_losses(stages=[undeclared_stage], n_steps=1, dynamics="so_rpy")
-    assert_close(jit_gradient(fast)(point), jit_gradient(plain)(point))
-    assert "gradient: on lanes ('undeclared_stage' is not fused)" in explain(step, data)
-
-
-@pytest.mark.parametrize(("dynamics", "control"), PAIRS)
+@pytest.mark.parametrize(("dynamics", "control"), [PAIRS[0], PAIRS[-1]])
 def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
-    """The derivatives are with respect to all leaves of drones."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control)
@@ -263,5 +247,4 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
 @needs_compiler
 def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
     ((fast, *_), (plain, *_)), point = make_losses(n_steps=jnp.int32(3))
-    for direction in (point, jax.tree.map(jnp.ones_like, point)):
-        assert_close(jax.jvp(fast, (point,), (direction,)), jax.jvp(plain, (point,), (direction,)))
+    assert_close(jax.jvp(fast, (point,), (point,)), jax.jvp(plain, (point,), (point,)))

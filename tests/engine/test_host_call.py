@@ -38,8 +38,7 @@ def step_on_xla(sim, n):
     return sim.step_fn(sim.data, jnp.int32(n))
 
 
-@pytest.mark.parametrize("n_worlds", [3, 700], ids=["one buffer", "a buffer for each array"])
-@pytest.mark.parametrize("n_drones", [1, 2])
+@pytest.mark.parametrize(("n_worlds", "n_drones"), [(3, 1), (700, 2)], ids=["one buffer", "a buffer for each array"])
 def test_host_calls_give_the_numbers_of_the_compiled_step(n_worlds, n_drones):
     sim = Sim(n_worlds, n_drones, control="state")
     sim.data = with_states(sim.data, pos=[0, 0, 5.0])
@@ -49,7 +48,7 @@ def test_host_calls_give_the_numbers_of_the_compiled_step(n_worlds, n_drones):
         assert trees_equal(sim.data, expected)
 
 
-@pytest.mark.parametrize(("n_drones", "control"), [(1, "state"), (3, "attitude"), (9, "rotor_vel")])
+@pytest.mark.parametrize(("n_drones", "control"), [(1, "state"), (9, "rotor_vel")])
 def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
     """13 worlds end within a block of lanes; 1,400 worlds are distributed over the cores."""
     n_worlds, end_states = 1400, []
@@ -115,16 +114,7 @@ def test_subnormal_numbers_are_zero_as_in_the_compiled_step(sim):
     assert np.float32(1e-38) / np.float32(100) > 0  # the caller's arithmetic keeps subnormal numbers
 
 
-def test_a_non_finite_drone_flags_its_world_only(sim):
-    states = sim.data.states
-    sim.data = sim.data.replace(states=states.replace(vel=states.vel.at[1, 1].set(jnp.nan)))
-    sim.step()
-    sim.step()
-    np.testing.assert_array_equal(sim.data.core.nonfinite[:, 0], [False, True, False])
-
-
 def test_fields_that_are_read_later_keep_their_values(sim):
-    """A record creates its fields when they are read, and later steps and commands do not change them."""
     expected = [np.array(leaf_on_host(x)) for x in jax.tree.leaves(step_on_xla(sim, 3))]
     sim.step(3)
     unread, states = sim.data, sim.data.states
@@ -139,11 +129,6 @@ def test_fields_that_are_read_later_keep_their_values(sim):
     assert states.pos is pos
 
 
-def test_arrays_of_a_record_are_created_once(sim):
-    assert sim.data is sim.data
-    assert sim.data.states.pos is sim.data.states.pos
-
-
 def test_a_record_that_was_not_read_can_be_copied(sim):
     for copied in (copy.copy(sim.data), copy.deepcopy(sim.data.states), pickle.loads(pickle.dumps(sim.data.states))):
         states = getattr(copied, "states", copied)
@@ -154,13 +139,13 @@ def test_a_record_that_was_not_read_can_be_copied(sim):
         sim.data.states.position  # noqa: B018
 
 
-@pytest.mark.parametrize("field", ["states", "params", "controls"])
-def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim, field):
+def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim):
     twin = build_falling_sim()
     twin.step(2)
     sim.step()
     twin.step()
-    jax.jit(lambda x: jax.tree.map(lambda y: y * 0 + 7, x), donate_argnums=0)(getattr(sim.data, field))
+    read = sim.data.states, sim.data.params, sim.data.controls
+    jax.jit(lambda x: jax.tree.map(lambda y: y * 0 + 7, x), donate_argnums=0)(read)
     sim.step(3)
     twin.step(3)
     assert trees_equal(sim.data.states, twin.data.states)
@@ -177,7 +162,6 @@ def test_a_command_on_the_device_may_be_donated_later(sim):
 
 
 def test_threads_read_consistent_records_while_another_steps(sim):
-    """Height and step count in every record belong to the same moment."""
     samples, stopped = [], threading.Event()
 
     def read():

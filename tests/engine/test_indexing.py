@@ -48,8 +48,6 @@ WRITES = [
 
 
 def test_updates_at_indices_equal_those_of_plain(sim):
-    """One stage of a drone computes all functions."""
-
     @stage("drone")
     def write(data):
         rows = [fn(jnp.zeros_like(data.states.pos), data.core.steps) for fn, _ in WRITES]
@@ -78,7 +76,7 @@ PROGRAMS = {
             f"lax.scatter{kind}(v0, {INDICES[mode]}[:, None], v0[:3, None] * jnp.ones(2), {WINDOW}, mode={mode!r})",
         )
         for mode in MODES
-        for kind in ("", "_add", "_sub", "_mul", "_min", "_max")
+        for kind in (("", "_add", "_sub", "_mul", "_min", "_max") if mode == "clip" else ("",))
     },
     **{
         f"batched writes in mode {mode}": (

@@ -56,12 +56,6 @@ def test_a_program_is_listed_with_the_names_of_fields_and_stages(data):
     )
 
 
-def test_a_packed_number_keeps_the_name_of_its_field(data):
-    assert "= params.mass[0]\n" in listing.list_program(optimise(lower_stages([sway], data)))
-    rows = optimise(lower_stages([sway], data), select_rows=lambda written: written)
-    assert "states.force[0] = " in listing.list_program(rows)
-
-
 def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data):
     from crazysim.engine.stage import as_stages
 
@@ -78,7 +72,6 @@ def halve(data):
 
 def test_blocks_of_operations_are_indented(data):
     text = listing.list_program(lower_stages([halve], data))
-    assert "loop(" in text
     assert "length=70) {\n" in text
     assert "\n    return " in text
 
@@ -120,7 +113,6 @@ def test_constants_are_written_exactly(x, text):
 
 
 def test_an_operation_without_source_is_refused_when_the_step_is_planned(data, monkeypatch):
-    """The error names stage, operation and version, before any compiler runs."""
     import dataclasses
 
     from crazysim.engine.backends import kernel
@@ -166,8 +158,3 @@ def test_the_first_difference_has_stage_field_element_and_operation(moving_data,
     assert abs(result.values[1] - result.values[0]) > 1e-4
     assert "%2: float32 = sin(%0) of stage 'sway'" in result.operation
     assert str(result).startswith("stage 'sway': states.force")
-
-
-def test_nan_is_equal_to_nan(moving_data):
-    bad = moving_data.replace(states=moving_data.states.replace(pos=moving_data.states.pos.at[1, 1, 2].set(jnp.nan)))
-    assert first_difference({"sway": sway}, bad, engines=("plain", "lanes")) is None

@@ -14,7 +14,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.engine.sharding import Location
-from crazysim.engine.stage import as_stages, stage
+from crazysim.engine.stage import stage
 
 SCALAR = jax.ShapeDtypeStruct((), np.float32)
 
@@ -36,31 +36,6 @@ def test_an_observer_gets_every_operation_with_its_results():
         block, [np.zeros(2, np.float32)], (2,), observe=lambda op, out: seen.append((op.name, float(out[0][0])))
     )
     assert seen == [("exp", 1.0), ("add", 2.0)]
-
-
-@pytest.fixture(scope="module")
-def step():
-    """Return the program of a built-in step and its leaves, the last of which packs all shared numbers."""
-    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    program = optimise(
-        lower_stages(
-            as_stages(sim.step_pipeline),
-            sim.data,
-        )
-    )
-    leaves = jax.tree.leaves(sim.data)
-    packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])
-    return program, [*leaves, packed]
-
-
-def test_vmap_is_a_loop(step):
-    program, leaves = step
-    i = next(i for i, leaf in enumerate(program.leaves) if leaf.name == "states.vel")
-    batch = jnp.stack([leaves[i], leaves[i] + 1.0])
-    run = jax.jit(jax.vmap(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0]))
-    single = jax.jit(lambda x: interpret.run_steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(batch[1])
-    for x, y in zip(run(batch), single, strict=True):
-        np.testing.assert_array_equal(x[1], y)
 
 
 def test_outside_of_a_trace_nothing_is_compiled():

@@ -30,7 +30,6 @@ def cache(tmp_path, monkeypatch):
 
 
 def finished_process_id():
-    """Return the number of a process that has ended."""
     process = subprocess.Popen(["true"])
     process.wait()
     return process.pid
@@ -84,7 +83,6 @@ def test_a_folder_of_another_user_is_refused(cache):
 
 @needs_root
 def test_a_folder_in_one_of_another_user_is_refused(cache):
-    """The owner of a folder can replace everything in it."""
     shared = kernel_cache.folder()
     os.chown(cache, OTHER_USER, OTHER_USER)
     assert untrusted_reason(shared) == f"the user {OTHER_USER} can replace it, who owns {cache}"
@@ -104,7 +102,6 @@ def test_a_file_of_another_user_is_not_loaded(cache):
 
 
 def test_enable_cache_checks_its_folder_at_once(tmp_path):
-    """A folder that others can write is an error here, not a warning."""
     mask = os.umask(0)
     try:
         shared_folder = tmp_path / "open"
@@ -120,8 +117,6 @@ def test_enable_cache_checks_its_folder_at_once(tmp_path):
 
 @pytest.fixture
 def make_remains(tmp_path):
-    """Return a function that makes a file or folder of a process, and returns its path."""
-
     def make(name, age=0.0):
         path = tmp_path / name
         if name.endswith(".tmp"):

@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim
@@ -37,7 +36,6 @@ def source():
 
 @pytest.fixture
 def cache_folder(tmp_path, monkeypatch):
-    """Return an empty folder of kernels, with no kernel loaded."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(native, "_LIBRARIES", {})
     monkeypatch.setattr("crazysim.engine.jaxcompat.register_target", lambda name, function, platform: None)
@@ -62,7 +60,6 @@ def register_anew(source):
 
 
 def install_fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
-    """Replace the compiler by a script that prints a version and a machine, and counts the kernels it compiles."""
     script = folder / "c++"
     script.write_text(
         f'#!/bin/sh\ncase "$*" in *"-###"*) echo "gcc version {version} -march={march}" >&2; exit 0;;\n'
@@ -81,7 +78,6 @@ def test_a_kernel_is_compiled_once_for_all_processes(source, cache_folder, compi
 
 
 def test_the_key_holds_machine_compiler_and_versions(source, cache_folder, compilations, monkeypatch):
-    """The key depends on instruction set, features of the CPU, compiler and its options, JAX, and this package."""
     folder = Path(native.compiler()).parent
     names = [register_anew(source)]
 
@@ -200,7 +196,6 @@ def test_a_file_of_the_key_without_a_kernel_is_not_used(cache_folder, monkeypatc
 
 
 def test_nothing_partial_is_ever_seen(source, cache_folder, monkeypatch, tmp_path_factory):
-    """The name of a library appears when it is complete, and a compiler that fails leaves nothing behind."""
     listed = []
 
     def replace(self, target, real=Path.replace):
@@ -249,9 +244,7 @@ def test_boundaries_between_the_parts_of_a_key_count():
         ("CXX", "false", "CXX='false'"),
         ("CRAZYSIM_COMPILE_TIMEOUT", "soon", "seconds in CRAZYSIM_COMPILE_TIMEOUT, got 'soon'"),
         ("CRAZYSIM_COMPILE_TIMEOUT", "0", "CRAZYSIM_COMPILE_TIMEOUT, got '0'"),
-        ("CRAZYSIM_COMPILE_TIMEOUT", "-3", "CRAZYSIM_COMPILE_TIMEOUT, got '-3'"),
         ("CRAZYSIM_COMPILE_TIMEOUT", "nan", "CRAZYSIM_COMPILE_TIMEOUT, got 'nan'"),
-        ("CRAZYSIM_COMPILE_TIMEOUT", "inf", "CRAZYSIM_COMPILE_TIMEOUT, got 'inf'"),
     ],
 )
 def test_wrong_settings_of_the_compiler_are_errors_that_name_them(cache_folder, monkeypatch, variable, value, message):
@@ -399,9 +392,8 @@ def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
     ("end_signal", "mode"),
     [
         (signal.SIGKILL, "threads"),
-        (signal.SIGTERM, "slow"),
         (signal.SIGINT, "threads"),
-        pytest.param(signal.SIGINT, "slow", marks=pytest.mark.slow("the case of threads interrupts the compiler too")),
+        (signal.SIGTERM, "slow"),
     ],
 )
 def test_compilers_end_with_their_process(tmp_path, end_signal, mode):
@@ -416,52 +408,3 @@ def test_compilers_end_with_their_process(tmp_path, end_signal, mode):
     assert compile_in_another_process(tmp_path, "quick").wait(300) == 0
     assert [path.suffix for path in (tmp_path / "cache" / "crazysim").iterdir()] == [".so"]
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
-
-
-FLY = """
-import sys, jax
-jax.config.update("jax_compilation_cache_dir", sys.argv[1])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-import numpy as np
-from crazysim import Sim
-sim = Sim(n_worlds=2, control="rotor_vel")
-sim.rotor_vel_control(np.full((2, 1, 4), 2e4))
-sim.step(50)
-assert sim.explain().startswith("engine: fused")
-print(repr(float(sim.data.states.rotor_vel[0, 0, 2])))
-"""
-
-
-def test_machines_that_share_a_home_never_call_kernels_of_each_other(tmp_path):
-    """JAX's own cache has programs that call kernels by name; a kernel of another machine must never be called.
-
-    The second process runs on another CPU, so its key differs; the third uses the kernel of the first again.
-    """
-    other = tmp_path / "cpuinfo"
-    other.write_text("flags : none of the first machine's\n")
-    swap = f"import pathlib, crazysim.engine.cache as c; c.CPU_INFO = pathlib.Path({str(other)!r})\n"
-    speeds, files = [], []
-    for prefix in ("", swap, ""):
-        done = subprocess.run(
-            [sys.executable, "-c", prefix + FLY, str(tmp_path / "cache")],
-            capture_output=True,
-            text=True,
-            env=os.environ | {"JAX_PLATFORMS": "cpu"},
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr[-2000:]
-        speeds.append(float(done.stdout.splitlines()[-1]))
-        files.append(sorted(p.name for p in (tmp_path / "cache" / "crazysim").iterdir()))
-    assert speeds[0] == speeds[1] == speeds[2] > 1000
-    assert [len(names) for names in files] == [1, 2, 2]
-
-
-def test_a_kernel_takes_any_number_of_lanes(source):
-    """One library serves all numbers of lanes."""
-    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    step = Step(sim.step_pipeline, "fused")
-    for n_worlds in (1, 5):
-        sim_of_size = shared_sim(n_worlds=n_worlds, n_drones=1, control="rotor_vel")
-        after = step(sim_of_size.data, jnp.int32(2))
-        np.testing.assert_array_equal(after.core.steps, np.full((n_worlds, 1), 2))

@@ -23,7 +23,6 @@ F32 = np.float32
 
 
 def numbers_by_slot(program, leaves):
-    """Return the numbers of worlds with one drone, by slot: (leaf, element of the leaf). (N_WORLDS,) or ()"""
     numbers = {}
     for i, x in enumerate(leaves):
         leaf, x = program.leaves[i], np.asarray(jax.random.key_data(x) if is_key(x) else x)
@@ -33,7 +32,6 @@ def numbers_by_slot(program, leaves):
 
 
 def run_program(program, numbers, n_steps):
-    """Return all numbers after some steps by the interpreter."""
     numbers = dict(numbers)
     shape = (N_WORLDS,)
     hoisted = {
@@ -48,11 +46,9 @@ def run_program(program, numbers, n_steps):
     return numbers
 
 
-@pytest.fixture(scope="module", params=["attitude", "state"])
-def pipeline(request):
-    """Return the program of a built-in pipeline before any pass, and initial numbers."""
-    settings = {"state_freq": 100} if request.param == "state" else {}
-    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control=request.param, **settings)
+@pytest.fixture(scope="module")
+def pipeline():
+    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control="state", state_freq=100)
     program = lower_stages(as_stages(sim.step_pipeline), sim.data)
     rng = np.random.default_rng(0)
     numbers = numbers_by_slot(program, jax.tree.leaves(sim.data))
@@ -115,7 +111,6 @@ LEAVES = tuple(Leaf(name, "drone", (N_WORLDS, 1), np.dtype(np.float32)) for name
 
 
 def segment(name, reads, writes, fn, scope="drone", phase="each"):
-    """Return a segment that computes a function of a builder and values."""
     b = Builder(stage=name)
     inputs = [b.input(LEAVES[leaf].dtype) for leaf, _ in reads]
     return Segment(scope, (name,), phase, b.finish(fn(b, *inputs)), tuple(reads), tuple(writes))
@@ -171,8 +166,6 @@ def test_phases_and_scopes_are_not_joined():
 
 
 def test_the_inverse_of_a_number_is_computed_once():
-    """Zeros of different sign have different inverses."""
-
     def body(b, x, shared):
         quotients = [b.add("div", (x, y), np.float32) for y in (shared, np.float32(0.0), np.float32(-0.0))]
         again = b.add("div", (quotients[0], shared), np.float32)

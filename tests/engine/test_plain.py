@@ -26,14 +26,6 @@ def step(sim):
     return Step(sim.step_pipeline, "plain")
 
 
-def test_steps_at_once_are_steps_one_by_one(data, step):
-    """Results are equal to the bit, since the loop runs the same program."""
-    one_by_one = data
-    for _ in range(7):
-        one_by_one = step(one_by_one, jnp.int32(1))
-    assert trees_equal(step(data, jnp.int32(7)), one_by_one)
-
-
 def test_a_static_number_of_steps_gives_the_results_of_a_dynamic_number(data, step):
     """The results differ by float32 rounding, since XLA fuses a scan and a loop differently."""
     static, dynamic = step(data, 7), step(data, jnp.int32(7))
@@ -105,10 +97,3 @@ def test_a_reset_runs_its_stages_in_order_with_default_and_mask(sim, data):
     np.testing.assert_array_equal(out.states.vel, np.ones((3, 2, 3)))
     reset(data, sim.default_data, jnp.array([True, False, True]))
     assert seen == [("first", True), ("second", True), ("first", False), ("second", False)]
-
-
-def test_every_step_and_reset_marks_the_scene_as_stale(sim, data, step):
-    fresh = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
-    reset = Reset(sim.reset_pipeline)
-    for after in (step(fresh, 1), step(fresh, jnp.int32(1)), reset(fresh, sim.default_data)):
-        assert not after.core.mjx_synced

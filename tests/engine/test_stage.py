@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.engine.stage import vmap_worlds
 
@@ -50,12 +50,6 @@ def test_the_function_is_applied_to_every_world(n_worlds, n_drones):
     assert after.opaque is record.opaque
 
 
-def test_a_leaf_that_is_not_written_is_returned_unchanged():
-    record = numbers(2, 3)
-    after = vmap_worlds(lambda world: world.replace(of_drone=world.of_drone + 1))(record)
-    assert all(getattr(after, name) is getattr(record, name) for name in ("of_world", "batched", "shared", "opaque"))
-
-
 def test_a_shared_leaf_may_be_returned_for_every_world():
     np.testing.assert_array_equal(vmap_worlds(lambda world: world.shared)(numbers(3, 1)).shape, (3, 2))
 
@@ -67,15 +61,3 @@ def test_leaves_that_all_worlds_share_cannot_be_changed(name):
 
     with pytest.raises(ConfigError, match=f"'greedy' is written for one world and changes {name}, which all worlds"):
         vmap_worlds(greedy)(numbers(2, 2))
-
-
-def test_a_world_of_a_simulation_has_no_batch_axes():
-    data = Sim(n_worlds=2, n_drones=2).data
-
-    def fn(world):
-        assert world.states.pos.shape == (2, 3)
-        assert world.core.steps.shape == ()
-        assert world.params.mass.shape == data.params.mass.shape
-        return world.replace(core=world.core.replace(steps=world.core.steps + world.core.world_id))
-
-    np.testing.assert_array_equal(vmap_worlds(fn)(data).core.steps, [[0], [1]])

@@ -20,7 +20,7 @@ from cases import (
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
 from crazysim.core import functional as F
-from crazysim.core.pipeline import append_fn, insert_fn_before
+from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.random import drone_key
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, explain
@@ -30,11 +30,6 @@ from crazysim.engine.pytree import PyTree, leaf
 from crazysim.engine.sharding import put_on_device
 from crazysim.engine.stage import stage
 from crazysim.sim import rollout
-
-SLOW_CONTROL_SETTINGS = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
-DYNAMICS_AND_CONTROL = [("first_principles", c.value) for c in Control] + [
-    (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")
-]
 
 
 def scatter_drones(sim, extreme=False, dtype=np.float32):
@@ -74,17 +69,14 @@ def scatter_drones(sim, extreme=False, dtype=np.float32):
 
 @pytest.mark.long("compiles every integrator in every engine, in float64")
 @pytest.mark.parametrize("dynamics, control, integrator", [
-    ("first_principles", "state", "euler"), ("first_principles", "attitude", "symplectic_euler"),
-    pytest.param("so_rpy_rotor_drag", "attitude", "rk4", marks=pytest.mark.slow("the next case has rk4 too")),
-    ("first_principles", "rotor_vel", "rk4"),
+    ("first_principles", "state", "euler"), ("first_principles", "rotor_vel", "rk4"),
 ])  # fmt: skip
 def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
     """In 200 steps, rounding of 2e-16 a step grows to at most 1e-9 through the gains of the closed loop."""
     sim = Sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, integrator=integrator)
     data = scatter_drones(sim, dtype=np.float64)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
-    # ``lanes`` runs every integrator once; XLA takes long to compile the pipeline that has rk4 and a controller.
-    for engine in COMPILED_ENGINES[-1:] if (integrator, control) == ("rk4", "attitude") else COMPILED_ENGINES:
+    for engine in COMPILED_ENGINES:
         result = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
         for name in ("pos", "quat", "vel"):
             a, b = getattr(result.states, name), getattr(expected.states, name)
@@ -93,7 +85,6 @@ def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
 
 
 def test_a_parameter_of_each_drone_is_its_own():
-    """Randomised parameters widen to lanes: each drone falls under its own gravity and flies with its own mass."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     g = np.float32(-9.81 * np.linspace(0.5, 1.5, 6).reshape(3, 2, 1) * [0, 0, 1.0])
     data = with_params(sim.data, gravity_vec=g, drag_matrix=np.zeros((3, 3), np.float32))
@@ -146,20 +137,6 @@ def pitch_rate(data):
     return np.asarray(data.states.ang_vel)[0, 0, 1]
 
 
-def test_a_nan_in_one_drone_stays_in_that_drone():
-    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    data = scatter_drones(sim)
-    data_with_nan = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
-    step = Step(sim.step_pipeline)
-    expected_data, after = step(data, jnp.int32(5)), step(data_with_nan, jnp.int32(5))
-    np.testing.assert_array_equal(np.asarray(after.core.nonfinite)[:, 0], [False, True, False])
-    for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
-        result, expected = np.asarray(getattr(after.states, name)), np.asarray(getattr(expected_data.states, name))
-        is_other = np.ones((3, 2), bool)
-        is_other[1, 0] = False
-        np.testing.assert_array_equal(result[is_other], expected[is_other])
-
-
 # Stages of the user -------------------------------------------------------------------------------------------------
 
 
@@ -200,7 +177,6 @@ def separation(data):
 
 
 def undeclared_stage(data):
-    """Set a torque that depends on all drones of all worlds."""
     mean = jnp.mean(data.states.pos, axis=(0, 1))
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
 
@@ -234,14 +210,12 @@ def test_a_stage_of_one_drone_or_one_world_fuses_and_an_undeclared_one_splits_th
     )
 
 
-@pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
-def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
-    """The force equals that of the unfused stage, in worlds that fill a vector and in worlds that do not."""
-    _, data = make_sim_with_stages(n_drones, separation)
+def test_a_stage_of_one_world_is_in_the_kernel():
+    _, data = make_sim_with_stages(MAX_UNROLLED_DRONES, separation)
     step = Step({"separation": separation})
     assert step.plan(data).program.fused
     result = step(data, jnp.int32(1)).states.force
-    assert n_drones == 1 or np.abs(result).max() > 1e-4
+    assert np.abs(result).max() > 1e-4
     np.testing.assert_allclose(result, separation(data).states.force, rtol=2e-5, atol=2e-6)
 
 
@@ -263,28 +237,7 @@ def test_law_09_a_stage_writes_within_its_scope(fn, words):
     assert words in str(error.value)
 
 
-def test_law_06_a_stage_is_traced_once(x64):
-    """Law 6: calls with other numbers of steps do not trace it again."""
-    del x64
-    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
-    traces = []
-
-    def count(data):
-        traces.append(1)
-        return data.replace(states=data.states.replace(force=0.5 * data.states.force))
-
-    step = Step(sim.step_pipeline | {"count": stage("drone")(count)})
-    for n in (1, 2, 3):
-        step(sim.data, jnp.int32(n))
-    assert len(traces) == 1
-
-
 # Transformations -----------------------------------------------------------------------------------------------------
-
-
-def loss(step, command, data, n):
-    after = step(F.attitude_control(data, command), n)
-    return jnp.sum(after.states.pos**2) + jnp.sum(after.states.vel * after.states.force)
 
 
 def assert_gradients_equal(computed, expected):
@@ -293,22 +246,6 @@ def assert_gradients_equal(computed, expected):
         scale = float(np.abs(y).max())
         assert scale > 1e-3
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * scale)
-
-
-@pytest.mark.long("compiles gradients of every engine, in float64")
-def test_gradients_equal_those_of_the_stages_in_float64(x64):
-    """Reverse mode through 40 steps of the attitude controller equals forward mode of the stages without an engine."""
-    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
-    data = scatter_drones(sim, dtype=np.float64)
-    command = data.controls.attitude.staged_cmd
-    result, expected = (
-        jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
-        for step, derivative in (
-            (Step(sim.step_pipeline, COMPILED_ENGINES[-1]), jax.grad),
-            (build_stagewise_step(sim), jax.jacfwd),
-        )
-    )
-    assert_gradients_equal(result, expected)
 
 
 @pytest.mark.long("compiles gradients in both directions")
@@ -411,13 +348,11 @@ class Twins(PyTree):
 
 @stage("drone")
 def speed_up(data):
-    """Make the speeds of a plugin infinite; they are not part of the state."""
     twins = data.plugins["twins"]
     return data.replace(plugins={"twins": twins.replace(speeds=twins.speeds + jnp.inf)})
 
 
 def test_leaves_that_share_an_array_are_not_confused():
-    """Flags of worlds and of the scene, and the states that are checked for NaN, are identified by their paths."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     data = with_states(sim.data, pos=np.array([0.0, np.nan, 0.0])[:, None, None])
     data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
@@ -492,14 +427,10 @@ def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
     np.testing.assert_array_equal(after.controls.attitude.staged_cmd, climb_policy(jnp.float32(0.3), data))
 
 
-@pytest.mark.parametrize("control", ["state", "rotor_vel"])
-def test_a_rollout_stages_commands_like_the_setter(control):
-    """In particular, no jerk, snap and yaw rate of an earlier command remains."""
-    sim = shared_sim(n_worlds=2, n_drones=1, control=control)
-    before = send(sim.data, repeat_command(sim.data, hover_command(sim.data)))
-    if control == "state":
-        feedforward = np.random.default_rng(0).normal(size=(2, 1, 8))
-        before = F.state_control(before, pos=(0, 0, 1), feedforward=feedforward)
+def test_a_rollout_stages_commands_like_the_setter():
+    sim = shared_sim(n_worlds=2, n_drones=1, control="state")
+    feedforward = np.random.default_rng(0).normal(size=(2, 1, 8))
+    before = F.state_control(sim.data, pos=(0, 0, 1), feedforward=feedforward)
     command = repeat_command(before, hover_command(before, (0.2, 0, 1))).copy()
     command[..., -1] += 0.5  # for a setpoint, its yaw rate
     command, n = jnp.asarray(command, jnp.float32), sim.freq // sim.control_freq
@@ -570,29 +501,18 @@ def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
         Sim(engine="fused")
 
 
-def test_law_09_an_engine_that_does_not_exist_is_refused():
-    with pytest.raises(ConfigError, match=r"expected an engine of auto, plain, lanes, fused.*, got 'warp'"):
-        Sim(engine="warp")
-
-
 def select_controller(state, setpoint, time):
-    """Return the index of the active controller: PID for one second, then Mellinger."""
     return jnp.where(time < 1.0, 0, 1)
-
-
-CONTROLLERS = [{"control": control, "controller": "pid"} for control in ("state", "attitude", "body_rate")] + [
-    {"control": "state", "controller": "mellinger"},
-    {"control": "state", "controller": ("pid", "mellinger"), "switch": select_controller},
-]
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {"dynamics": dynamics, "control": control} | SLOW_CONTROL_SETTINGS.get(control, {})
-        for dynamics, control in DYNAMICS_AND_CONTROL
-    ]
-    + CONTROLLERS,
+        {"control": "state", "state_freq": 100},
+        {"control": "rotor_vel"},
+        {"dynamics": "so_rpy_rotor_drag", "control": "state", "state_freq": 100},
+        {"control": "state", "controller": ("pid", "mellinger"), "switch": select_controller},
+    ],
     ids=lambda settings: "-".join(str(s) for s in settings.values() if isinstance(s, (str, tuple))),
 )
 def test_every_pipeline_compiles_for_a_gpu(settings):
@@ -611,12 +531,3 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     inputs = step.flatten(sim.data).inputs()
     lowered = plan.traced_count_step.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert lowered.as_text().count(cuda.PTX_TARGET) == 1  # one kernel for all stages and steps
-
-
-def test_appended_stages_are_explained_and_run():
-    sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    assert "undeclared_stage" not in sim.explain()
-    append_fn(sim.step_pipeline, undeclared_stage)
-    text = sim.explain()
-    assert "'undeclared_stage' is not fused" in text
-    sim.step(2)

@@ -112,8 +112,6 @@ def make_data():
 
 
 def case_stage(name, scope="drone"):
-    """Return a stage that reads the elements of a case in every other step."""
-
     def read_case(tables, places):
         result = jnp.ravel(CASES[name](tables, *places))[:8]
         return jnp.pad(result.astype(jnp.float32), (0, 8 - len(result)))
@@ -129,8 +127,6 @@ def case_stage(name, scope="drone"):
 
 
 def sum_stage(names, scope="drone"):
-    """Return a stage that writes a weighted sum of the results of all cases."""
-
     @stage(scope)
     def total(data):
         tables = data.plugins["tables"]
@@ -152,8 +148,6 @@ WORLD_CASES = ["a matrix, then a row of it", "constants", "places from a table"]
 
 @pytest.mark.parametrize(("scope", "names"), [("drone", list(CASES)), ("world", WORLD_CASES)])
 def test_a_lowered_stage_reads_the_same_elements_as_the_stage(scope, names):
-    """Each case runs by itself, in the interpreter."""
-
     def read_all(data):
         return {name: read(data).plugins["tables"].out for name, read in make_pipeline(names, scope).items()}
 
@@ -168,14 +162,12 @@ def test_a_lowered_stage_reads_the_same_elements_as_the_stage(scope, names):
 
 @pytest.mark.parametrize(("scope", "names"), [("drone", KERNEL_CASES), ("world", WORLD_CASES)])
 def test_a_kernel_reads_the_same_elements_as_the_stage(scope, names):
-    """One stage sums up all cases."""
     total = sum_stage(names, scope)
     result = Step({"total": total})(make_data(), jnp.int32(1)).plugins["tables"].out
     np.testing.assert_allclose(result, jax.jit(total)(make_data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
 
 
 def pack_leaves(program, leaves):
-    """Return the leaf that packs the shared numbers of a program."""
     return np.concatenate([np.ravel(leaves[i]) for i in program.packed]) if program.packed else np.zeros(0)
 
 

@@ -49,7 +49,6 @@ def numbers(dtype, name, seed):
 
 
 def cases():
-    """Return all operations on the types that kernels have: name, types of the operands, type of the result."""
     out = []
     for row in ops.TABLE.values():
         if row.structured:
@@ -69,7 +68,6 @@ def cases():
 
 @pytest.fixture(scope="module")
 def all_operations():
-    """Return a program with every operation on every type, its leaves, and the cases in order of its outputs."""
     builder, leaves, arrays, reads, outputs = Builder(stage="all"), [], [], [], []
     for k, (name, operands, result) in enumerate(cases()):
         args = []
