@@ -168,12 +168,6 @@ def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
         assert trees_equal(sim.default_data, shorthand.default_data)
 
 
-@pytest.mark.parametrize("plugins", [Wind(), "imu", [Wind], None], ids=str)
-def test_law_09_plugins_of_a_simulation_are_a_list(plugins):
-    with pytest.raises(ConfigError, match=r"expected plugins as a list of plugins, got .*plugins=\[Wind\(\)\]"):
-        Sim(plugins=plugins)
-
-
 def test_remove_restores_the_simulation_before_the_plugin():
     """Plugins are removed in any order. Stages, records and every bit of a flight are as before."""
     sim = make_hovering_sim(engine="interpret")

@@ -16,7 +16,6 @@ from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
 from crazysim.engine.pytree import PyTree, check_axes, leaf, scopes
-from crazysim.engine.sharding import world_mesh
 from crazysim.errors import EngineWarning
 
 COUNTS = [(2, 2, 2), (3, 2, 4), (4, 3, 1)]
@@ -119,18 +118,6 @@ def test_a_derivative_reaches_the_drones_from_a_mass():
     slope = np.asarray(jax.jit(jax.grad(height))(sim.data.plugins["springs"].pos))
     assert np.all(slope[1, :, 2] != 0)
     assert np.all(slope[0] == 0)
-
-
-def test_worlds_are_spread_over_devices():
-    kinds = (Springs, Tying)
-    unsharded_sim = build_springs(kinds, 4, 2, 3)
-    sharded_sim = build_springs(kinds, 4, 2, 3, mesh=world_mesh(jax.devices("cpu")[:2]))
-    for sim in (unsharded_sim, sharded_sim):
-        sim.step(8)
-    for record in sharded_sim.data.plugins.values():
-        assert len(record.pos.sharding.device_set) == 2
-    for name, value in states_by_name(unsharded_sim.data).items():
-        np.testing.assert_allclose(states_by_name(sharded_sim.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
 def test_random_numbers_are_those_of_world_and_member():

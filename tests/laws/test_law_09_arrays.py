@@ -276,12 +276,6 @@ def test_states_and_flat_data_of_another_environment_are_refused(settings):
         env.step(None, action)
 
 
-def test_reset_without_keys_is_refused():
-    env, _, _ = hover()
-    with pytest.raises(ConfigError, match="expected a random key"):
-        env.reset(jax.random.split(jax.random.key(0), 3)[:0])
-
-
 @pytest.mark.parametrize(
     "memory", [jnp.zeros((N_WORLDS, 3)), jnp.zeros((N_WORLDS, 2), int), {"h": jnp.zeros((N_WORLDS, 2))}]
 )

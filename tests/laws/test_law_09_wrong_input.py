@@ -123,18 +123,6 @@ def test_device_commands_are_checked_only_on_request(level_sim):
     sim.data = before
 
 
-def test_commands_are_cast_to_the_type_of_the_state(level_sim):
-    """The documented conversion: values may lose digits, and are never clipped."""
-    before = level_sim.data
-    level, shape = level_sim.control.value, command_shape(level_sim.data, level_sim.control)
-    command = np.arange(np.prod(shape)).reshape(shape) * 1000
-    for equal_command in (command, command.tolist(), command.astype(np.float64), jnp.asarray(command, jnp.int32)):
-        data = getattr(F, f"{level}_control")(before, equal_command)
-        staged = data.controls.rotor_vel if level == "rotor_vel" else getattr(data.controls, level).staged_cmd
-        assert staged.dtype == before.states.pos.dtype
-        np.testing.assert_array_equal(staged, command)
-
-
 @pytest.fixture(scope="module")
 def sim():
     return Sim(n_worlds=3, n_drones=1)
@@ -321,11 +309,6 @@ def test_data_of_another_simulation_is_refused_where_it_is_assigned(sim, name, w
     assert sim.default_data is default
 
 
-def test_commands_under_jit_are_checked_in_shape_too(sim):
-    with pytest.raises(ValueError, match=r"has shape \(1, 4\)"):
-        jax.eval_shape(lambda data, cmd: F.attitude_control(data, cmd, check_finite=True), sim.data, jnp.zeros((1, 4)))
-
-
 @pytest.mark.parametrize(
     "call",
     [
@@ -350,15 +333,3 @@ def test_default_data_of_another_simulation_are_refused_by_a_reset(sim):
     for other in (Sim(n_worlds=2), Sim(n_worlds=3, control="state")):
         with pytest.raises(ConfigError, match="of one simulation"):
             sim.reset_fn(sim.data, other.default_data)
-
-
-@pytest.mark.parametrize("name", ["", 5])
-def test_a_name_of_an_object_is_a_text(sim, name):
-    with pytest.raises(ConfigError, match="non-empty string as name of an object"):
-        sim.scene.add("box", name=name)
-
-
-def test_replace_takes_a_plugin(sim):
-    for plugin in (None, "wind"):
-        with pytest.raises(ConfigError, match="expected a plugin"):
-            sim.replace(plugin)
