@@ -8,28 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim as cs
-from crazysim.core.plugin import StagePlacement, param
+from crazysim.core.plugin import Param, StagePlacement, param, state
 from crazysim.core.population import Population
-from crazysim.engine.pytree import Members, leaf
 from crazysim.engine.stage import stage
 
 STIFFNESS = 40.0
 """Stiffness of the springs, N/m."""
-
-
-class Masses(Members):
-    """Point masses."""
-
-    pos: jax.Array = leaf("member", 1)
-    """Position, world frame, m. (3,)"""
-    vel: jax.Array = leaf("member", 1)
-    """Velocity, world frame, m/s. (3,)"""
-    cmd: jax.Array = leaf("member", 1)
-    """Position to which the spring pulls, world frame, m. (3,)"""
-    ticks: jax.Array = leaf("member")
-    """Number of ticks of the controller. ()"""
-    stiffness: jax.Array = leaf("parameter", 1, (1,))
-    """Stiffness of the spring, N/m. (1,)"""
 
 
 class Springs(Population):
@@ -38,7 +22,16 @@ class Springs(Population):
     members: int | Sequence[str] = 1
     name: str = "springs"
     rate: int | None = 100
-    stiffness: float | tuple = param(default=STIFFNESS, keep=False)
+    pos: Param = param(default=None, core=(3,), scope="member")
+    """Position, world frame, m. (3,)"""
+    vel: jax.Array = state((3,), scope="member")
+    """Velocity, world frame, m/s. (3,)"""
+    cmd: jax.Array = state((3,), scope="member")
+    """Position to which the spring pulls, world frame, m. (3,)"""
+    ticks: jax.Array = state((), scope="member", dtype=np.int32)
+    """Number of ticks of the controller. ()"""
+    stiffness: Param = param(default=STIFFNESS)
+    """Stiffness of the spring, N/m. (1,)"""
     prefix: ClassVar[str] = "Mass"
     command_field: ClassVar[str] = "cmd"
 
@@ -46,29 +39,24 @@ class Springs(Population):
     def control_freq(self):
         return self.rate
 
-    def record(self, sim):
+    def bind(self, sim):
         start = np.arange(1.0, self.n_members + 1)[:, None] * np.ones(3)
-        stiffness = np.atleast_1d(np.float32(self.stiffness))
-        return self.create(
-            sim, Masses, pos=start, vel=np.zeros(3), cmd=np.zeros(3), ticks=np.int32(0), stiffness=stiffness
-        )
+        return self.replace(pos=start).with_arrays(sim)
 
     def control(self, data):
-        record = self.read(data)
-        return record.replace(ticks=record.ticks + 1)
+        return self.replace(ticks=self.ticks + 1)
 
     def derivative(self, data):
-        record = self.read(data)
-        assert record.pos.shape == (3,)
+        assert self.pos.shape == (3,)
         assert data.states.pos.shape == (data.core.n_drones, 3)
-        return {"pos": record.vel, "vel": record.stiffness * (record.cmd - record.pos)}
+        return {"pos": self.vel, "vel": self.stiffness * (self.cmd - self.pos)}
 
 
 class Crowd(Springs):
     """Springs whose masses also attract each other."""
 
     def derivative(self, data):
-        rates, pos = super().derivative(data), self.read(data).pos
+        rates, pos = super().derivative(data), self.pos
 
         def pull(other, is_self):
             return jnp.where(is_self, 0.0, other - pos)
@@ -81,7 +69,7 @@ class Tied(Springs):
 
     def derivative(self, data):
         rates = super().derivative(data)
-        return rates | {"vel": rates["vel"] + jnp.mean(data.states.pos - self.read(data).pos, axis=0)}
+        return rates | {"vel": rates["vel"] + jnp.mean(data.states.pos - self.pos, axis=0)}
 
 
 class Tying(Springs):

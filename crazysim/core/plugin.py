@@ -23,7 +23,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, setting
 from crazysim.drones import Airframe
-from crazysim.engine.pytree import CORE_NDIM_KEY, PyTree, Scope, device_array
+from crazysim.engine.pytree import CORE_NDIM_KEY, Members, PyTree, Scope, device_array
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
 from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
@@ -113,7 +113,7 @@ def param(
         default: Default value; None for the airframe's value, or for none.
         core: Shape of the number of one drone.
         scope: ``"parameter"`` for a number for all drones or one per drone, ``"shared"`` for one for all drones, or
-            ``"drone"`` for a state that begins an episode with this number.
+            ``"drone"`` for a state that begins an episode with this number; ``"member"`` in a population.
         airframe: Dotted path or function of the airframe that gives the number if it is None.
         low: Smallest value allowed.
         high: Largest value allowed.
@@ -148,7 +148,7 @@ def state(
 
     Args:
         core: Shape of the state of one drone, or of one world.
-        scope: ``"drone"`` or ``"world"``.
+        scope: ``"drone"`` or ``"world"``; ``"member"`` in a population.
         dtype: Type; None for the type of the states.
         optional: True for a state that is None unless ``bind`` gives it a value.
         sparse: As in ``crazysim.engine.pytree.leaf``.
@@ -243,6 +243,7 @@ def check_parameter(
     allowed: Range = ANY_NUMBER,
     dtype: DTypeLike | None = None,
     per_axis: bool = False,
+    n_members: int | None = None,
 ) -> Array:
     """Return a setting as an array that all drones share, or with one entry per drone.
 
@@ -255,24 +256,30 @@ def check_parameter(
         allowed: Range of all entries, such as ``crazysim.tables.range_between(low=0.0)``.
         dtype: Type; None for the type of the states.
         per_axis: True to accept one number for all axes of a vector.
+        n_members: Number of members of a population, for a number of its members instead of the drones; it may also be
+            (n_members, *core), the same in all worlds.
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
     """
-    batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
-    if core == (1,) and array.shape == batch:
+    batch, array, kind = sim.data.states.pos.shape[:2], np.asarray(value), "drone"
+    batches = [batch]
+    if n_members is not None:
+        batch, kind = (sim.n_worlds, n_members), "member"
+        batches = [(n_members,), batch]
+    if core == (1,) and array.shape in batches and array.shape != core:
         array = array[..., None]
     is_number = array.dtype.kind in ("iu" if dtype is not None and np.issubdtype(dtype, np.integer) else "iuf")
     is_shared = array.shape == core or (array.ndim == 0 and (per_axis or core != (3,)))
     require(
-        is_number and (is_shared or array.shape == (*batch, *core)),
-        f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all drones, or "
-        f"{(*batch, *core)} = (n_worlds, n_drones, {', '.join(map(str, core))}) for each, got shape "
+        is_number and (is_shared or array.shape in [(*x, *core) for x in batches]),
+        f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all {kind}s, or "
+        f"{(*batch, *core)} = (n_worlds, n_{kind}s, {', '.join(map(str, core))}) for each, got shape "
         f"{array.shape} and type {array.dtype}",
     )
     array = read_numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
-    return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
+    return device_array(np.broadcast_to(array, core if is_shared else (*batch, *core)), dtype)
 
 
 def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
@@ -281,8 +288,18 @@ def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
-def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any]) -> Array | None:
-    """Return the array of a field for all worlds; ``name`` is its name in messages."""
+def bind_leaf(
+    sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any], n_members: int | None = None
+) -> Array | None:
+    """Return the array of a field for all worlds.
+
+    Args:
+        sim: The simulation.
+        name: Name of the field in messages.
+        value: The user's number, or None.
+        metadata: Declaration of the field.
+        n_members: Number of members of the population to which the field belongs; None for a field of drones.
+    """
     scope, dtype = metadata["scope"], metadata["dtype"] or sim.data.states.pos.dtype
     core = tuple([sim.data.states.rotor_vel.shape[-1] if n == "rotors" else n for n in metadata["shape"]])
     declaration = metadata.get("setting", Setting())
@@ -293,11 +310,14 @@ def bind_leaf(sim: Simulation, name: str, value: Any, metadata: Mapping[str, Any
         return None
     if scope == "shared":
         return device_array(np.array(value, ndmin=len(core)), dtype)
-    batch = (sim.n_worlds, 1) if scope == "world" else sim.data.states.pos.shape[:2]
+    n_members = None if scope == "drone" else n_members
+    batch = sim.n_worlds, 1 if scope == "world" else sim.n_drones if n_members is None else n_members
     if value is None or scope == "world":
         return device_array(np.broadcast_to(value or 0, (*batch, *core)), dtype)
-    array = check_parameter(sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis)
-    return device_array(np.broadcast_to(array, (*batch, *core)), dtype) if scope == "drone" else array
+    array = check_parameter(
+        sim, name, value, core, declaration.range, metadata["dtype"], declaration.per_axis, n_members
+    )
+    return array if scope == "parameter" else device_array(np.broadcast_to(array, (*batch, *core)), dtype)
 
 
 def _as_tuples(value: Any, arrays: bool) -> Any:
@@ -395,10 +415,11 @@ class Plugin(PyTree):
             values: Values of fields. If a value is None, the user's number is still checked.
         """
         bound: dict[str, Any] = {**values, "is_bound": True}
+        n_members = self.n_members if isinstance(self, Members) else None
         for field in dataclasses.fields(self):
             name, value, metadata = field.name, getattr(self, field.name), field.metadata
             if "scope" in metadata and values.get(name) is None:
-                bound.setdefault(name, bind_leaf(sim, name, value, metadata))
+                bound.setdefault(name, bind_leaf(sim, name, value, metadata, n_members))
             elif not metadata.get("keep", True):
                 bound.setdefault(name, None)
             elif metadata.get("static"):

@@ -1,14 +1,15 @@
 """Populations: all objects of one kind in a world other than drones, such as cars, loads or free bodies.
 
-A population is a plugin with a record that has one row for each member. Most methods are written for one member.
+A population is a plugin whose numbers and states have one row for each member. Most methods are written for one member.
 Scopes, masks, seeds, sharding, engines and gradients treat members as they treat drones.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +20,9 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
-from crazysim.core.plugin import Plugin, Simulation, StagePlacement
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, state
 from crazysim.core.settings import dividing_rate
-from crazysim.engine.pytree import Members, PyTree, float_dtype
+from crazysim.engine.pytree import Members, device_array
 from crazysim.engine.stage import RESERVED_SCOPES, Stage, is_tick
 from crazysim.errors import ConfigError, require
 
@@ -31,13 +32,13 @@ MAX_MEMBERS = 100_000
 R = TypeVar("R", bound=Members)
 
 
-class Population(Plugin):
+class Population(Plugin, Members):
     """Base class of populations, which ``sim.add`` adds.
 
-    A subclass overrides ``record``, ``derivative`` and any other method it needs. ``control``, ``derivative`` and
-    ``reset_episode`` are written for one member: leaves of the population and of worlds have no batch axes, and
-    ``self.read(data)`` is the record of the member. Leaves of drones are (n_drones, ...), leaves of other populations
-    are (n_members, ...), and both may only be read. ``influence`` is written for one drone, as in other plugins.
+    A population is declared like any plugin, with numbers and states of the scope ``"member"``. ``control``,
+    ``derivative`` and ``reset_episode`` are written for one member: leaves of the population and of worlds have no
+    batch axes. Leaves of drones are (n_drones, ...), leaves of other populations are (n_members, ...), and both may
+    only be read. ``influence`` is written for one drone, as in other plugins.
 
     A population has up to two stages with its name as their scope. The stage of its controller runs before the
     integration of the drones, and the stage of its integration runs after it.
@@ -46,13 +47,17 @@ class Population(Plugin):
     members: int | Sequence[str] = 1
     """Number of members in each world, or their names, such as ``("Fleet1Tenth_0", "Fleet1Tenth_7")``."""
     name: str = "population"
-    """Name of the population: key of its record in ``data.plugins``, and scope of its leaves and stages."""
+    """Name of the population: key in ``data.plugins``, and scope of its leaves and stages."""
+    population: str = dataclasses.field(default="", kw_only=True, repr=False, metadata={"static": True})
+    n_members: int = dataclasses.field(default=0, kw_only=True, repr=False, metadata={"static": True})
+    """Number of members in each world."""
+    member_id: Array = state((), scope="member", dtype=np.int32)
     prefix: ClassVar[str] = "Member"
     """Beginning of the names of members that are given by number: ``Member_0``."""
     positions: ClassVar[tuple[str, ...]] = ("pos",)
     """Fields that the scheme ``symplectic_euler`` advances with the new values of the other states."""
     command_field: ClassVar[str | None] = None
-    """Field of the record that ``with_command`` writes; None for a population without commands."""
+    """Field that ``with_command`` writes; None for a population without commands."""
 
     @property
     def scope(self) -> str:
@@ -82,11 +87,6 @@ class Population(Plugin):
         return names
 
     @property
-    def n_members(self) -> int:
-        """Number of members in each world."""
-        return len(self.names)
-
-    @property
     def control_freq(self) -> int | None:
         """Rate of ``control``, Hz, a divisor of the rate of physics steps; None for that rate."""
         return None
@@ -96,27 +96,14 @@ class Population(Plugin):
         """True if the drones' integration must call ``influence``; populations integrate their own states."""
         return type(self).influence is not Plugin.influence or self.constrains
 
-    def create(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds. Values without axes of worlds or members are repeated along them.
+    def check_settings(self) -> None:
+        super().check_settings()
+        object.__setattr__(self, "population", self.name)
+        object.__setattr__(self, "n_members", len(self.names))
 
-        Args:
-            sim: The simulation.
-            kind: Class of the record.
-            fields: Values of the fields. The value of a leaf of members has the shape (*core), (n_members, *core) or
-                (n_worlds, n_members, *core). Values of other leaves and nested records are used unchanged.
-        """
-        self.check(sim)
-        counts = sim.n_worlds, self.n_members
-        values = {}
-        for name, value in fields.items():
-            metadata = kind.__dataclass_fields__[name].metadata  # type: ignore[attr-defined]
-            is_member_leaf = metadata.get("scope") == "member" and value is not None and not isinstance(value, PyTree)
-            values[name] = _repeat_for_members(name, value, metadata, counts) if is_member_leaf else value
-        ids = np.array(np.broadcast_to(np.arange(self.n_members, dtype=np.int32), counts))
-        return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
-
-    def check(self, sim: Simulation) -> None:
+    def check_simulation(self, sim: Simulation) -> None:
         """Check the name of the population and the rate of its controller."""
+        super().check_simulation(sim)
         require(
             self.name not in (*RESERVED_SCOPES, "drone", "world"),
             f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.",
@@ -124,12 +111,16 @@ class Population(Plugin):
         if self.control_freq is not None:
             dividing_rate(f"control_freq of {self.name!r}", self.control_freq, sim.data.core.freq)
 
-    def control(self, data: SimData) -> Members:
-        """Return the record of one member with the outputs of its controller; called at ``control_freq``."""
-        return self.read(data)
+    def with_arrays(self, sim: Simulation, **values: Any) -> Self:
+        ids = np.broadcast_to(np.arange(self.n_members), (sim.n_worlds, self.n_members))
+        return super().with_arrays(sim, member_id=device_array(ids, np.int32), **values)
+
+    def control(self, data: SimData) -> Self:
+        """Return one member with the outputs of its controller; called at ``control_freq``."""
+        return self
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        """Return the time derivatives of the states of one member, per second, by field of its record.
+        """Return the time derivatives of the states of one member, per second, by field.
 
         The integration advances them in the scheme of the simulation. The rate of a unit quaternion is the derivative
         of its four numbers; ``finish`` restores its length.
@@ -137,21 +128,21 @@ class Population(Plugin):
         return {}
 
     def scheme(self, integrator: Integrator) -> Callable[..., Any]:
-        """Return the function ``(record, rates_fn, dt) -> record`` by which the integration advances one member.
+        """Return the function ``(member, rates_fn, dt) -> member`` by which the integration advances one member.
 
         Override it for states that another method advances better, such as fast rotation under Euler's schemes.
         """
         return choose_scheme(integrator, self.positions)
 
-    def finish(self, record: Members) -> Members:
-        """Return the record of one member at the end of a step: unit quaternions restored, states limited."""
-        return record
+    def finish(self) -> Self:
+        """Return one member at the end of a step: unit quaternions restored, states limited."""
+        return self
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return a stage for ``control`` and a stage for ``derivative``, if the class overrides these methods."""
         cls, placements = type(self), []
         if cls.control is not Population.control:
-            control_freq = self.control_freq
+            control_freq = self.bound(sim.data).control_freq
             condition = None if control_freq is None else functools.partial(is_tick, freq=control_freq)
             name = f"{self.name}_control"
             placements.append(StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name))
@@ -161,16 +152,15 @@ class Population(Plugin):
             placements.append(StagePlacement(Stage(step, self.name, name=name), before="measurements", name=name))
         return placements
 
-    def with_poses(self, record: R, pos: Array, quat: Array) -> R:
-        """Return a record of all worlds with other poses; by default in fields ``pos`` and ``quat``, if it has them.
+    def with_poses(self, pos: Array, quat: Array) -> Self:
+        """Return the population with arrays at other poses; by default in fields ``pos`` and ``quat``, if it has them.
 
         Args:
-            record: The record.
             pos: Positions, world frame, m. (n_worlds, n_members, 3)
             quat: Attitudes, body to world, xyzw. (n_worlds, n_members, 4)
         """
-        fields = record.__dataclass_fields__  # type: ignore[attr-defined]
-        return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in fields})
+        fields = self.__dataclass_fields__  # type: ignore[attr-defined]
+        return self.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in fields})
 
     def with_command(self, data: SimData, command: ArrayLike) -> SimData:
         """Return the data of all worlds with a new command for every member. (n_worlds, n_members, k)"""
@@ -184,14 +174,14 @@ class Population(Plugin):
         return self.write(data, record.replace(**{field: device_command}))
 
     def _run_controller(self, data: SimData) -> SimData:
-        return self.write(data, self.control(data))
+        return self.write(data, self.bound(data).control(data))
 
-    def _integrate(self, scheme: Callable[..., Members], data: SimData) -> SimData:
-        def rates_fn(record: Members) -> dict[str, Array]:
-            return plugin_rates(self, self.write(data, record))
+    def _integrate(self, scheme: Callable[..., Self], data: SimData) -> SimData:
+        def rates_fn(member: Self) -> dict[str, Array]:
+            return plugin_rates(self, self.write(data, member))
 
-        advanced_record = scheme(self.read(data), rates_fn, 1 / data.core.freq)
-        return self.write(data, self.finish(advanced_record))
+        advanced_member = scheme(self.read(data), rates_fn, 1 / data.core.freq)
+        return self.write(data, advanced_member.finish())
 
 
 RatesFn = Callable[[R], dict[str, Array]]
@@ -251,19 +241,3 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
             f"expected finite numbers as command of {name!r}, got NaN or infinity. Check its computation."
         )
     return array.astype(dtype)
-
-
-def _repeat_for_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
-    """Return a value repeated for every member of every world."""
-    array = np.asarray(value)
-    is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # a Python int such as 1 becomes the float 1.0
-    dtype = np.int32 if is_integer else float_dtype() if array.dtype.kind in "iuf" else array.dtype
-    core_ndim = metadata["core_ndim"]
-    core = array.shape[max(array.ndim - core_ndim, 0) :] if array.ndim >= core_ndim else None
-    batch = array.shape[: array.ndim - core_ndim] if core is not None else ()
-    if core is None or metadata["core"] not in (None, core) or batch not in ((), counts[1:], counts):
-        raise ConfigError(
-            f"expected {name} with {core_ndim} dimensions for all members, or behind {counts[1:]} = (n_members,) or "
-            f"{counts} = (n_worlds, n_members), got shape {array.shape}. Use np.broadcast_to."
-        )
-    return np.array(np.broadcast_to(array, (*counts, *core)), dtype)

@@ -240,7 +240,7 @@ class Sim:
         sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
         for kind, members in populations.items():
             plugin = sim.add(kind([v.name for v in members]))
-            record = plugin.with_poses(plugin.read(sim.data), *vehicle_poses(members, states.pos))
+            record = plugin.read(sim.data).with_poses(*vehicle_poses(members, states.pos))
             sim.data = plugin.write(sim.data, record)
         sim.build_default_data()
         for plugin in plugins:

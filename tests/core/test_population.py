@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from springs import KINDS, STIFFNESS, Crowd, Masses, Springs, Tied, Tying, build_springs
+from springs import KINDS, STIFFNESS, Crowd, Springs, Tied, Tying, build_springs
 
 from crazysim import ConfigError, Sim, stage
 from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.plugin import Param, nested, param
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
 from crazysim.engine.pytree import PyTree, check_axes, leaf, scopes
@@ -287,11 +288,13 @@ def test_commands_of_another_shape_are_refused():
     class Still(Population):
         name: str = "still"
 
-        def record(self, sim):
-            return self.create(sim, Masses, pos=0, vel=np.zeros(3), cmd=np.zeros(3), ticks=0, stiffness=np.ones(1))
+        pos: Param = param(default=None, core=(3,), scope="member")
 
-    with pytest.raises(ConfigError, match="expected pos with 1 dimensions"):
-        sim.add(Still())
+    for wrong in (0.0, np.zeros((2, 3)), np.zeros((3, 3, 3))):
+        with pytest.raises(
+            ConfigError, match=r"expected pos .* for all members, or \(2, 3, 3\) = \(n_worlds, n_members"
+        ):
+            sim.add(Still(3, pos=wrong))
 
 
 def test_leaves_have_the_axes_of_their_population():
@@ -307,13 +310,11 @@ def test_records_within_a_record_belong_to_its_population():
     class Inner(PyTree):
         x: jax.Array = leaf("member")
 
-    class Outer(Masses):
-        inner: Inner
+    class Outer(Springs):
+        inner: Inner | None = nested(default=None)
 
-    record = build_springs(Springs).data.plugins["springs"]
-    values = {name: getattr(record, name) for name in ("member_id", "pos", "vel", "cmd", "ticks", "stiffness")}
-    outer = Outer("springs", 3, inner=Inner(record.ticks), **values)
-    assert scopes(outer).inner.x == "springs"
+    record = build_springs(Outer).data.plugins["springs"]
+    assert scopes(record.replace(inner=Inner(record.ticks))).inner.x == "springs"
 
 
 def test_a_rate_of_something_else_is_refused():

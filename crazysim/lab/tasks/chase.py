@@ -15,7 +15,6 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tasks.touch_down import TouchDown
 from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
 
@@ -74,7 +73,7 @@ class Chase(TouchDown):
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's roof, world frame. (..., 3) each"""
-        car: CarData = data.plugins[CARS]
+        car: Cars = data.plugins[CARS]
         roof_pos = jnp.asarray(roof_centre(), car.pos.dtype)
         arm = rotation.rotate(car.quat, jnp.broadcast_to(roof_pos, car.pos.shape))
         turning = jnp.concatenate([0 * car.yaw_rate, 0 * car.yaw_rate, car.yaw_rate], axis=-1)
@@ -99,7 +98,7 @@ class Chase(TouchDown):
         }
 
 
-def rolling_car(car: CarData, yaw: Array, speed: Array, steer: Array) -> CarData:
+def rolling_car(car: Cars, yaw: Array, speed: Array, steer: Array) -> Cars:
     """Return cars that roll without slip, with commands to keep speed and steering angle.
 
     Args:

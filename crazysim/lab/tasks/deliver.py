@@ -20,7 +20,6 @@ from crazysim.envs.tasks.goals import pick_entry, state_of
 from crazysim.lab.tasks.bring_load import BringLoad
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_state import to_world_frame
 from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.plugins.vehicles.trailer import trailer_axles, trailer_rates
@@ -173,7 +172,7 @@ class Deliver(BringLoad):
         return data.plugins["load"].pos
 
 
-def ring_positions(car: CarData) -> Array:
+def ring_positions(car: Cars) -> Array:
     """Return the positions of the rings of loads on the trailers of one world, m. (n_members, 3)"""
     vehicle = load_vehicle(VEHICLE)
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
@@ -184,7 +183,7 @@ def ring_positions(car: CarData) -> Array:
     return jnp.concatenate([deck_centre, jnp.full_like(car.yaw, height)], axis=-1)
 
 
-def ring_motion(car: CarData) -> tuple[Array, Array]:
+def ring_motion(car: Cars) -> tuple[Array, Array]:
     """Return positions, m, and velocities, m/s, of the rings of loads on the trailers of one world. (n_members, 3) each
 
     The velocities are exact derivatives. A difference of two float32 positions, times 500 Hz, has errors of 2e-4 m/s.

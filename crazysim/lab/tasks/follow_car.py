@@ -18,7 +18,6 @@ from crazysim.envs.tasks.goals import motion_of
 from crazysim.lab.tasks.chase import CARS, VEHICLE, rolling_car
 from crazysim.lab.tasks.target_camera import TargetCamera
 from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
 
@@ -120,7 +119,7 @@ class FollowCar(Task):
 
     def target_motion(self, data: SimData) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of the point behind and above each drone's car. (n_drones, 3) each"""
-        car: CarData = data.plugins[CARS]
+        car: Cars = data.plugins[CARS]
         arm = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw), 0 * car.yaw], axis=-1) * -FOLLOW_DISTANCE
         turning_vel = jnp.concatenate([-arm[..., 1:2], arm[..., :1], 0 * car.yaw], axis=-1) * car.yaw_rate
         return car.pos + arm + np.array([0.0, 0.0, FOLLOW_HEIGHT], car.pos.dtype), car.vel + turning_vel

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
-from crazysim.core.plugin import Simulation, StagePlacement, param
+from crazysim.core.plugin import Param, Simulation, StagePlacement, param, state
 from crazysim.core.population import Population, RatesFn
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rigid_body import free_rotation
-from crazysim.engine.pytree import Members, host_array, leaf
+from crazysim.engine.pytree import device_array, host_array
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
@@ -32,41 +32,6 @@ MAX_BODIES = 1000
 """Largest number of bodies in a world."""
 START_SPACING = 0.5
 """Distance between neighbours of the default row of bodies, m."""
-BODY_SETTINGS = ("mass", "friction", "restitution")
-"""Settings with a number for each body."""
-
-
-class FreeBodiesData(Members):
-    """States and parameters of free bodies."""
-
-    pos: Array = leaf("member", 1, (3,))
-    """Position of the centre of mass, world frame, m. (n_worlds, n_members, 3)"""
-    quat: Array = leaf("member", 1, (4,))
-    """Attitude, body to world, unit, xyzw. (n_worlds, n_members, 4)"""
-    vel: Array = leaf("member", 1, (3,))
-    """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
-    ang_vel: Array = leaf("member", 1, (3,))
-    """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
-    force: Array = leaf("member", 1, (3,))
-    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
-    torque: Array = leaf("member", 1, (3,))
-    """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
-    impulse: Array = leaf("member", 1, (3,))
-    """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
-    normal_impulse: Array = leaf("world", 1)
-    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
-    (n_worlds, 1, n_contacts)"""
-    friction_impulse: Array = leaf("world", 2)
-    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
-    (n_worlds, 1, n_contacts, 3)"""
-    mass: Array = leaf("member", 1, (1,))
-    """Mass, kg. (n_worlds, n_members, 1)"""
-    inertia: Array = leaf("member", 1, (3,))
-    """Moments of inertia about the axes of the body, kg m^2. (n_worlds, n_members, 3)"""
-    friction: Array = leaf("member", 1, (1,))
-    """Coulomb's coefficient of the surface, 1. (n_worlds, n_members, 1)"""
-    restitution: Array = leaf("member", 1, (1,))
-    """Ratio of the speeds after and before a bounce, 1. (n_worlds, n_members, 1)"""
 
 
 class FreeBodies(Population):
@@ -78,22 +43,21 @@ class FreeBodies(Population):
 
     members: int | Sequence[str] = 1
     """Number of bodies in each world, or their names."""
-    size: Any = (0.2, 0.2, 0.2)
+    size: Any = setting(default=(0.2, 0.2, 0.2), keep=False)
     """Full lengths of a box, m (3,), or radius of a ball, m, for all bodies; or a list with an entry for each body."""
-    mass: ArrayLike = param(default=0.1, low=MASS.low, high=MASS.high, keep=False)
-    """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
-    pos: ArrayLike | None = param(default=None, keep=False)
-    """Positions at the start, world frame, m; None for a row along x on the floor. (3,), (n_members, 3) or (n_worlds,
-    n_members, 3)"""
-    quat: ArrayLike = param(default=(0.0, 0.0, 0.0, 1.0), keep=False)
-    """Attitudes at the start, xyzw, normalised here. (4,), (n_members, 4) or (n_worlds, n_members, 4)"""
-    vel: ArrayLike = param(default=(0.0, 0.0, 0.0), keep=False)
-    """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
-    friction: ArrayLike = param(default=0.6, low=0.0, high=MAX_FRICTION, keep=False)
-    """Coulomb's coefficient; the larger one of two bodies is used. (), (n_members,) or (n_worlds, n_members)"""
-    restitution: ArrayLike = param(default=0.0, low=0.0, high=1.0, keep=False)
-    """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (), (n_members,) or
-    (n_worlds, n_members)"""
+    mass: Param = param(default=0.1, scope="member", low=MASS.low, high=MASS.high)
+    """Mass, kg. (n_worlds, n_members, 1)"""
+    pos: Param = param(default=None, core=(3,), scope="member")
+    """Position of the centre of mass, world frame, m; None for a row along x on the floor. (n_worlds, n_members, 3)"""
+    quat: Param = param(default=(0.0, 0.0, 0.0, 1.0), core=(4,), scope="member")
+    """Attitude, body to world, xyzw, normalised here. (n_worlds, n_members, 4)"""
+    vel: Param = param(default=(0.0, 0.0, 0.0), core=(3,), scope="member")
+    """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
+    friction: Param = param(default=0.6, scope="member", low=0.0, high=MAX_FRICTION)
+    """Coulomb's coefficient; the larger one of two bodies is used. (n_worlds, n_members, 1)"""
+    restitution: Param = param(default=0.0, scope="member", low=0.0, high=1.0)
+    """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (n_worlds,
+    n_members, 1)"""
     objects: ObjectSelection = None
     """Handles, or names of objects that the bodies touch; None for all in the scene, () for the ground alone."""
     drones: bool = True
@@ -104,6 +68,22 @@ class FreeBodies(Population):
     """Iterations of the solver."""
     rgba: ArrayLike | None = color(per_item=True)
     """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
+    ang_vel: Array = state((3,), scope="member")
+    """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
+    force: Array = state((3,), scope="member")
+    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
+    torque: Array = state((3,), scope="member")
+    """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
+    impulse: Array = state((3,), scope="member")
+    """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
+    normal_impulse: Array = state(("n_contacts",), scope="world")
+    """Impulses along the normals of the contact points, N s; the initial impulses of the next step.
+    (n_worlds, 1, n_contacts)"""
+    friction_impulse: Array = state(("n_contacts", 3), scope="world")
+    """Impulses across the normals, world frame, N s; the initial impulses of the next step.
+    (n_worlds, 1, n_contacts, 3)"""
+    inertia: Array = state((3,), scope="member")
+    """Moments of inertia about the axes of the body, kg m^2. (n_worlds, n_members, 3)"""
     name: str = "bodies"
     prefix: ClassVar[str] = "Box"
 
@@ -127,7 +107,7 @@ class FreeBodies(Population):
     def moved_kinds(self) -> tuple[str, ...]:
         return (self.name,)
 
-    def record(self, sim: Simulation) -> FreeBodiesData:
+    def bind(self, sim: Simulation) -> FreeBodies:
         shapes = self.shapes
         others = [p.name for p in sim.scene.plugins() if isinstance(p, FreeBodies) and p.name != self.name]
         if others:
@@ -137,31 +117,19 @@ class FreeBodies(Population):
             )
         check_softness(sim.data.core.freq, self.softness)
         pos = row_positions(shapes) if self.pos is None else self.pos
-        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in BODY_SETTINGS}
         quat = np.asarray(self.quat, np.float64)
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
-        self.check(sim)
         terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, HeightField)]
         n_contacts = require_few_contacts(BodyContacts(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
-        zero = np.zeros(3)
-        record = self.create(
+        bodies = self.replace(pos=pos, quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True)).with_arrays(
             sim,
-            FreeBodiesData,
-            pos=np.asarray(pos, np.float64),
-            quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
-            vel=np.asarray(self.vel, np.float64),
-            ang_vel=zero,
-            force=zero,
-            torque=zero,
-            impulse=zero,
             normal_impulse=host_array(0.0, sim.n_worlds, 1, n_contacts),
             friction_impulse=host_array(0.0, sim.n_worlds, 1, n_contacts, 3),
-            inertia=zero,
-            **numbers,
         )
         self._add_to_scene(sim, shapes)
-        return record.replace(inertia=record.mass * np.stack([inertia_per_mass(shape) for shape in shapes]))
+        inertia = np.asarray(bodies.mass) * np.stack([inertia_per_mass(shape) for shape in shapes])
+        return bodies.replace(inertia=device_array(inertia))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         body_contacts = BodyContacts(sim, self)
@@ -170,21 +138,20 @@ class FreeBodies(Population):
         return [*super().stages(sim), StagePlacement(contact, before="measurements", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        body = self.read(data)
-        torque = rotation.rotate_inverse(body.quat, body.torque)
-        ang_momentum = body.inertia * body.ang_vel
+        torque = rotation.rotate_inverse(self.quat, self.torque)
+        ang_momentum = self.inertia * self.ang_vel
         return {
-            "pos": body.vel,
-            "quat": 0.5 * rotation.multiply(body.quat, jnp.concatenate([body.ang_vel, 0 * body.mass])),
-            "vel": jnp.asarray(GRAVITY, body.pos.dtype) + body.force / body.mass,
-            "ang_vel": (torque - rotation.cross(body.ang_vel, ang_momentum)) / body.inertia,
+            "pos": self.vel,
+            "quat": 0.5 * rotation.multiply(self.quat, jnp.concatenate([self.ang_vel, 0 * self.mass])),
+            "vel": jnp.asarray(GRAVITY, self.pos.dtype) + self.force / self.mass,
+            "ang_vel": (torque - rotation.cross(self.ang_vel, ang_momentum)) / self.inertia,
         }
 
-    def scheme(self, integrator: Integrator) -> Callable[..., FreeBodiesData]:
+    def scheme(self, integrator: Integrator) -> Callable[..., FreeBodies]:
         """Return the simulation's scheme; an Euler scheme integrates rotations by ``free_rotation``."""
         scheme = super().scheme(integrator)
 
-        def integrate_motion(body: FreeBodiesData, rates_fn: RatesFn, dt: float) -> FreeBodiesData:
+        def integrate_motion(body: FreeBodies, rates_fn: RatesFn, dt: float) -> FreeBodies:
             if integrator == Integrator.rk4:
                 new_body = scheme(body, rates_fn, dt)
                 return new_body.replace(ang_vel=limit_ang_vel(new_body.ang_vel, 1 / dt))
@@ -196,13 +163,12 @@ class FreeBodies(Population):
 
         return integrate_motion
 
-    def finish(self, record: FreeBodiesData) -> FreeBodiesData:
-        identity = jnp.asarray([0.0, 0.0, 0.0, 1.0], record.quat.dtype)
-        return record.replace(quat=rotation.safe_normalize(record.quat, identity))
+    def finish(self) -> FreeBodies:
+        identity = jnp.asarray([0.0, 0.0, 0.0, 1.0], self.quat.dtype)
+        return self.replace(quat=rotation.safe_normalize(self.quat, identity))
 
     def move_objects(self, data: SimData) -> Objects:
-        record = self.read(data)
-        return data.objects.with_poses({self.name: (record.pos, record.quat)})  # type: ignore[union-attr]
+        return data.objects.with_poses({self.name: (self.pos, self.quat)})  # type: ignore[union-attr]
 
     def _add_to_scene(self, sim: Simulation, shapes: Sequence[Shape]) -> None:
         """Add the bodies to the scene, if they are not there yet."""
@@ -210,6 +176,10 @@ class FreeBodies(Population):
         colors = np.broadcast_to(as_rgba(rgba, len(shapes)), (len(shapes), 4))
         geoms = [body_geom_xml(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]
         sim.scene.add_once(geoms, self.name, len(shapes))
+
+
+FreeBodiesData = FreeBodies
+"""What ``data.plugins`` has: the same class, with arrays."""
 
 
 def row_positions(shapes: Sequence[Shape]) -> np.ndarray:

@@ -3,10 +3,9 @@
 from typing import TYPE_CHECKING
 
 from crazysim.names import lazy_getattr
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_params import CarParams
 from crazysim.plugins.vehicles.car_state import CarState, ackermann
-from crazysim.plugins.vehicles.cars import Bicycles, Cars
+from crazysim.plugins.vehicles.cars import Bicycles, CarData, Cars
 from crazysim.plugins.vehicles.following import PathController, PathState, PurePursuit, Stanley
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle, vehicle_names

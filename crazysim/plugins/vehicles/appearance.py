@@ -13,7 +13,6 @@ from crazysim import rotation
 from crazysim.core.data import Objects
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_rgba
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_state import ackermann, heading_quat, tilted_quat
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
 from crazysim.plugins.vehicles.trailer import trailer_axles
@@ -68,22 +67,16 @@ def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
     return np.array([(x, y) for x in (front, rear) for y in sides])
 
 
-def move_cars(objects: Objects, cars: Any, car: CarData) -> Objects:
-    """Return the objects of a world with its cars at their poses.
-
-    Args:
-        objects: Objects of the world.
-        cars: The population.
-        car: Record of the population, for one world. Leaves (n_members, ...)
-    """
+def move_cars(objects: Objects, cars: Any) -> Objects:
+    """Return the objects of a world with its cars, whose arrays are (n_members, ...), at their poses."""
     vehicle = load_vehicle(cars.vehicle)
-    poses = {"body": (car.pos, car.quat), "wheel": _wheel_poses(vehicle, car)}
+    poses = {"body": (cars.pos, cars.quat), "wheel": _wheel_poses(vehicle, cars)}
     if cars.trailer:
-        poses |= _trailer_poses(vehicle, car)
+        poses |= _trailer_poses(vehicle, cars)
     return objects.with_poses({_object_name(cars, part): pose for part, pose in poses.items()})
 
 
-def _wheel_poses(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
+def _wheel_poses(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     positions = wheel_positions(vehicle)
     shape = (car.pos.shape[0], len(positions))
@@ -115,7 +108,7 @@ def _trailer_poses(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Ar
     return {"drawbar": (front, bar_quat), "trailer": (front, deck_quat), "trailer_wheel": wheel}
 
 
-def _above_plane(level_pos: Array, car: CarData, height: float) -> Array:
+def _above_plane(level_pos: Array, car: Any, height: float) -> Array:
     """Return level positions, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
     offset, normal = level_pos - car.pos[:, :2], car.normal
     rise = -(normal[:, :1] * offset[:, :1] + normal[:, 1:2] * offset[:, 1:]) / normal[:, 2:]

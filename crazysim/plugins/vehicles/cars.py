@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +13,23 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
-from crazysim.core.plugin import Simulation, StagePlacement, param
+from crazysim.core.plugin import Param, Simulation, StagePlacement, check_parameter, nested, param, state
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
 from crazysim.dynamics.models import GRAVITY
+from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import PyTree, device_array
-from crazysim.engine.stage import Stage, is_tick
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import HeightField, ground_at
 from crazysim.plugins.vehicles import appearance, starts
-from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import to_body_frame
+from crazysim.plugins.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
 from crazysim.plugins.vehicles.following import PathController, PurePursuit, motor_reference, path_state
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel, VehicleSource, load_vehicle
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.single_track import single_track
+from crazysim.tables import range_between
 from crazysim.trajectories import Trajectory
 
 CONTROL_FREQ = 50
@@ -54,25 +53,24 @@ class Cars(Population):
     """Number of cars in each world, or their names."""
     vehicle: VehicleSource = "f1tenth_ros"
     """Vehicle model, as for ``load_vehicle``."""
-    pos: ArrayLike | None = param(default=None, keep=False)
-    """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
-    (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
-    yaw: ArrayLike | None = param(default=None, keep=False)
-    """Headings at the start, rad; None for the path's heading, or zero. (), (n_members,) or (n_worlds, n_members)"""
+    pos: Param = param(default=None, core=(3,), scope="member")
+    """Position of the centre of mass, world frame, m (n_worlds, n_members, 3); of the plugin that is added, x and y
+    (2,), or for each; None for the start of the path, or a row along y with gaps of 1 m."""
+    yaw: Param = param(default=None, scope="member")
+    """Heading, rad, not wrapped; None for the path's heading, or zero. (n_worlds, n_members, 1)"""
     level: Literal["drive", "speed"] = "drive"
     """Command level of cars without a path."""
-    path: Path | Trajectory | Sequence[Path | Trajectory] | None = None
+    path: Path | Trajectory | Sequence[Path | Trajectory] | None = nested(default=None)
     """Path, trajectory, or a sequence of them to follow; None to drive by commands."""
     controller: PathController | None = None
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
     """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the path where the car is."""
-    index: ArrayLike | None = param(default=None, keep=False)
-    """Index of each car's path; with None, car i follows path i modulo the number of paths. (), (n_members,) or
-    (n_worlds, n_members)"""
-    start: ArrayLike | None = param(default=None, keep=False)
+    index: Param = param(default=None, whole=True, dtype=np.int32)
+    """Index of each car's path; with None, car i follows path i modulo the number of paths. (1,)"""
+    start: Param = param(default=None)
     """Time at which a car is at the start of its path, s; None for zero, or equal intervals for the cars of one closed
-    path. (), (n_members,) or (n_worlds, n_members)"""
+    path. (1,)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
     freq: int | None = None
@@ -82,14 +80,74 @@ class Cars(Population):
     in_scene: bool = True
     """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
     name: str = "cars"
+    body_vel: Array = state((2,), scope="member")
+    """Forward and left velocity of the centre of mass, body frame, m/s. (n_worlds, n_members, 2)"""
+    yaw_rate: Array = state(scope="member")
+    """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
+    normal: Array = state((3,), scope="member")
+    """Unit normal of the ground below, upwards, world frame; it follows terrain with a time constant of
+    ``SETTLING_TIME``. (n_worlds, n_members, 3)"""
+    steer: Array = state(scope="member")
+    """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
+    distance: Array = state(scope="member")
+    """Distance that the wheels rolled, m; backwards it decreases. (n_worlds, n_members, 1)"""
+    joints: Array | None = state((2,), scope="member", optional=True)
+    """Headings of the trailer's drawbar and deck, rad, not wrapped; None without trailers. (n_worlds, n_members, 2)"""
+    command: Array = state((2,), scope="member")
+    """Motor reference, 1, or speed, m/s, depending on the command level, followed by the steering angle, rad.
+    (n_worlds, n_members, 2)"""
+    applied_command: Array | None = state((2,), scope="member", optional=True)
+    """Motor reference and steering angle, rad, of the last tick of the controller; None at the level ``drive``, where
+    they are the command. (n_worlds, n_members, 2)"""
+    force: Array = state((3,), scope="member")
+    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
+    torque: Array = state((3,), scope="member")
+    """External torque, world frame, N m, of which only z acts; kept until it is changed. (n_worlds, n_members, 3)"""
+    arc: Array | None = state(scope="member", optional=True)
+    """Arc length of the car's projection on its path, m. (n_worlds, n_members, 1)"""
+    params: Any = nested(default=None)
+    """Parameters of the dynamics, ``CarParams``."""
+    memory: Any = nested(default=None)
+    """Memory of the path controller."""
+    gains: Any = nested(default=None)
+    """Gains of the path controller."""
     prefix: ClassVar[str] = "Fleet1Tenth"
     positions: ClassVar[tuple[str, ...]] = ("pos", "yaw", "distance")
     command_field: ClassVar[str | None] = "command"
 
-    def with_poses(self, record: CarData, pos: Array, quat: Array) -> CarData:
+    @property
+    def state(self) -> CarState:
+        """State of the dynamics."""
+        return CarState(**{name: getattr(self, name) for name in CarState._fields})
+
+    @property
+    def quat(self) -> Array:
+        """Attitude, body to world, xyzw. (n_worlds, n_members, 4)"""
+        return tilted_quat(self.yaw, self.normal)
+
+    @property
+    def vel(self) -> Array:
+        """Velocity of the centre of mass, world frame, m/s; z is zero even on slopes. (n_worlds, n_members, 3)"""
+        return _level_vel(self.yaw, self.body_vel)
+
+    @property
+    def ang_vel(self) -> Array:
+        """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
+        return _ang_vel_about_z(self.yaw_rate)
+
+    def with_vel(self, vel: Array, ang_vel: Array) -> Cars:
+        """Return the cars with other velocities; only the horizontal velocity and the yaw rate are used.
+
+        Args:
+            vel: Velocity of the centre of mass, world frame, m/s. (..., 3)
+            ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        """
+        return self.replace(body_vel=to_body_frame(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
+
+    def with_poses(self, pos: Array, quat: Array) -> Cars:
         yaw = rotation.yaw(quat)[..., None]
-        joints = None if record.joints is None else jnp.broadcast_to(yaw, record.joints.shape)
-        return record.replace(pos=pos, yaw=yaw, joints=joints)
+        joints = None if self.joints is None else jnp.broadcast_to(yaw, self.joints.shape)
+        return self.replace(pos=pos, yaw=yaw, joints=joints)
 
     @property
     def control_freq(self) -> int | None:
@@ -107,114 +165,101 @@ class Cars(Population):
             return None
         return PurePursuit() if self.controller is None else self.controller
 
-    def control_freq_in(self, freq: int) -> int:
-        """Return the rate of the controller, Hz, in a simulation at ``freq``, Hz."""
-        if self.freq is not None:
-            return self.freq
-        return default_rates(freq, {"freq": CONTROL_FREQ}, f" of {self.name!r}")["freq"]
+    @property
+    def needs_controller(self) -> bool:
+        """Whether a controller calculates the motor reference; commands of the level ``drive`` need none."""
+        return self.level != "drive" or self.path_controller is not None
 
-    def record(self, sim: Simulation) -> CarData:
-        self.check(sim)
+    def check_settings(self) -> None:
+        super().check_settings()
+        if isinstance(self.vehicle, Mapping):
+            object.__setattr__(self, "vehicle", self.model)  # hashable
+
+    def bind(self, sim: Simulation) -> Cars:
         vehicle, freq, counts = self.model, sim.data.core.freq, (sim.n_worlds, self.n_members)
-        self._check_settings(vehicle)
+        self._check_choices(vehicle)
         paths, controller = self._paths(), self.path_controller
         index = start = arc = gains = memory = None
+        control_freq = self.freq or default_rates(freq, {"freq": CONTROL_FREQ}, f" of {self.name!r}")["freq"]
         params = CarParams.create(vehicle, freq, self.trailer)
         pos, yaw = starts.row_positions(self.n_members), np.zeros((self.n_members, 1))
         if paths is not None and controller is not None:
             controller.check(vehicle, paths)
-            index = starts.member_numbers("index", self._path_indices(paths), counts, paths.n_paths)
-            start_times = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
-            start = starts.member_numbers("start", start_times, counts)
+            index = check_parameter(
+                sim, "index", self._path_indices(paths), allowed=range_between(0, paths.n_paths - 1),
+                dtype=np.int32, n_members=self.n_members,
+            )  # fmt: skip
+            start = starts.spread_start_times(paths, np.asarray(index), self.n_members)
+            start = check_parameter(sim, "start", start if self.start is None else self.start, n_members=self.n_members)
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
-            gains, memory = controller.gains(vehicle, params, self.control_freq_in(freq)), controller.memory()
+            gains, memory = controller.gains(vehicle, params, control_freq), controller.memory()
         if self.pos is not None:
-            pos = starts.member_array("pos", self.pos, counts, (2,))
-        if self.yaw is not None:
-            yaw = starts.member_array("yaw", np.asarray(self.yaw)[..., None], counts, (1,))
-        pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
+            check_parameter(sim, "pos", self.pos, (2,), n_members=self.n_members)
+            pos = self.pos
+        pos = np.broadcast_to(np.asarray(pos, float), (*counts, 2))
         if arc is not None and self.pos is not None:
             arc = starts.project_arcs(paths, index, pos, arc)
         height, normal = ground_at(sim.data, device_array(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
-        zero = np.zeros((*counts, 1))
-        zeros_2, zeros_3 = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
-        needs_controller = self.level != "drive" or controller is not None
-        record = self.create(
+        start_poses = self.replace(pos=np.concatenate([pos, z], axis=-1), yaw=yaw if self.yaw is None else self.yaw)
+        zeros = device_array(np.zeros((*counts, 2)))
+        cars = start_poses.with_arrays(
             sim,
-            CarData,
-            pos=np.concatenate([pos, z], axis=-1),
-            yaw=yaw,
-            body_vel=zeros_2,
-            yaw_rate=zero,
-            normal=np.asarray(normal),
-            steer=zero,
-            distance=zero,
-            joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
-            command=zeros_2,
-            applied_command=zeros_2 if needs_controller else None,
-            force=zeros_3,
-            torque=zeros_3,
+            freq=control_freq,
+            normal=normal,
+            applied_command=zeros if self.needs_controller else None,
             params=params,
             path=paths,
             index=index,
-            start_time=start,
-            arc=arc,
+            start=start,
+            arc=arc if arc is None else device_array(arc),
             memory=_repeat_for_members(memory, counts),
             gains=gains,
         )
         if self.in_scene:
             appearance.add_to_scene(sim, self, vehicle)
-        return record
+        return cars.replace(joints=device_array(np.tile(cars.yaw, 2))) if self.trailer else cars
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
-        placements = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
-        if self.path_controller is None and self.level == "drive":
-            return placements
-        name, condition = (
-            f"{self.name}_control",
-            functools.partial(is_tick, freq=self.control_freq_in(sim.data.core.freq)),
-        )
-        return [StagePlacement(Stage(self._run_controller, self.name, condition, name=name), name=name), *placements]
+        placements = super().stages(sim)
+        return placements if self.needs_controller else placements[1:]
 
-    def control(self, data: SimData) -> CarData:
-        car = self.read(data)
+    def control(self, data: SimData) -> Cars:
         controller = self.path_controller
         if controller is None:
-            acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
-            drive = motor_reference(car.command[:1], acc, car.params)
-            return car.replace(applied_command=jnp.concatenate([drive, car.command[1:]]))
-        time = data.core.steps / data.core.freq - car.start_time[0] if self.reference == "time" else None
-        tracking = path_state(car.state, car.path, car.index[0], car.arc, controller.reference_offset(car.params), time)
-        applied_command, memory = controller.update(car.state, tracking, car.memory, car.gains, car.params)
-        return car.replace(applied_command=applied_command, arc=tracking.arc, memory=memory)
+            acc = SPEED_GAIN * (self.command[:1] - self.body_vel[:1])
+            drive = motor_reference(self.command[:1], acc, self.params)
+            return self.replace(applied_command=jnp.concatenate([drive, self.command[1:]]))
+        time = data.core.steps / data.core.freq - self.start[0] if self.reference == "time" else None
+        offset = controller.reference_offset(self.params)
+        tracking = path_state(self.state, self.path, self.index[0], self.arc, offset, time)
+        applied_command, memory = controller.update(self.state, tracking, self.memory, self.gains, self.params)
+        return self.replace(applied_command=applied_command, arc=tracking.arc, memory=memory)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        car = self.read(data)
         model = kinematic if self.model.dynamics == "kinematic" else single_track
-        command = car.command if car.applied_command is None else car.applied_command
-        force, terrain_rates = car.force[:2], {}
+        command = self.command if self.applied_command is None else self.applied_command
+        force, terrain_rates = self.force[:2], {}
         if any(isinstance(record, HeightField) for record in data.plugins.values()):
-            force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
-            terrain_rates = self._terrain_rates(data, car)
-        wrench = jnp.concatenate([to_body_frame(car.yaw, force), car.torque[2:]])
-        rates = model(car.state, command, car.params, wrench)._asdict() | terrain_rates
+            force = force - GRAVITY[2] * self.params.mass * self.normal[2:] * self.normal[:2]
+            terrain_rates = self._terrain_rates(data)
+        wrench = jnp.concatenate([to_body_frame(self.yaw, force), self.torque[2:]])
+        rates = model(self.state, command, self.params, wrench)._asdict() | terrain_rates
         return {name: rate for name, rate in rates.items() if rate is not None}
 
-    def _terrain_rates(self, data: SimData, car: CarData) -> dict[str, Array]:
+    def _terrain_rates(self, data: SimData) -> dict[str, Array]:
         """Return the rates of position and normal of one car that follows terrain."""
-        height, normal = ground_at(data, car.pos)
-        vel, settling_rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
+        height, normal = ground_at(data, self.pos)
+        vel, settling_rate = self.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
         climb_rate = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
-        settling_vel = settling_rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        settling_vel = settling_rate * (height + self.model.number("wheels.radius") - self.pos[2:])
         return {
             "pos": jnp.concatenate([vel[:2], climb_rate + settling_vel]),
-            "normal": settling_rate * (normal - car.normal),
+            "normal": settling_rate * (normal - self.normal),
         }
 
     def move_objects(self, data: SimData) -> Objects:
-        return appearance.move_cars(data.objects, self, self.read(data))  # type: ignore[arg-type]
+        return appearance.move_cars(data.objects, self)  # type: ignore[arg-type]
 
     @property
     def moved_kinds(self) -> tuple[str, ...] | None:
@@ -224,8 +269,7 @@ class Cars(Population):
     def moves_objects(self) -> bool:
         return self.in_scene
 
-    def _check_settings(self, vehicle: VehicleModel) -> None:
-        """Check settings that are not numbers."""
+    def _check_choices(self, vehicle: VehicleModel) -> None:
         for name, choices in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
             if getattr(self, name) not in choices:
                 raise ConfigError(f"expected {name} of {self.name!r} as one of {choices}, got {getattr(self, name)!r}")
@@ -256,9 +300,25 @@ def _repeat_for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTre
     return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
 
 
+@jit_eager_calls()
+def _level_vel(yaw: Array, body_vel: Array) -> Array:
+    level_vel = to_world_frame(yaw, body_vel)
+    return jnp.concatenate([level_vel, jnp.zeros_like(yaw)], axis=-1)
+
+
+@jit_eager_calls()
+def _ang_vel_about_z(yaw_rate: Array) -> Array:
+    zero = jnp.zeros_like(yaw_rate)
+    return jnp.concatenate([zero, zero, yaw_rate], axis=-1)
+
+
 class Bicycles(Cars):
     """Bicycles of AIMotionLab-Virtual: the motor reference is the torque of the rear wheel, N m; no steering."""
 
     vehicle: VehicleSource = "bicycle"
     name: str = "bicycles"
     prefix: ClassVar[str] = "Bicycle"
+
+
+CarData = Cars
+"""What ``data.plugins`` has: the same class, with arrays."""

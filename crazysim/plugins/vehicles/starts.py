@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.engine.pytree import float_dtype
-from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.path import Path
 
 START_SPACING = 1.0
@@ -18,51 +16,6 @@ START_SPACING = 1.0
 def row_positions(n: int) -> NDArray:
     """Return positions in a row along y around the origin, m. (n, 2)"""
     return np.stack([np.zeros(n), START_SPACING * (np.arange(n) - (n - 1) / 2)], axis=1)
-
-
-def member_array(
-    name: str, value: ArrayLike, counts: tuple[int, int], member_shape: tuple[int, ...]
-) -> NDArray[np.float64]:
-    """Return checked positions or headings, one for all cars or one per car. (..., *member_shape)
-
-    Args:
-        name: Name of the setting, for errors.
-        value: Positions, m, or headings, rad.
-        counts: Numbers of worlds and of cars.
-        member_shape: Shape for one car.
-    """
-    array = np.asarray(value, float)
-    shapes, is_finite = [member_shape, (counts[1], *member_shape), (*counts, *member_shape)], np.all(np.isfinite(array))
-    if array.shape not in shapes or not is_finite:
-        raise ConfigError(
-            f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
-            f"got shape {array.shape}{'' if is_finite else ' with NaN or infinity'}. Use one value for "
-            f"all cars, or one for each."
-        )
-    return array
-
-
-def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n_paths: int | None = None) -> NDArray:
-    """Return one number for all cars, (1,), or one per car, (n_worlds, n_members, 1).
-
-    Args:
-        name: Name of the setting, for errors.
-        value: Number or numbers.
-        counts: Numbers of worlds and of cars.
-        n_paths: Number of paths, for indices of paths; None for real numbers.
-    """
-    array = np.asarray(value)
-    is_valid = n_paths is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n_paths)))
-    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not is_valid:
-        kind = "a number" if n_paths is None else f"a whole number from 0 to {n_paths - 1}"
-        raise ConfigError(
-            f"expected {name} as {kind} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
-            f"got {value!r}. Use one number, or an array of one of these shapes."
-        )
-    if not np.all(np.isfinite(array)):
-        raise ConfigError(f"expected {name} to be finite, got {value!r}. Use a time in seconds, such as 0.0.")
-    array = array.astype(float_dtype() if n_paths is None else np.int32)
-    return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
 
 
 def path_poses(

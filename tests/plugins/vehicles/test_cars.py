@@ -54,7 +54,7 @@ def deviations(record, time):
         reference = record.path.time_reference(0, time - start[0])[0]
         return jnp.linalg.norm(pos[:2] - record.path.point_at(0, arc).pos), reference[0] - arc
 
-    return jax.vmap(deviation)(record.pos[0], record.arc[0], record.start_time[0])
+    return jax.vmap(deviation)(record.pos[0], record.arc[0], record.start[0])
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -218,13 +218,13 @@ def test_cars_roll_down_a_slope():
         ({"controller": PurePursuit()}, "expected a path for controller of 'cars', got none"),
         ({"controller": "lqr", "path": EIGHT}, "expected controller of Cars as PathController"),
         ({"path": "eight"}, "expected a Path, a Trajectory"),
-        ({"path": EIGHT, "index": 1}, "a whole number from 0 to 0"),
-        ({"path": EIGHT, "start": [0.0, 1.0]}, "expected start as a number"),
+        ({"path": EIGHT, "index": 1}, "index to be from 0 to 0"),
+        ({"path": EIGHT, "start": [0.0, 1.0]}, "expected start as real numbers of shape (1,) for all members"),
         ({"path": EIGHT, "vehicle": "bicycle"}, "expected a vehicle that steers"),
         ({"vehicle": "bicycle", "trailer": True}, "expected a vehicle with a table [trailer]"),
         ({"path": Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0), "controller": LPV()}, "can drive forwards"),
-        ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as finite numbers of shape"),
-        ({"yaw": [0.0, 1.0]}, "expected yaw as finite numbers"),
+        ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as real numbers of shape (2,) for all members"),
+        ({"yaw": [0.0, 1.0]}, "expected yaw as real numbers of shape (1,) for all members"),
         ({"freq": 40}, "to divide freq = 500 Hz"),
         ({"members": ["a", "a"]}, "got 'a' twice"),
     ],
