@@ -232,7 +232,7 @@ class Cars(Population):
             return self.replace(applied_command=jnp.concatenate([drive, self.command[1:]]))
         time = data.core.steps / data.core.freq - self.start[0] if self.reference == "time" else None
         offset = controller.reference_offset(self.params)
-        tracking = path_state(self.state, self.path, self.index[0], self.arc, offset, time)
+        tracking = path_state(self.state, self.path, self.index[0], self.arc, offset, time)  # type: ignore[arg-type]
         applied_command, memory = controller.update(self.state, tracking, self.memory, self.gains, self.params)
         return self.replace(applied_command=applied_command, arc=tracking.arc, memory=memory)
 

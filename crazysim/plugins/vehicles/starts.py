@@ -19,7 +19,7 @@ def row_positions(n: int) -> NDArray:
 
 
 def path_poses(
-    paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]
+    paths: Path, index: ArrayLike, start: ArrayLike, counts: tuple[int, int]
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
 
