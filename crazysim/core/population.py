@@ -21,10 +21,11 @@ from crazysim.core.data import SimData
 from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, state
-from crazysim.core.settings import dividing_rate
+from crazysim.core.settings import Setting, dividing_rate
 from crazysim.engine.pytree import Members, device_array
 from crazysim.engine.stage import RESERVED_SCOPES, Stage, is_tick
 from crazysim.errors import ConfigError, require
+from crazysim.tables import range_between
 
 MAX_MEMBERS = 100_000
 """Largest number of members of a population in a world."""
@@ -49,7 +50,9 @@ class Population(Plugin, Members):
     name: str = "population"
     """Name of the population: key in ``data.plugins``, and scope of its leaves and stages."""
     population: str = dataclasses.field(default="", kw_only=True, repr=False, metadata={"static": True})
-    n_members: int = dataclasses.field(default=0, kw_only=True, repr=False, metadata={"static": True})
+    n_members: int = dataclasses.field(
+        default=0, kw_only=True, repr=False, metadata={"static": True, "setting": Setting(range_between(0))}
+    )
     """Number of members in each world."""
     member_id: Array = state((), scope="member", dtype=np.int32)
     prefix: ClassVar[str] = "Member"
