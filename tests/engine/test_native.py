@@ -335,7 +335,7 @@ flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=20000000
 quick = 'extern "C" __attribute__((visibility("default"))) int crazysim_call = 1;'
 source = quick if sys.argv[1] == "quick" else slow
 compile = lambda key: native._get_library([*native.compiler_command(), *flags], key, source)
-if sys.argv[1] == "threads":
+if source == slow:
     with native.compiling_threads(2) as pool:
         list(pool.map(compile, "abcd"))
 else:
@@ -344,12 +344,7 @@ else:
 
 
 def compile_in_another_process(folder, mode):
-    """Start a process that compiles kernels into a folder.
-
-    Args:
-        folder: Folder of the cache and of temporary files.
-        mode: ``"quick"`` or ``"slow"`` for one such kernel, ``"threads"`` for four slow ones in two threads.
-    """
+    """Start a process that compiles one kernel into a folder, ``"quick"``, or four ``"slow"`` ones in two threads."""
     cache_folder = folder / "cache"
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
@@ -388,16 +383,9 @@ def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
     assert not native._INTERRUPTED.is_set()
 
 
-@pytest.mark.parametrize(
-    ("end_signal", "mode"),
-    [
-        (signal.SIGKILL, "threads"),
-        (signal.SIGINT, "threads"),
-        (signal.SIGTERM, "slow"),
-    ],
-)
-def test_compilers_end_with_their_process(tmp_path, end_signal, mode):
-    with compile_in_another_process(tmp_path, mode) as process:
+@pytest.mark.parametrize("end_signal", [signal.SIGKILL, signal.SIGINT])
+def test_compilers_end_with_their_process(tmp_path, end_signal):
+    with compile_in_another_process(tmp_path, "slow") as process:
         try:
             wait_for(lambda: len(compiler_commands(tmp_path)) >= 3)  # the script, the driver and the compiler
             process.send_signal(end_signal)
