@@ -67,7 +67,6 @@ class Loop:
     """The loop of every script: a command from NumPy, some steps, the positions into NumPy."""
 
     def __init__(self, sim: Any, control: str, n_steps: int, iterations: int = 50):
-        """Run the loop once, which compiles the step."""
         import numpy as np
         from measure import start_hovering
 
@@ -105,7 +104,6 @@ class Gradient:
     """Gradient of the final positions with respect to attitude commands, timed like ``measure.Flight``."""
 
     def __init__(self, package: str, sim: Any, n_steps: int):
-        """Compile the gradient."""
         import jax
         import jax.numpy as jnp
         from measure import seconds, start_hovering
@@ -146,7 +144,6 @@ class GymSteps:
     """
 
     def __init__(self, package: str, case: dict[str, Any], device: str):
-        """Make the environment and step it a few times, which compiles the step."""
         import gymnasium
         import jax
         import numpy as np
@@ -235,7 +232,6 @@ class SceneQuery:
     """Scene query after a step, timed without the step, or the construction of a swarm."""
 
     def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
-        """Build the scene, and measure its queries for the first time, which compiles them."""
         self._module, self._case, self._device = importlib.import_module(f"{package}.sim"), case, device
         self._task, self._sim = task, None
         if task != "swarm_build":

@@ -94,7 +94,6 @@ def report_rates(
         return step.reward.mean(), step.done.mean()
 
     def rollout_with_images(env: Any, state: Any, act: Any, key: Any) -> Any:
-        """Return the results of a rollout of a policy that also receives depth images."""
         render = base_env.sim.scene.depth_fn("fpv_cam", *image_size)  # type: ignore[misc]
 
         def step(state: Any, key: Any) -> Any:

@@ -143,7 +143,6 @@ def count_operations(block: Block, when_rate: float) -> float:
 
 
 def _count_contracted(block: Block) -> int:
-    """Return the number of products that are contracted with a sum, at most one per sum."""
     users: dict[Value, list[Operation]] = {}
     for op in block.walk():
         for x in op.args:

@@ -70,7 +70,6 @@ class Flight:
     """
 
     def __init__(self, sim: Any, control: str, n_steps: int, device: str):
-        """Make the drones hover, and step once, which compiles the step."""
         start_hovering(sim, control)
         self.sim, self.n_steps, self.start_data = sim, n_steps, sim.data
         self.is_queued = device != "cpu"
@@ -189,18 +188,15 @@ def describe_machine(device: str) -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Return the name of the processor as reported by the system."""
     return _cpu_info("model name") or platform.machine()
 
 
 def _vectors() -> str:
-    """Return the widest vector instructions that kernels use on this processor; CXXFLAGS can exclude some."""
     features = [x for x in _cpu_info("flags").split() if f"-mno-{x}" not in os.environ.get("CXXFLAGS", "")]
     return next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in features), "128 bit")
 
 
 def _cpu_info(key: str) -> str:
-    """Return an entry of /proc/cpuinfo for the first processor; empty on systems other than Linux."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")

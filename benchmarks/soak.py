@@ -96,21 +96,14 @@ class Memory:
     """Resident memory of this process over time, read by a thread."""
 
     def __init__(self, period_s: float):
-        """Create an empty series of readings.
-
-        Args:
-            period_s: Time between two readings, s.
-        """
         self._period_s, self._readings, self._stop_event = period_s, [], threading.Event()
 
     def __enter__(self) -> Memory:
-        """Start the thread."""
         self._start_time = time.monotonic()
         threading.Thread(target=self._read_memory, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the thread."""
         self._stop_event.set()
 
     def samples(self, start_s: float) -> tuple[np.ndarray, np.ndarray]:

@@ -378,7 +378,6 @@ def readme(records: list[Line]) -> str:
     head = ["", "two CPU cores (AVX2)", "one NVIDIA H100"]
 
     def lines_of(name: str, device: str, **case: Any) -> list[Line]:
-        """Return the lines that contain the entries of ``case``, of one figure, measured on one device."""
         lines = [
             line
             for record in records
@@ -388,7 +387,6 @@ def readme(records: list[Line]) -> str:
         return [line for line in lines if all(line.get(key) == value for key, value in case.items())]
 
     def range_text(values: Iterable[float]) -> str:
-        """Return the smallest and the largest number as text, with two digits."""
         ordered_values = sorted(round_digits(value, 2) for value in values)
         return f"{ordered_values[0]:g} to {ordered_values[-1]:g}" if ordered_values else ""
 

@@ -71,7 +71,6 @@ class PeerPolicy(PyTree):
     """True if a tanh follows the layers."""
 
     def __call__(self, obs: Obs) -> Array:
-        """Return the actions for observations."""
         out = mlp(self.layers, (flatten(obs) - self.mean) / self.std)
         return jnp.tanh(out) if self.has_tanh else out
 
@@ -93,7 +92,6 @@ def train_crazysim(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
 @functools.cache
 def _auto_reset(env: Env) -> AutoReset:
-    """Return the environment with automatic resets, the same object for all seeds, so that they share programs."""
     return AutoReset(env)
 
 
@@ -143,7 +141,6 @@ def train_brax(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
 
 def _device_put_replicated(tree: Any, devices: Any) -> Any:
-    """Return arrays with a copy on each device, as the function of older JAX did."""
     sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(devices, ("i",)), jax.sharding.PartitionSpec("i"))
     return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), sharding), tree)
 
@@ -227,8 +224,6 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
 @functools.cache
 def _compiled_step(env: AutoReset) -> Any:
-    """Return a compiled step: next state, and the observations, rewards, ends and time limits of all worlds."""
-
     @jax.jit
     def step(state: Any, action: Array) -> Any:
         state = env.step(state, jnp.clip(action, -1.0, 1.0)[:, None])
@@ -297,7 +292,6 @@ def measure_trainer(
 
 
 def _version(name: str) -> str:
-    """Return the version of a trainer; crazysim need not be installed, only on the path."""
     return crazysim.__version__ if name == "crazysim" else importlib.metadata.version(PACKAGES[name])
 
 

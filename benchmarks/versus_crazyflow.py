@@ -108,7 +108,6 @@ class Comparison:
     def __init__(
         self, workers: dict[str, Worker], engines: list[str], controllers: list[str], device: str, repeats: int
     ):
-        """Store the workers and the variants to compare."""
         self.workers, self.engines, self.controllers = workers, engines, controllers
         self.device, self.repeats = device, repeats
         self.machine = workers["crazysim"].request(do="machine", device=device)
@@ -174,7 +173,6 @@ class Comparison:
             print(json.dumps(line | self.machine), flush=True)
 
     def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
-        """Return the median time of a call and its compile time, s, by contestant. Calls of contestants alternate."""
         first_durations = {
             name: worker.request(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
@@ -205,7 +203,6 @@ class Worker:
     """Client of one program in its own process, with JSON lines as protocol."""
 
     def __init__(self, python: str, name: str):
-        """Start the process."""
         command = [python, FOLDER / "contestant.py", name]
         # Two processes share one GPU, so each preallocates less than half of its memory instead of three quarters.
         env = {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.45"} | os.environ
@@ -248,7 +245,6 @@ def peer_interpreter(device: str) -> Path:
 
 
 def _jax_extra(device: str) -> str:
-    """Return the extra of JAX that this environment has for a device."""
     if device == "cpu":
         return ""
     installed = {d.metadata["Name"] for d in importlib.metadata.distributions()}

@@ -126,5 +126,4 @@ __getattr__ = lazy_getattr(__name__)
 
 
 def __dir__() -> list[str]:
-    """Return the public names, including those not yet imported."""
     return __all__

@@ -49,7 +49,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _error_message(error: Exception, command: str) -> str:
-    """Return the message of an error. For a missing package it names the extra of crazysim that installs it."""
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return str(error)

@@ -163,7 +163,6 @@ def tree_bytes(tree: Any) -> int:
 
 
 def _memory_size(device: jax.Device) -> float:
-    """Return the memory of a device in bytes; infinite if it is unknown."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"]

@@ -118,7 +118,6 @@ class UnknownNameError(ConfigError, KeyError):
     """A name that does not exist, such as one of an airframe, a controller, a mode, a body, a camera or a stage."""
 
     def __str__(self) -> str:
-        """Return the message itself; ``KeyError`` would show its quoted form."""
         return str(self.args[0])
 
 
@@ -149,13 +148,6 @@ class UnsupportedError(Exception):
     """
 
     def __init__(self, cause: str, primitive: str = "", stage: str = ""):
-        """Create the error.
-
-        Args:
-            cause: The reason, as a sentence without a full stop.
-            primitive: Name of the JAX primitive, if it is known.
-            stage: Name of the stage, if it is known.
-        """
         super().__init__(cause, primitive, stage)
         self.cause, self.primitive, self.stage = cause, primitive, stage
 
@@ -175,5 +167,4 @@ class UnsupportedError(Exception):
         return self.cause if is_complete else f"primitive {self.primitive!r}: {self.cause}"
 
     def __str__(self) -> str:
-        """Return the reason, with the stage and the version of JAX where the stage is known."""
         return f"{self.reason} (stage {self.stage!r}, jax {self.jax_version})" if self.stage else self.reason

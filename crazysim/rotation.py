@@ -186,7 +186,6 @@ def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = Tr
 
 
 def _polynomial(x: Array, coefficients: list[float]) -> Array:
-    """Return the polynomial with these coefficients, constant term first. (...)"""
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):  # Horner's scheme: one multiply-add per coefficient
         value = value * x + coefficient
@@ -226,7 +225,6 @@ def to_rpy(q: Array) -> Array:
 
 
 def _wrap_angle(angle: Array) -> Array:
-    """Return the angle in [-pi, pi] that is equivalent to an angle in [-2 pi, 2 pi], rad. (...)"""
     return angle - 2 * jnp.pi * ((angle > jnp.pi).astype(angle.dtype) - (angle < -jnp.pi).astype(angle.dtype))
 
 

@@ -61,7 +61,6 @@ def _has_egl() -> bool:
 
 
 def _is_command() -> bool:
-    """Return True in a process of the command ``crazysim``, or of ``python -m crazysim``."""
     name = os.path.basename(sys.argv[0] if sys.argv else "")
     return name in ("crazysim", "crazysim.exe") or (name == "-m" and "crazysim" in sys.orig_argv)
 

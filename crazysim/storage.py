@@ -218,7 +218,6 @@ def process_name() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Return a short name of this machine and its namespace of process IDs, such as a container."""
     try:
         pid_namespace = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -246,12 +245,6 @@ def remove_abandoned_files(folder: Path, pattern: str) -> None:
 
 
 def _is_abandoned(name: str, age: float) -> bool:
-    """Return True if no process needs a file or folder any more.
-
-    Args:
-        name: Its name, which contains the name of its process.
-        age: Time since it was written, s.
-    """
     matches = re.findall(r"[.-]([0-9a-f]{8})-(\d+)-", name)
     if not matches:
         return False
@@ -358,19 +351,6 @@ class ZipReader:
     """A zip archive from which files are unpacked within limits of number and size."""
 
     def __init__(self, file: BinaryIO, name: str, max_files: int, max_file_bytes: int, max_total_bytes: int):
-        """Open an archive.
-
-        Args:
-            file: The archive, which stays open.
-            name: Name of the archive, for messages.
-            max_files: Largest number of files.
-            max_file_bytes: Largest file that is unpacked, bytes.
-            max_total_bytes: Largest number of bytes that are unpacked in all.
-
-        Raises:
-            ConfigError: If it has more than ``max_files`` files.
-            Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
-        """
         self._zip, self._name = zipfile.ZipFile(file), name
         self._max_file_bytes, self._max_total_bytes = max_file_bytes, max_total_bytes
         self._n_unpacked_bytes = 0
@@ -419,7 +399,6 @@ def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
 
 
 def _parse_array(content: bytes, name: str) -> NDArray:
-    """Return the array of a ``.npy`` file, after a check that its header states no more bytes than follow it."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -124,7 +124,6 @@ def read_number(name: str, value: Any, allowed: Range = ANY_NUMBER, remedy: str 
 def _as_array(
     name: str, value: Any, shapes: Shapes | None = None, whole: bool = False, owner: str = "", remedy: str = ""
 ) -> NDArray:
-    """Return a number or an array of numbers as an array."""
     try:
         array = np.array(value)
     except (TypeError, ValueError, RecursionError):

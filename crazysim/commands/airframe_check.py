@@ -83,12 +83,10 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
 
 
 def _thrust_to_weight(airframe: Airframe) -> float:
-    """Return the ratio of the largest thrust at zero torque to the weight (dimensionless)."""
     return max_thrust_without_torque(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
 def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
-    """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _thrust_to_weight(airframe)
     max_thrust, min_thrust = (float(airframe.value(f"rotors.thrust_{limit}")) for limit in ("max", "min"))
     hover_thrust = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
@@ -125,7 +123,6 @@ def _body_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
 
 
 def _rotor_rows(airframe: Airframe) -> Iterator[tuple[str, str]]:
-    """Yield speeds, lag and the rates of the default controller."""
     hover_speed, max_speed = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
     yield "rotor speed", f"{hover_speed:,.0f} rpm in hover, {hover_speed / max_speed:.0%} of {max_speed:,.0f} rpm"
     yield "rotor time constant", f"{1 / rotor_rate(airframe):.3g} s in hover"
@@ -146,7 +143,6 @@ def _battery_text(airframe: Airframe) -> str:
 
 
 def _controller_rows(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    """Yield the command levels that each controller follows, or the parameters that it lacks."""
     yield "controllers", "command levels that each of them follows"
     if Dynamics.first_principles not in dynamics:
         if dynamics:
@@ -169,14 +165,12 @@ def _controller_rows(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[
 
 
 def _levels_text(missing_by_level: Mapping[str, str]) -> str:
-    """Return the command levels with all parameters, and the missing parameters of other levels, as text."""
     followed = ", ".join(levels for levels, missing in missing_by_level.items() if not missing)
     reasons = [f"not {levels}: {missing}" for levels, missing in missing_by_level.items() if missing]
     return "; ".join([followed or "none", *reasons])
 
 
 def _missing_parameters(create: Callable[[], Any]) -> str:
-    """Return the reason why parameters cannot be created; empty if they can."""
     try:
         create()
     except ConfigError as error:
@@ -186,7 +180,6 @@ def _missing_parameters(create: Callable[[], Any]) -> str:
 
 
 def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
-    """Yield warnings about numbers that are allowed but probably mistakes."""
     positions, ratio = airframe.value("rotors.position"), _thrust_to_weight(airframe)
     if ratio < MIN_THRUST_TO_WEIGHT:
         yield f"thrust over weight is {ratio:.2f}; below {MIN_THRUST_TO_WEIGHT:g} little is left for manoeuvres"
@@ -204,7 +197,6 @@ def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
 
 
 def _agility_warnings(airframe: Airframe) -> Iterator[str]:
-    """Yield warnings about slow turns, precession and slow rotors, and about divergence at the default rate."""
     for (axis, minimum), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
         if acc < minimum:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)

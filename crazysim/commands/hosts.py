@@ -114,14 +114,12 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
 
 
 def _stop_all(number: int, frame: object) -> None:
-    """On Ctrl-C, end this process as SIGTERM does: JAX stops all hosts after the same iteration. A second one kills."""
     del frame
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _host_addresses(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings with which JAX connects the hosts; none if it reads them from the scheduler's variables."""
     address, n, i = options.coordinator, options.hosts, options.host_id
     if address == "auto":
         return {}
@@ -137,7 +135,6 @@ def _host_addresses(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _check_coordinator(text: str) -> None:
-    """Check an address, which JAX would try to connect with until ``--connect-timeout``, or for ever."""
     match = re.fullmatch(r"(.+):(\d{1,5})", text)
     if match is None or not 1 <= int(match[2]) <= MAX_PORT:
         raise ConfigError(
@@ -154,7 +151,6 @@ def _check_coordinator(text: str) -> None:
 
 
 def _stop_others(host: Hosts, error: BaseException) -> None:
-    """Print an error, send it to the other hosts, and end the process when they have ended."""
     is_expected = isinstance(error, (ValueError, ImportError, OSError, DivergedError))
     text = str(error) if is_expected else f"{type(error).__name__}: {error}"
     if not is_expected:
@@ -169,7 +165,6 @@ _end_lock = threading.Lock()
 
 
 def _end_process(host: Hosts, line: str, reason: str | None) -> None:
-    """Print a line, send a reason to the other hosts unless it is None, wait until they end, and end the process."""
     if not _end_lock.acquire(blocking=False):
         time.sleep(2 * STOP_SECONDS)
     print(line, file=sys.stderr)
@@ -185,7 +180,6 @@ def _end_process(host: Hosts, line: str, reason: str | None) -> None:
 
 
 def _stop_with_others(host: Hosts) -> None:
-    """End this process as soon as another host stops with an error."""
     while True:
         time.sleep(POLL_SECONDS)
         with suppress(Exception):  # the coordinator has gone: JAX's runtime ends this process

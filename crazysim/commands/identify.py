@@ -145,7 +145,6 @@ def run(options: argparse.Namespace) -> None:
 def _report_errors(
     options: argparse.Namespace, logs: Sequence[Log], held_out: Sequence[Log], models: Mapping[str, Predictor]
 ) -> None:
-    """Print the errors of predictions of fitted and held-out logs, and draw them if requested."""
     for title, flights in (("fitted logs", logs), ("held-out logs", held_out)):
         if flights:
             for name, model in models.items():
@@ -161,7 +160,6 @@ def _write_file(path: Path, text: str) -> None:
 
 
 def _split_interval(text: str) -> tuple[str, tuple[float, float]]:
-    """Return path, start and end of ``LOG@START:END``; start and end may be left out."""
     match = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
     if match is None and re.fullmatch(r".+@[^@/]*:[^@/]*", text) and not Path(text).exists():
         raise ConfigError(f"expected LOG@START:END with times in s, got {text!r}. Use for example flight.csv@10:25.")
@@ -171,7 +169,6 @@ def _split_interval(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _read_columns(texts: Sequence[str]) -> Columns:
-    """Return the columns of FIELD=NAMES pairs."""
     column_fields = Columns.__dataclass_fields__
     fields: dict[str, Any] = {}
     for text in texts:

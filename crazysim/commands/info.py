@@ -47,7 +47,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield the name of each line and a function that returns the text after the name."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
     # Cores that this process may use.
@@ -65,7 +64,6 @@ def _info_lines() -> Iterator[tuple[str, Callable[[], str]]]:
 
 
 def _value_or_reason(value: Callable[[], str]) -> str:
-    """Return the value of a line, or the reason why it is missing."""
     try:
         return value()
     except importlib.metadata.PackageNotFoundError:
@@ -129,7 +127,6 @@ def _cache() -> str:
 
 
 def _rendering() -> str:
-    """Return the OpenGL backend and whether it renders; the attempt runs in a subprocess because it may crash."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     environment = os.environ | startup.refused_variables
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"

@@ -122,7 +122,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
-    """Return the pilot of the policy to fly; None for a flight without one."""
     excluded = ("drones", "control_freq", "freq", "drone", "dynamics", "controller", "pilot", "gamepad", "commands")
     if options.policy is None:
         require(options.goals is None, "expected --policy with --goals, got none. Use --policy out/hover, for example.")

@@ -83,7 +83,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any]) -> None:
-    """Fly a show in real time, and print the report of the loop."""
     import numpy as np
 
     from crazysim.lab.live import Browser, Window

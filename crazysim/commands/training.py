@@ -79,7 +79,6 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
-    """Add a command that reads the folder of a run, and return the function that adds its arguments."""
     parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     parser.add_argument("folder", type=Path, help="folder of the run")
@@ -87,7 +86,6 @@ def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: s
 
 
 def _add_task_and_device(add: Any) -> None:
-    """Add the options of a command that rebuilds the environment of a run."""
     task_help = "FILE.py:CLASS of your task, if it has moved since training"
     add("--task", metavar="FILE.py:CLASS", help=task_help)
     add("--device", help="device: cpu, gpu; by default the training's")
@@ -111,7 +109,6 @@ def parse_seeds(text: str) -> Sequence[int]:
 
 
 def _parse_sweep(texts: Sequence[str]) -> dict[str, list[float]]:
-    """Return the values in NAME=VALUE,VALUE by name."""
     sweep: dict[str, list[float]] = {}
     for text in texts:
         name, _, values = text.partition("=")
@@ -126,7 +123,6 @@ def _parse_sweep(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def _parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
-    """Return NAME=VALUE pairs as a dict; a value that is not JSON is a string."""
     pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -158,7 +154,6 @@ def train(options: argparse.Namespace) -> int | None:
 
 
 def _train(options: argparse.Namespace, devices: str | None = None) -> None:
-    """Train a policy in this process, on ``devices`` if the options name none."""
     from crazysim.train.runs import run, run_many
 
     settings: dict[str, Any] = {
@@ -179,7 +174,6 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> None:
 
 
 def _exit(*_: object) -> NoReturn:
-    """Raise ``SystemExit`` on SIGTERM, so that training writes its checkpoint before the process ends."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second signal would interrupt the writing
     raise SystemExit(128 + signal.SIGTERM)
 

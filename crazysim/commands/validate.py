@@ -63,7 +63,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _draw_sections(selected_sections: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[str, str]:
-    """Write the pictures, and return their paths relative to the page by the names of the sections."""
     pictures = {}
     for section in selected_sections:
         section_rows = [row for row in rows if row.section == section.name]
@@ -79,7 +78,6 @@ def _draw_sections(selected_sections: Sequence[Section], rows: Sequence[Row], fo
 
 
 def _provenance(selected_sections: Sequence[Section]) -> str:
-    """Return a sentence with the date and the versions of the programs that made the page."""
     command = ["git", "-C", str(Path(crazysim.__file__).parent), "describe", "--always", "--dirty"]
     try:
         result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -100,7 +98,6 @@ def _provenance(selected_sections: Sequence[Section]) -> str:
 
 
 def _processor() -> str:
-    """Return the name of the processor, or the architecture if the system gives no name."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

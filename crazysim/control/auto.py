@@ -294,7 +294,6 @@ class Auto(Controller):
         return jnp.where(is_on, rotor_vel, 0.0), memory.replace(momentum=expected_momentum, torque=disturbance_torque)
 
     def _command_errors(self, state: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
-        """Return the rotation error, rad (None at the level ``body_rate``), and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]
         rpy, ang_vel_des = command[..., :3], jnp.zeros_like(state.ang_vel)

@@ -72,7 +72,6 @@ def fastest_rotor_rate(airframe: Airframe) -> float:
 
 
 def _lag_rates(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
-    """Return the rates of the lag at a speed of the rotors, rpm, on spin-up and spin-down, 1/s. (n_rotors, 2)"""
     lag = np.atleast_2d(airframe.value("rotors.lag"))
     return lag[:, 0::2] + 2 * lag[:, 1::2] * rotor_vel[:, None]
 

@@ -72,17 +72,11 @@ class CFirmware(Controller, params=AllocationParams):
     """Rate of the controller, Hz."""
 
     def __post_init__(self) -> None:
-        """Load the library.
-
-        Raises:
-            ConfigError: If the library cannot be loaded or lacks a function.
-        """
         expect(self.motors in MOTOR_UNITS, f"motors as one of {', '.join(MOTOR_UNITS)}", self.motors)
         _ = self._copy_path
 
     @functools.cached_property
     def _copy_path(self) -> str:
-        """Path of the copy that is loaded."""
         return copy_library(self.library)
 
     def memory(self, airframe: Airframe) -> CFirmwareMemory:
@@ -120,7 +114,6 @@ class CFirmware(Controller, params=AllocationParams):
         )
 
     def _rotor_vel(self, motors: Array, params: AllocationParams) -> Array:
-        """Return rotor speeds, rpm, from motor commands. (n_rotors,)"""
         if self.motors == "rpm":
             return motors
         thrust = motors * params.thrust_max if self.motors == "throttle" else motors
@@ -129,15 +122,6 @@ class CFirmware(Controller, params=AllocationParams):
 
 
 def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return memories and motor commands after one call of a library for all drones. (..., n_words), (..., n_motors)
-
-    Args:
-        library: Path of the copy of the library.
-        level: Index of the command level in ``COMMAND_LEVELS``.
-        n_motors: Number of motors of a drone.
-        words: Memories. The library writes into a copy of them. (..., n_words)
-        inputs: ``struct crazysim_input`` of each drone. (..., n_inputs)
-    """
     words, inputs = np.array(words, np.uint32, order="C"), np.ascontiguousarray(inputs, np.float32)
     motors = np.zeros((*inputs.shape[:-1], n_motors), np.float32)
     pointers = words.ctypes.data, level, inputs.ctypes.data, motors.ctypes.data
@@ -187,10 +171,7 @@ def copy_library(library: str | Path) -> str:
 
 
 def _loading_error(library: Path) -> str:
-    """Return the reason why a library cannot be loaded; empty if it can be loaded.
-
-    A separate process tries to load it, because the system kills a process that loads a truncated library.
-    """
+    # A separate process tries to load it, because the system kills a process that loads a truncated library.
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:
         process = subprocess.run(command, capture_output=True, text=True, timeout=LOADING_TIMEOUT, check=False)
@@ -208,5 +189,4 @@ _open_library = functools.cache(ctypes.CDLL)
 
 @functools.cache
 def _copies_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return the temporary folder with the copies of libraries of this process."""
     return tempfile.TemporaryDirectory(prefix="crazysim-", ignore_cleanup_errors=True)

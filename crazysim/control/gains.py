@@ -21,7 +21,6 @@ class Gains(AirframeParams):
     """Paths of the values that are needed beside those that leaves declare, declared like ``controller``."""
 
     def __init_subclass__(cls, controller: str = "", needs: tuple[str, ...] = (), **kwargs: Any) -> None:
-        """Keep the declarations."""
         super().__init_subclass__(**kwargs)
         cls.controller, cls.needs = controller or cls.controller, (*cls.needs, *needs)
 

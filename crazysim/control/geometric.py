@@ -101,12 +101,6 @@ def geometric_control(
         feedback = feedback + integral
 
     def subtract_drag(motion: Array, derivative: Array) -> Array:
-        """Return an acceleration minus the drag over mass at a velocity, or the same for their derivatives.
-
-        Args:
-            motion: Velocity, acceleration or jerk, world frame. (..., 3)
-            derivative: Derivative of ``motion``. (..., 3)
-        """
         if not feedforward:
             return derivative
         return derivative - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass

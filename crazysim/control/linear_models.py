@@ -87,7 +87,6 @@ def load_derivative(
         ang_acc_per_pull = jnp.linalg.solve(J, lever)
 
         def joint_acceleration(acc: Array, ang_acc: Array) -> Array:
-            """Return the acceleration of the joint, world frame, m/s^2. (3,)"""
             return acc + matvec(matrix, cross(ang_acc, attach) + cross(ang_vel, cross(ang_vel, attach)))
 
         acc = force / mass + gravity_vec
@@ -139,7 +138,6 @@ def _z_axis(rpy: Array) -> Array:
 
 
 def _rotational_derivatives(rpy: Array, ang_vel: Array, torque: Array, J: Array) -> tuple[Array, Array]:
-    """Return the derivatives of roll, pitch, yaw and of the body rates."""
     roll, pitch = rpy[0], rpy[1]
     heading_rate = jnp.sin(roll) * ang_vel[1] + jnp.cos(roll) * ang_vel[2]
     yaw_rate = heading_rate / jnp.cos(pitch)

@@ -183,7 +183,6 @@ class Mellinger(Controller, params=MellingerParams, memory=MellingerMemory):
     def _command(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
     ) -> tuple[Array, Array, MellingerMemory, Array]:
-        """Return thrust and torque, PWM, the memory, and the desired force, N, which is zero without a setpoint."""
         s, p, force = data.states, params, jnp.zeros_like(data.states.pos)
         axes = rotation.matrix(s.quat)
         if isinstance(command, Setpoint):
@@ -199,14 +198,12 @@ class Mellinger(Controller, params=MellingerParams, memory=MellingerMemory):
 
 
 def _desired_rates(data: DroneData, command: Setpoint | Array) -> Array:
-    """Return the desired body rates of a full-state setpoint, rad/s, otherwise zero. (3,)"""
     if isinstance(command, Setpoint):
         return data.controls.state.cmd[13:16]
     return jnp.zeros_like(data.states.ang_vel)
 
 
 def _divide_by_gain(x: Array, gain: Array) -> Array:
-    """Return ``x / gain``, and zero where the gain is zero. (...)"""
     return jnp.where(gain == 0, 0.0, x / jnp.where(gain == 0, 1.0, gain))
 
 

@@ -140,7 +140,6 @@ class PID(Controller):
     def _desired_rates(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
     ) -> tuple[Array, PIDLoopMemory, Array]:
-        """Return the desired angles, degrees, the memory of the attitude loop, and the desired rates, degrees/s."""
         is_rate_command = data.controls.mode == Control.body_rate
         if is_rate_command and not self.hold_yaw:
             return memory.rpy_des, memory.attitude, DEGREES_PER_RADIAN * command[:3]  # type: ignore[index]
@@ -160,7 +159,6 @@ class PID(Controller):
 
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:
-    """Return the memory, reset where the thrust is zero or less, as ``controllerPidReinitialize`` does."""
     m, is_off = memory, memory.thrust <= 0
     return m.replace(
         position=m.position.reset_where(is_off, pos),

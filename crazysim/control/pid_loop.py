@@ -157,7 +157,6 @@ def continue_integral(memory: PIDLoopMemory, output: Array, desired_output: Arra
 
 
 def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
     b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
     delay_1, delay_2 = delays[..., 0, :], delays[..., 1, :]
     new_delay = sample - delay_1 * a1 - delay_2 * a2
@@ -165,7 +164,6 @@ def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
 
 
 def _wrap_angle(x: Array, is_angle: Sequence[bool]) -> Array:
-    """Return values with 360 degrees subtracted above 180 degrees and added below -180 degrees where ``is_angle``."""
     if not any(is_angle):
         return x
     correction = jnp.where(x > 180, 360.0, jnp.where(x < -180, -360.0, 0.0))

@@ -159,11 +159,9 @@ def keep_upright(specific_thrust: Array, setpoint: Setpoint, params: PositionPar
 
 
 def _limit_length(x: Array, limit: Array) -> Array:
-    """Return vectors, shortened to a limit where they are longer. (..., n)"""
     norm = safe_norm(x)
     return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
 
 
 def _join_vertical(horizontal: Array, vertical: Array) -> Array:
-    """Return the vector with a horizontal part (..., 2) and a vertical part (..., 1). (..., 3)"""
     return jnp.concatenate([horizontal, vertical], axis=-1)

@@ -58,13 +58,6 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
 
 
 def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
-    """Return the collective thrust, the scale of roll and pitch torque, the yaw force and the tilt thrusts.
-
-    Returns:
-        Collective thrust, N (..., 1); factor in [0, 1] of roll and pitch torque (..., 1); yaw force, which is the yaw
-        torque over its torque arm, N (..., 1); tilt thrusts, which are the thrust of each rotor for the unscaled roll
-        and pitch torque, over the rotor's share of the collective thrust, N (..., n_rotors).
-    """
     p = params
     # Thrust of each rotor divided by the collective thrust, positive.
     lift_shares = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)
@@ -105,9 +98,6 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
 
 
 def _reduce_rotors(function: Callable[[Array, Array], Array], x: Array) -> Array:
-    """Return the largest or smallest entry over the rotors, by pairwise comparisons. (..., 1)
-
-    The gradient of ``jnp.max`` divides by the number of entries that equal the result. Where XLA computes the entries
-    twice, with different rounding, that number may be zero.
-    """
+    # The gradient of ``jnp.max`` divides by the number of entries that equal the result. Where XLA computes the entries
+    # twice, with different rounding, that number may be zero.
     return functools.reduce(function, [x[..., k : k + 1] for k in range(x.shape[-1])])

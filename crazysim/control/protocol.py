@@ -112,7 +112,6 @@ class Controller:
     def __init_subclass__(
         cls, params: type[AirframeParams] | None = None, memory: type[PyTree] | None = None, **kwargs: Any
     ) -> None:
-        """Make every subclass a frozen dataclass, and check its declarations."""
         super().__init_subclass__(**kwargs)
         cls.params_type, cls.memory_type = params or cls.params_type, memory or cls.memory_type
         dataclasses.dataclass(frozen=True, eq=False)(cls)

@@ -78,7 +78,6 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def _solve_by_doubling(A: Array, G: Array, H: Array) -> Array:
-    """Return the limit of H under doubling, or NaN where A does not converge to zero. (n, n)"""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
     def double_step(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
@@ -102,8 +101,6 @@ def solve_lyapunov(A: Array, Q: Array) -> Array:
 
 
 def _solve_smith(A: Array, Q: Array) -> Array:
-    """Return X with ``X = A^T X A + Q`` for a stable A, by doubling (Smith 1968). (n, n)"""
-
     def double_step(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
         X, power = carry
         return (X + power.T @ X @ power, power @ power), None

@@ -14,7 +14,6 @@ from crazysim.engine.pytree import leaf
 
 
 def _thrust_scale(airframe: Airframe) -> ArrayLike:
-    """Return the thrust of the firmware's PWM for a desired thrust over that thrust, 1."""
     pwm_per_newton = airframe.value("controller.mass_thrust", ())
     max_thrust = airframe.n_rotors * airframe.value("rotors.thrust_max", ())
     return pwm_per_newton * (max_thrust / airframe.value("controller.pwm_max", ()))

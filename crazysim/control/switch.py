@@ -100,7 +100,6 @@ class Switch(Controller):
         return rotor_vel, SwitchMemory(tuple(new_memories), active, rotor_vel)
 
     def _active_index(self, data: DroneData, command: Setpoint | Array, params: SwitchParams) -> Array:
-        """Return the index of the controller to use. ()"""
         if params.index is not None:
             index = params.index[0]
         else:
@@ -136,10 +135,8 @@ def _check_indices(switch: Any, n: int) -> np.ndarray:
 
 
 def _is_tick(data: DroneData, freq: Any) -> Array | bool:
-    """Return True if this step is a tick of a rate, Hz. ()"""
     return data.core.steps % (data.core.freq // freq) == 0
 
 
 def _select_tree(mask: Any, new_tree: Any, old_tree: Any) -> Any:
-    """Return ``new_tree`` where a mask is True and ``old_tree`` elsewhere. A leaf that is one object in both stays."""
     return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new_tree, old_tree)

@@ -135,10 +135,7 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
 
 
 def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
-    """Return one array per airframe, padded to a common shape along the axes over rotors.
-
-    A length of 1 means that all rotors share a value, which is repeated.
-    """
+    # A length of 1 means that all rotors share a value, which is repeated.
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
     padded = []
     for x in arrays:
@@ -154,7 +151,6 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
 
 
 def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
-    """Return a record in which ``None`` in fields ``ROTOR_MASK``, also of nested records, is replaced by a mask."""
     if not isinstance(record, PyTree):
         return record
     changes = {}

@@ -27,7 +27,6 @@ def any_lane(condition: Array) -> Array:
 
 
 def _batching_rule(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
-    """Return True if the condition holds for any element of a batch, as an unbatched result."""
     return any_lane_p.bind(jnp.any(args[0], axis=dims[0])), [None]
 
 

@@ -52,7 +52,6 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
 
 
 def _apply_staged_command(data: SimData, level: Control) -> SimData:
-    """Return the data of one drone with the staged command of a level in force."""
     controls = controls_of(data)
     level_controls = getattr(controls, level.value)
     level_controls = level_controls.replace(cmd=level_controls.staged_cmd)
@@ -62,7 +61,6 @@ def _apply_staged_command(data: SimData, level: Control) -> SimData:
 
 
 def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
-    """Return the command in force of one drone: a setpoint at the level ``state``, otherwise four numbers."""
     level_controls = getattr(data.controls, level.value)
     return (
         Setpoint.of_command(level_controls.cmd, level_controls.feedforward)
@@ -72,7 +70,6 @@ def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
 
 
 def _stage_output(data: SimData, level: Control, command: Array) -> SimData:
-    """Return the data of one drone with its controller's command staged; rotor speeds take effect at once."""
     controls = controls_of(data)
     if level == Control.rotor_vel:
         return data.replace(controls=controls.replace(rotor_vel=command))
@@ -83,7 +80,6 @@ def _stage_output(data: SimData, level: Control, command: Array) -> SimData:
 
 
 def _replace_memory(data: SimData, level: Control, memory: Any) -> SimData:
-    """Return the data of one drone with the memory of the controller that follows a level."""
     level_controls = getattr(data.controls, level.value)
     level_controls = level_controls.replace(controller=level_controls.controller.replace(memory=memory))
     return data.replace(controls=data.controls.replace(**{level.value: level_controls}))

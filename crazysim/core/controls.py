@@ -96,7 +96,6 @@ class _LevelData(PyTree):
         return None if self.controller is None else getattr(self.controller.memory, name, None)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the given fields replaced; ``params`` replaces the parameters of the controller."""
         if self.controller is not None and "params" in changes:
             controller = changes.get("controller", self.controller)
             changes["controller"] = controller.replace(params=changes.pop("params"))
@@ -177,7 +176,6 @@ def check_same_controllers(controls: SimControls, reference: SimControls, name: 
 
 
 def _controller_records(controls: SimControls) -> list[ControllerData]:
-    """Return the records of all controllers, from the command level down."""
     levels = (controls.state, controls.attitude, controls.body_rate)
     return [level.controller for level in levels if level is not None and level.controller is not None]
 
@@ -193,7 +191,6 @@ def _describe_controller(controller: ControllerData) -> str:
 
 
 def _type_name(record: object) -> str:
-    """Return the name of a record's type, with the types of the controllers in it."""
     name, members = type(record).__name__, getattr(record, "controllers", ())
     return f"{name}({', '.join(map(_type_name, members))})" if members else name
 
@@ -220,7 +217,6 @@ class SimControls(PyTree):
         return getattr(getattr(self, self.mode.value), "controller", None)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the given fields replaced; ``controller`` replaces the controller of the command level."""
         if "controller" in changes:
             level = changes.get(self.mode.value, getattr(self, self.mode.value))
             changes[self.mode.value] = level.replace(controller=changes.pop("controller"))

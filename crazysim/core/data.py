@@ -267,13 +267,11 @@ class SimData(Record):
         )
 
     def check(self) -> None:
-        """Check shapes and types of the states, and the axes of every leaf."""
         require_states(self)
         require_arrays(self)
         check_axes(self, self.core.n_worlds, self.core.n_drones)
 
     def without_sizes(self) -> SimData:
-        """Return the data with 0 as its numbers of worlds and drones."""
         return self.replace(core=self.core.replace(n_worlds=0, n_drones=0))
 
 

@@ -98,7 +98,6 @@ def check_setpoint(
 
 
 def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
-    """Return the setpoint with the given parts, a NumPy array if no part is a JAX array. (n_worlds, n_drones, 16)"""
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     batch_shape = data.states.pos.shape[:2]
@@ -111,7 +110,6 @@ def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.nda
 
 
 def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
-    """Return a part of a setpoint as an array that broadcasts to a shape."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
         is_broadcastable = np.broadcast_shapes(array.shape, shape) == shape
@@ -125,10 +123,7 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
 
 
 def _setpoint(xp: Any, batch_shape: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
-    """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)
-
-    ``xp`` is the array module: ``numpy`` or ``jax.numpy``.
-    """
+    # ``xp`` is the array module: ``numpy`` or ``jax.numpy``.
     zeros = xp.zeros((*batch_shape, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
     half_yaw = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
@@ -267,7 +262,6 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
 def _as_command(
     data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
 ) -> Array | NDArray:
-    """Return a command as an array of the state's dtype, after checking shape, type and values."""
     is_on_host = not isinstance(command, jax.Array)
     try:
         array = np.asarray(command) if is_on_host else command

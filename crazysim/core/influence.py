@@ -95,7 +95,6 @@ def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: fl
 
 
 def _call_method(title: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
-    """Return the result of a plugin's method; an error of the method gets a note that names plugin and method."""
     try:
         return method(data)
     except Exception as error:
@@ -105,7 +104,6 @@ def _call_method(title: str, method: Callable[[SimData], T], data: SimData, scop
 
 
 def _check_params(title: str, before: Any, after: Any) -> None:
-    """Check that parameters have the shapes of one drone; a curve may become one curve per rotor."""
     for f in dataclasses.fields(before):
         old, new = getattr(before, f.name), getattr(after, f.name)
         if new is old:

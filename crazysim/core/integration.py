@@ -157,7 +157,6 @@ class Integration:
     """Height of the ground on which drones stand, world frame, m; None without ground."""
 
     def __call__(self, data: SimData) -> SimData:
-        """Return the data one step later."""
         return self.method(data, self.derivative)
 
     def on_ground(self, ground: Callable[[SimData], Array | float] | None) -> Integration:
@@ -186,7 +185,6 @@ class Integration:
         return apply_constraint(constraining_plugins[0], influenced_data, deriv, None if self.method is rk4 else dt)
 
     def _unconstrained_derivative(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
-        """Return the data with all influences applied, and the derivative without constraints."""
         for plugin in self.plugins:
             data = apply_influence(plugin, data)
         deriv = self.deriv_fn(data)

@@ -72,13 +72,6 @@ class BuiltPipeline(Generic[F]):
     """A pipeline and the function that runs it; an edit of the pipeline builds a new function."""
 
     def __init__(self, name: str, stages: Pipeline, build_fn: Callable[[Pipeline], F]):
-        """Build the function for the first time.
-
-        Args:
-            name: Name of the pipeline, for messages.
-            stages: Functions by name, in order; users may edit the dict.
-            build_fn: Function from a pipeline to the function that runs it.
-        """
         self._name, self._stages, self._build_fn = name, stages, build_fn
         self._last_build: tuple[Sequence[Callable[..., Any]], F]
         self.build()

@@ -188,7 +188,6 @@ def _leaf_metadata(scope: Scope, core: CoreShape, **details: Any) -> dict[str, A
 
 
 def _declare_static_fields(cls: type) -> None:
-    """Make every new field without a declaration static; a field of a base class keeps its declaration."""
     inherited = {f.name: f for base in reversed(cls.__mro__[1:])
                  for f in vars(base).get("__dataclass_fields__", {}).values()}  # fmt: skip
     for name, hint in inspect.get_annotations(cls).items():
@@ -321,7 +320,6 @@ def bind_leaf(
 
 
 def _as_tuples(value: Any, arrays: bool) -> Any:
-    """Return lists, and arrays where they are allowed, as tuples, which are hashable."""
     value = value.tolist() if arrays and hasattr(value, "tolist") else value
     return tuple([_as_tuples(x, arrays) for x in value]) if type(value) in (list, tuple) else value
 
@@ -376,10 +374,7 @@ class Plugin(PyTree):
         abstract: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Make every subclass a frozen dataclass, whose numbers and states are leaves for JAX.
-
-        An abstract class leaves the field ``name`` to its subclasses.
-        """
+        # An abstract class leaves the field ``name`` to its subclasses.
         if replaces:
             cls.replaces = replaces
         cls.requires = (*cls.requires, *(requires if isinstance(requires, tuple) else (requires,)))
@@ -392,7 +387,6 @@ class Plugin(PyTree):
         )
 
     def __post_init__(self) -> None:
-        """Check the user's settings; a plugin with arrays has been checked."""
         if self.is_bound is not True:
             self.check_settings()
 
@@ -673,7 +667,6 @@ class BoundMethod:
         return self.method.__name__
 
     def __call__(self, data: SimData) -> Any:
-        """Return what the method returns, such as the data after the stage."""
         known_data = self.plugin.known_data(data)
         after = self.method(self.plugin.bound(known_data), known_data)
         if known_data is data or not isinstance(after, SimData):

@@ -64,7 +64,6 @@ class Population(Plugin, Members):
 
     @property
     def scope(self) -> str:
-        """Scope of its states and stages: its name."""
         return self.name
 
     @property
@@ -96,7 +95,6 @@ class Population(Plugin, Members):
 
     @property
     def is_dynamic(self) -> bool:
-        """True if the drones' integration must call ``influence``; populations integrate their own states."""
         return type(self).influence is not Plugin.influence or self.constrains
 
     def check_settings(self) -> None:
@@ -105,7 +103,6 @@ class Population(Plugin, Members):
         object.__setattr__(self, "n_members", len(self.names))
 
     def check_simulation(self, sim: Simulation) -> None:
-        """Check the name of the population and the rate of its controller."""
         super().check_simulation(sim)
         require(
             self.name not in (*RESERVED_SCOPES, "drone", "world"),
@@ -142,7 +139,6 @@ class Population(Plugin, Members):
         return self
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return a stage for ``control`` and a stage for ``derivative``, if the class overrides these methods."""
         cls, placements = type(self), []
         if cls.control is not Population.control:
             control_freq = self.bound(sim.data).control_freq

@@ -137,11 +137,8 @@ def mix_bits(x: Array) -> Array:
 
 
 def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
-    """Return random multiples of 2^-23, in float64 of 2^-52, from zero to below one, (*shape).
-
-    None for keys and types for which JAX's own functions are used. In float64, JAX's functions need 64-bit
-    integers, which kernels do not have.
-    """
+    # None for keys and types for which JAX's own functions are used. In float64, JAX's functions need 64-bit integers,
+    # which kernels do not have.
     if dtype not in (jnp.float32, jnp.float64) or bits_generator(key.dtype) != threefry_prng_impl.name:
         return None
     if dtype == jnp.float64:
@@ -152,7 +149,6 @@ def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
 
 
 def _words(key: Array, shape: Sequence[int]) -> Array:
-    """Return random 32-bit words, (*shape)."""
     n = math.prod(shape)
     word_0, word_1 = jax.random.key_data(key)
     counters = np.arange(-(-n // 2), dtype=np.uint32)
@@ -162,10 +158,7 @@ def _words(key: Array, shape: Sequence[int]) -> Array:
 
 
 def _key(data: SimData, name: str, *members: Array) -> Array:
-    """Return the random key of a world, or of one of its members, at a step.
-
-    The step is hashed late, and the name last, so that all names share the earlier hashes.
-    """
+    # The step is hashed late, and the name last, so that all names share the earlier hashes.
     core, key = data.core, seed_key(data)
     for number in (core.world_id, core.episode, *members, core.steps, zlib.crc32(name.encode())):
         key = jax.random.fold_in(key, number)

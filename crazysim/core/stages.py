@@ -26,12 +26,10 @@ from crazysim.engine.stage import Stage, StageScope, is_tick
 def _built_in_stage(
     scope: StageScope, when: Callable[[SimData], Array | None] | None = None, **options: Any
 ) -> Callable[..., Stage]:
-    """Return a decorator that declares a built-in stage; the decorated function accepts any leading axes."""
     return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True, **options)
 
 
 def _rate_condition(level: str) -> Callable[[SimData], Array | None]:
-    """Return the condition of a stage that acts at the rate of a command level, ``data.controls.<level>.freq``."""
     return lambda data: is_tick(data, getattr(data.controls, level).freq)
 
 

@@ -156,7 +156,6 @@ class Airframe:
         return float(np.min(voltages)) if len(voltages) else None
 
     def __repr__(self) -> str:
-        """Return only the name, because the tables are long."""
         return f"Airframe({self.name!r})"
 
 
@@ -170,7 +169,6 @@ def airframe_names() -> tuple[str, ...]:
 
 
 def _lookup_advice(path: str, paths: Iterable[str]) -> str:
-    """Return the advice for a missing value: to add it if its path is a known key, or else a similar path."""
     table, _, key = path.rpartition(".")
     return (
         f"Add {key} to its table [{table}]; {GUIDE} lists all keys."

@@ -128,7 +128,6 @@ def _check_rotors(airframe: Airframe) -> str | None:
 
 
 def _check_curves(airframe: Airframe) -> str | None:
-    """Check the curves of the rotors: thrust that rises over the speed, drag torque, lag."""
     numbers = airframe.values
     if "rotors.thrust_curve" in numbers:
         curves = np.atleast_2d(numbers["rotors.thrust_curve"])
@@ -165,7 +164,6 @@ def _check_curves(airframe: Airframe) -> str | None:
 
 
 def _check_forces(airframe: Airframe) -> str | None:
-    """Check drag, and the forces of the fitted models and the battery."""
     numbers, n = airframe.values, airframe.n_rotors
     weight, max_thrust = numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE, n * numbers["rotors.thrust_max"]
     for path in ("drag.coefficients", "fitted.so_rpy_rotor_drag.drag_coefficients"):

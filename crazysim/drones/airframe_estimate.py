@@ -223,7 +223,6 @@ def _toml_string(text: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Return a number or an array with six digits, as TOML."""
     if np.ndim(value):
         return f"[{', '.join(_toml_value(item) for item in value)}]"
     return f"{float(value):.6g}" if isinstance(value, (float, np.floating)) else str(int(value))
@@ -238,7 +237,6 @@ def _rotor_layout(
     spins: Sequence[int] | None,
     propeller: float,
 ) -> tuple[NDArray, NDArray]:
-    """Return positions (n, 3), m, and signs of the yaw torques (n,) of the rotors; describe a layout in the file."""
     require(
         (arm is None) != (positions is None),
         "expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.",
@@ -288,7 +286,6 @@ def _rotor_layout(
 
 
 def _estimate_inertia(mass: float, rotor_pos: NDArray) -> NDArray:
-    """Return the inertia of points at the rotors: moments, or a matrix if its principal axes are not the body's."""
     squares = np.einsum("ni,nj->ij", rotor_pos, rotor_pos) / len(rotor_pos)
     matrix = OUTER_MASS_SHARE * mass * (np.trace(squares) * np.eye(3) - squares)
     off_diagonal = matrix - np.diag(np.diag(matrix))
@@ -304,7 +301,6 @@ def _add_thrust(
     motor_table: MotorTable | None,
     pitch: float | None,
 ) -> float:
-    """Add the largest thrust and the curves of thrust and torque; return the largest thrust of one rotor, N."""
     require(
         (thrust_to_weight is None) != (motor_table is None),
         "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
@@ -357,7 +353,6 @@ def _add_thrust(
 
 
 def _check_units(mass: float, propeller: float, rotor_pos: NDArray, thrust: float) -> None:
-    """Refuse numbers in other units, such as grams or inches."""
     disc_loading, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(rotor_pos, axis=-1)))
     if disc_loading > MAX_DISC_LOADING or reach > 20 * propeller:
         raise ConfigError(
@@ -368,14 +363,12 @@ def _check_units(mass: float, propeller: float, rotor_pos: NDArray, thrust: floa
 
 
 def _fit_quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
-    """Return the factor k of values = k rpm^2 by least squares, and the largest error."""
     squares = rpm**2
     k = float(squares @ values / (squares @ squares))
     return k, float(np.max(np.abs(values - k * squares)))
 
 
 def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
-    """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     column_names = ", ".join(COLUMNS)
     column_by_quantity: dict[str, NDArray] = {}
@@ -425,7 +418,6 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
 
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
-    """Return the columns of a CSV file by their names in its first line."""
     require(is_file(path), f"expected a motor table as an existing CSV file, got {str(path)!r}")
     lines = [line for line in read_text(path, MAX_TEXT_BYTES).splitlines() if line.strip() and line[0] != "#"]
     header, *rows = csv.reader(lines) if lines else [[]]
@@ -439,7 +431,6 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
 def _add_battery(
     file: _AirframeFile, mass: float, cells: int | None, capacity: float | None, resistance: float | None
 ) -> None:
-    """Add the battery, with estimates of the numbers that are None."""
     n_cells = cells or next(n_cells for n_cells, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
     charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n_cells * CELL_VOLTAGE)
     file.add("battery", "cells", n_cells, "1, in series", "given" if cells else "cells")

@@ -52,7 +52,6 @@ def is_airframe_file(source: object) -> bool:
 
 
 def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
-    """Return the airframe of a source; ``bases`` are the sources that led to it, each the base of the previous one."""
     if isinstance(source, Airframe):
         return source
     bases = extend_bases(bases, source)
@@ -68,12 +67,6 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
 
 
 def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
-    """Return the numbers that an airframe inherits, and the reason why some are not inherited (empty if all are).
-
-    Args:
-        base: The base.
-        changes: The airframe's own numbers, by dotted path.
-    """
     base_values = base.values
     changed_paths = [
         path

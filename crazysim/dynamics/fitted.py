@@ -67,7 +67,6 @@ class Params(BodyParams):
 
     @classmethod
     def create(cls, airframe: Airframe, dynamics: Dynamics) -> Self:
-        """Return the shared parameters of an airframe for one of the fitted models."""
         require_support(airframe, dynamics)
         fit = dict.fromkeys(("thrust_dyn_coef", "drag_matrix")) | fitted_numbers(airframe, dynamics)
         return super().create(airframe, **fit)
@@ -137,7 +136,6 @@ def saturate(cmd: Array, params: Params) -> Array:
 
 
 def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
-    """Return the fit's angular acceleration, blended into an attitude spring outside of the fitted range."""
     x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
     cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
     blend = jnp.clip((cos_pitch - MIN_BLENDED_COSINE) / (MIN_FITTED_COSINE - MIN_BLENDED_COSINE), 0.0, 1.0)
@@ -163,7 +161,6 @@ def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p:
 
 
 def _euler_spring(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
-    """Return the angular acceleration of the fit, body frame; singular at 90 degrees of pitch. (..., 3)"""
     rpy = rotation.to_rpy(quat)
     sin, cos = jnp.sin(rpy), jnp.cos(rpy)
     sr, sp, cr, cp = sin[..., 0], sin[..., 1], cos[..., 0], cos[..., 1]

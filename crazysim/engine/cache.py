@@ -118,7 +118,6 @@ def _usable_default_folder() -> Path | None:
 
 @functools.cache
 def _prepared_default_folder(*environment: str | None) -> Path | None:
-    """Make and return the default folder; None if the cache is off or the folder cannot be used."""
     del environment  # the key under which the result is cached
     try:
         path = default_folder()
@@ -135,15 +134,6 @@ def _prepared_default_folder(*environment: str | None) -> Path | None:
 
 
 def _prepare_folder(root: Path, path: Path) -> None:
-    """Make the folder of a cache, and remove the least recently used files if the cache is too large.
-
-    Args:
-        root: Folder with a limited size.
-        path: The folder of the cache: ``root`` or a subfolder.
-
-    Raises:
-        ConfigError: If it cannot be made or written, belongs to another user, or its disk is full.
-    """
     try:
         for private_folder in (root, path):
             make_private_folder(private_folder)
@@ -212,7 +202,6 @@ class CheckedPrograms:
 
 
 def _checksum(key: str, program: bytes) -> bytes:
-    """Return the checksum in a skippable frame of Zstandard (RFC 8878); zlib ignores what follows its stream."""
     digest = hashlib.sha256(key.encode() + b"\0" + program).digest()
     return 0x184D2A50.to_bytes(4, "little") + len(digest).to_bytes(4, "little") + digest
 
@@ -269,11 +258,9 @@ class keep_programs(contextlib.ContextDecorator):
     _thread_state = threading.local()
 
     def __init__(self, enabled: bool = True):
-        """Choose whether the block keeps programs."""
         self._enabled = enabled
 
     def __enter__(self) -> None:
-        """Open the cache, unless an outer block has opened it."""
         stack = self._thread_state.__dict__.setdefault("stack", [])
         context = None
         if self._enabled and not any(stack) and jaxcompat.cache_folder() is None and (path := folder()) is not None:
@@ -282,7 +269,6 @@ class keep_programs(contextlib.ContextDecorator):
         stack.append(context)
 
     def __exit__(self, *error: Any) -> None:
-        """Close the cache, if this block opened it."""
         context = self._thread_state.stack.pop()
         if context is not None:
             context.__exit__(*error)

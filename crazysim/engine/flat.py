@@ -39,13 +39,11 @@ class PackCache:
 
 
 def _are_on_one_cpu(arrays: list[Any]) -> bool:
-    """Return True if all arrays are on one CPU device."""
     devices = {device for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
 
 
 def _concatenate_in_numpy(arrays: list[Any]) -> Array:
-    """Return arrays of one device concatenated on that device; the result is committed if one of the arrays is."""
     committed_sharding = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
     return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed_sharding)
 
@@ -68,7 +66,6 @@ class ZerosCache:
         self._cached: tuple[Sequence[Any], Zeros] = (), ()  # one tuple: threads replace both at once
 
     def __call__(self, indices: Sequence[int], leaves: Sequence[Any]) -> Zeros:
-        """Return the zeros of some leaves."""
         arrays = [leaves[i] for i in indices]
         cached_arrays, zeros = self._cached
         if _are_same(arrays, cached_arrays):
@@ -84,12 +81,10 @@ class ZerosCache:
 
 
 def _without_numpy(arrays: list[Any]) -> list[Any]:
-    """Return the arrays, with None for each NumPy array: its owner may change it, so it must be read again."""
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 
 def _are_same(arrays: Sequence[Any], others: Sequence[Any]) -> bool:
-    """Return whether two lists hold the very same arrays."""
     return len(arrays) == len(others) and all(map(_is_same, arrays, others))
 
 

@@ -40,14 +40,6 @@ class HostLeaves:
     __slots__ = ("_jax_arrays", "_sharding", "_views", "addresses", "items")
 
     def __init__(self, items: list[Any], addresses: list[int], views: Any, sharding: Any):
-        """Store leaves.
-
-        Args:
-            items: For each leaf a JAX or NumPy array, or the ``CallResults`` of the call that wrote it.
-            addresses: Address of each leaf that kernels read.
-            views: NumPy views that keep the memory of JAX arrays alive.
-            sharding: Device on which JAX arrays are made.
-        """
         self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
         self._jax_arrays: dict[int, Array] = {}
 
@@ -82,7 +74,6 @@ class HostLeaves:
 
 
 def _address(x: NDArray) -> int:
-    """Return the address of the data of an array, for a writable array three times as fast as ``ctypes.data``."""
     return ctypes.addressof(ctypes.c_char.from_buffer(x)) if x.flags.writeable else x.ctypes.data  # type: ignore[arg-type]
 
 
@@ -101,7 +92,6 @@ class _Layout:
     """Pieces of memory that a call writes, and the places of its results in them."""
 
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
-        """Choose a place for each result, given its key, shape and type. Small results share one piece of memory."""
         self.places: list[_ArrayPlace] = []
         self.piece_sizes: list[int] = []
         """Size of each piece, bytes."""
@@ -160,14 +150,6 @@ class HostCall:
     """Function that runs the steps of a plan: one host kernel for each of its programs."""
 
     def __init__(self, kernels: Sequence[Kernels], owned: Sequence[Any], leaves: Sequence[Any], nonfinite: int):
-        """Prepare the memory and the calls of some kernels.
-
-        Args:
-            kernels: Kernels of the programs; ``is_host_call_possible`` must be True for them.
-            owned: For each program the indices of the leaves that it updates; None for all leaves that it writes.
-            leaves: Leaves of the data, for their shapes and types.
-            nonfinite: Index of the leaf with the flags of worlds that are not valid.
-        """
         self.was_called = False
         """True after the first call."""
         self._nonfinite = nonfinite
@@ -216,7 +198,6 @@ class HostCall:
         return HostLeaves(items, addresses, views, sharding)
 
     def _view(self, i: int, x: Any) -> NDArray:
-        """Return a NumPy view of a JAX array, after waiting for it. The last view of each leaf is cached."""
         entry = self._views_by_leaf.get(i)
         if entry is None or entry[0] is not x:
             key_data = jax.random.key_data(x) if jaxcompat.is_key(x) else x
@@ -224,7 +205,6 @@ class HostCall:
         return entry[1]
 
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:
-        """Return the leaves some steps later."""
         self.was_called = True
         results, addresses = CallResults(self._layout), leaves.addresses
         for kernel, n_lanes, inputs, outputs, address_format in self._launches:

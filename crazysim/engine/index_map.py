@@ -29,7 +29,6 @@ class MapKernels:
     """Kernels of one function, compiled when they are first needed."""
 
     def __init__(self, block: Block):
-        """Store the function; nothing is compiled."""
         self._block = block
         self._launches: dict[str, Launch] = {}
 

@@ -147,7 +147,6 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
 
 
 def _trace_function(fn: Callable[..., Any], variables: Sequence[Any]) -> ClosedJaxpr:
-    """Return the jaxpr of a function of some variables of another jaxpr."""
     avals = [(v.aval, getattr(v.aval, "weak_type", False)) for v in variables]
     return jax.make_jaxpr(fn)(*(jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=is_weak) for x, is_weak in avals))
 
@@ -556,7 +555,6 @@ _CACHE_LOCK = threading.Lock()
 
 @contextlib.contextmanager
 def _close_cache_outside(close: Callable[[], None]) -> Iterator[None]:
-    """Close JAX's cache before the first and after the last of overlapping blocks; JAX closes it without a lock."""
     global _n_cache_blocks
     with _CACHE_LOCK:
         if not _n_cache_blocks:

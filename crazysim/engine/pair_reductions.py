@@ -105,11 +105,8 @@ def _result_types(*args: object, jaxpr: ClosedJaxpr, n_captured: int, reduce: st
 def _batching_rule(
     axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_captured: int, reduce: str
 ) -> Any:
-    """Return the batched results and their axes.
-
-    Over the axis of drones, the reduction is computed. Over any other axis, the primitive is bound again for a batched
-    ``jaxpr``.
-    """
+    # Over the axis of drones, the reduction is computed. Over any other axis, the primitive is bound again for a
+    # batched ``jaxpr``.
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:
@@ -132,11 +129,8 @@ def _reduce_for_all(
     jaxpr: ClosedJaxpr,
     reduce: str,
 ) -> list[Array]:
-    """Return the reduction for each of ``n`` drones of a world. (n, ...) each
-
-    ``captured`` and ``other`` are the captured and the published values. Their axes are None for values that all drones
-    share.
-    """
+    # ``captured`` and ``other`` are the captured and the published values. Their axes are None for values that all
+    # drones share.
     pair_fn, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
     captured_by_drone = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 

@@ -153,10 +153,7 @@ class Planner(NamedTuple):
         return plan
 
     def _plan_programs(self, data: Record) -> tuple[Plan, list[str]]:
-        """Return a plan that runs programs, and messages on what its engine does not support.
-
-        If programs cannot step data on several devices, the plan runs ``plain``.
-        """
+        # If programs cannot step data on several devices, the plan runs ``plain``.
         distribution_limit = self._distribution_limit(data)
         if distribution_limit:
             return self._plan_plain(data, distribution_limit), []
@@ -204,7 +201,6 @@ class Planner(NamedTuple):
         return plan, problems
 
     def _distribution_limit(self, data: Record) -> str:
-        """Return the reason why data on several devices must be stepped by ``plain``; empty if there is none."""
         if not self.location.is_distributed:
             return ""
         if self.location.mesh is None:
@@ -236,7 +232,6 @@ class Planner(NamedTuple):
         run_programs: Run,
         n_leaves: int,
     ) -> Plan:
-        """Return a plan. Its step passes ``n_leaves`` leaves to ``run_programs``: None if not in ``read_leaves``."""
         roles, inputs = data.roles(), tuple(sorted(read_leaves))
         # If a stage writes the flags itself, no check is added.
         has_check = (
@@ -282,7 +277,6 @@ class Planner(NamedTuple):
         inputs: Sequence[int],
         outputs: Sequence[int],
     ) -> Callable[..., Any]:
-        """Return a step in which every device advances its own worlds."""
         over_worlds, shared = PartitionSpec(self.location.axis), PartitionSpec()
         specs = [over_worlds if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
         added_leaves = program_leaves[len(specs) :]  # the packed array, and rows, in which worlds are the last axis
@@ -302,24 +296,15 @@ class Planner(NamedTuple):
         return sharded_step
 
     def _report(self, problems: list[str]) -> None:
-        """Warn of all problems of a plan in one warning, or raise them as one error if ``strict`` is True."""
         report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
     def _no_kernel_message(self, error: UnsupportedError) -> str:
-        """Return a message that names the stage that has no kernel, or all stages if that stage is not known."""
         if error.stage:
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
     def _error_of_stage(self, error: UnsupportedError, data: Record) -> UnsupportedError:
-        """Return the error of the first stage for which no kernel can be written.
-
-        If there is none, return the error of the kernel of all stages.
-
-        Args:
-            error: Error of the kernel of all stages.
-            data: The data, or its shapes and types.
-        """
+        # If there is none, return the error of the kernel of all stages.
         for stage in self.stages:
             try:
                 kernel.require_source(optimise(lower_stages([stage], data)))
@@ -328,7 +313,6 @@ class Planner(NamedTuple):
         return error
 
     def _failing_stage(self, data: Record) -> str:
-        """Return the end of a message that names the first stage that cannot be lowered; empty if there is none."""
         for stage in self.stages:
             try:
                 optimise(lower_stages([stage], data))
@@ -338,25 +322,19 @@ class Planner(NamedTuple):
 
 
 def _leaf_formats(data: Record, program_leaves: Sequence[Leaf]) -> list[tuple[str, tuple[int, ...], Any]]:
-    """Return name, shape and type of each leaf of the data, followed by those of the leaves that passes add."""
     paths = jax.tree_util.tree_leaves_with_path(data)
     formats = [(f"data{jax.tree_util.keystr(path)}", x.shape, x.dtype) for path, x in paths]
     return formats + [(leaf.name, leaf.shape, leaf.dtype) for leaf in program_leaves[len(formats) :]]
 
 
 def _device_dtype(x: Any) -> Any:
-    """Return the type that an array or a type of the host has on a device: float32 for float64, unless JAX has it."""
     return jax.dtypes.canonicalize_dtype(getattr(x, "dtype", x), allow_extended_dtype=True)
 
 
 def _check_inputs(
     advance: Callable[..., Any], formats: Sequence[tuple[str, tuple[int, ...], Any]]
 ) -> Callable[..., Any]:
-    """Return a step that first compares the arrays that it gets with those that its kernels were written for.
-
-    A kernel reads memory as its program says, whatever the arrays are. The comparison takes place in tracing.
-    """
-
+    # A kernel reads memory as its program says, whatever the arrays are. The comparison takes place in tracing.
     def checked_advance(values: list[Any], n_steps: int | Array) -> list[Any]:
         for x, (name, shape, dtype) in zip(values, formats, strict=True):
             if x.shape != shape or _device_dtype(x) != _device_dtype(dtype):
@@ -370,13 +348,10 @@ def _check_inputs(
 
 
 def _jit_steps(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return two compiled steps: one takes the number of steps as an array, the other as a Python number."""
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
 def _put_results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a step in NumPy that puts its results on the device of its arguments."""
-
     def step(values: list[Any], n_steps: int | Array) -> list[Any]:
         committed_array = next((x for x in values if getattr(x, "committed", False)), None)
         device = None if committed_array is None else next(iter(committed_array.devices()))
@@ -388,7 +363,6 @@ def _put_results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
 def _join_runs(
     groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]
 ) -> tuple[Run, tuple[int, ...]]:
-    """Return a function that runs all of the independent programs, and the indices of the leaves that it writes."""
     runs = [adapt_to_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written_leaves)
@@ -412,11 +386,8 @@ def _join_runs(
 
 
 def _input_leaves(program: Program) -> list[int]:
-    """Return the indices of the leaves that must be passed to a program.
-
-    These are the leaves that it reads, and one leaf of the drones, because its shape gives the number of worlds. If
-    unfused stages split the step, all leaves that are written or checked are passed too.
-    """
+    # These are the leaves that it reads, and one leaf of the drones, because its shape gives the number of worlds. If
+    # unfused stages split the step, all leaves that are written or checked are passed too.
     in_rows = {i for leaf in program.leaves for i in leaf.row_leaves}
     separate = [i for i, leaf in enumerate(program.leaves) if not leaf.row_leaves and i not in in_rows]
     drone_leaves = [i for i in separate if program.leaves[i].scope == "drone"]

@@ -73,7 +73,6 @@ class PyTree:
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the subclass a frozen dataclass and register it with JAX."""
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True, eq=False)(cls)
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -93,7 +92,6 @@ class PyTree:
     if not TYPE_CHECKING:  # a type checker would take any name for a field
 
         def __getattr__(self, name: str) -> Any:
-            """Return a field of a record from ``lazy_record`` when it is first read."""
             fields = self.__dict__
             template = fields.get(_TEMPLATE)
             if template is None or name not in template.__dict__:
@@ -101,7 +99,6 @@ class PyTree:
             return fields.setdefault(name, _lazy_child(template.__dict__[name], fields[_READ_LEAF]))
 
         def __getstate__(self) -> dict[str, Any]:
-            """Return all fields, for copies and pickles."""
             return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
@@ -140,10 +137,7 @@ def _lazy_child(x: Any, read_leaf: Callable[[Any], Any]) -> Any:
 
 @functools.cache
 def _initial_fields(cls: Any) -> list[tuple[str, bool]]:
-    """Return (name, True if it is static) of each field that a lazy record has from the start.
-
-    The default of a field is an attribute of the class, so reading such a field would never call ``__getattr__``.
-    """
+    # The default of a field is an attribute of the class, so reading such a field would never call ``__getattr__``.
     fields = [(field.name, bool(field.metadata.get("static"))) for field in dataclasses.fields(cls)]
     return [(name, is_static) for name, is_static in fields if is_static or hasattr(cls, name)]
 
@@ -271,10 +265,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int | None = None) -> None:
 def _map_leaves(
     fn: Callable[[Any, Any, str, Members | None], Any], node: Any, metadata: Any, name: str, members: Members | None
 ) -> Any:
-    """Return the tree with ``fn(leaf, metadata, name, members)`` in place of every leaf.
-
-    The function receives the metadata of the leaf's field, its name for messages, and the record of its population.
-    """
+    # The function receives the metadata of the leaf's field, its name for messages, and the record of its population.
     if isinstance(node, PyTree):
         members = node if isinstance(node, Members) else members
         changes = {
@@ -297,7 +288,6 @@ def _map_leaves(
 def _map_foreign(
     fn: Callable[[Any, Any, str, Members | None], Any], record: Any, name: str, members: Members | None
 ) -> Any:
-    """Return a record of another library, such as ``flax.struct``, with ``fn`` applied as by ``_map_leaves``."""
     children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
     leaves = []
@@ -318,7 +308,6 @@ def _is_record(node: Any) -> bool:
 
 
 def _is_foreign_record(node: Any) -> bool:
-    """Return True for a dataclass of another library that JAX traverses."""
     is_instance = dataclasses.is_dataclass(node) and not isinstance(node, (type, PyTree))
     return is_instance and not jax.tree_util.all_leaves([node])
 

@@ -80,7 +80,6 @@ def query(queries: Sequence[Query], data: Record, platform: str) -> list[Any]:
 
 
 def _make_writer(fn: Callable[[Any], Any], scope: str, n_drones: int, names: list[str]) -> Callable[[Any], Any]:
-    """Return the function of a stage that writes the results of ``fn`` to the data."""
     shape = (n_drones, -1) if scope == "world" else (-1,)
 
     def write(queried: _Queried) -> _Queried:

@@ -74,7 +74,6 @@ def _is_on(x: object, sharding: SingleDeviceSharding) -> bool:
 
 
 def _runs_on(device: jax.Device) -> bool:
-    """Return True if a function that is traced now will run on the device, or on a mesh."""
     with jax.ensure_compile_time_eval():
         default_devices = jax.device_put(np.int8(0)).devices()
     return default_devices == {device} or not jax.sharding.get_abstract_mesh().empty

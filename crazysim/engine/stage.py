@@ -64,13 +64,11 @@ class Stage:
         phase: Phase = "each",
         ground: Callable[..., Array | float] | None = None,
     ):
-        """Declare a stage; see ``stage``.
-
-        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that their
-        operations are the same in all simulations and do not depend on ``n_worlds`` and ``n_drones``, so that an engine
-        traces them only once in a process. ``unfused_reason`` is the reason for the scope ``"batch"``, for messages.
-        ``ground`` is a function from the same data to the height of the ground at which the stage stops drones, m.
-        """
+        # ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that their
+        # operations are the same in all simulations and do not depend on ``n_worlds`` and ``n_drones``, so that an
+        # engine traces them only once in a process. ``unfused_reason`` is the reason for the scope ``"batch"``, for
+        # messages. ``ground`` is a function from the same data to the height of the ground at which the stage stops
+        # drones, m.
         self.fn, self.when, self.batched, self.trace_once = fn, when, batched, trace_once
         self.unfused_reason, self.ground = unfused_reason, ground
         self.scope: StageScope = scope
@@ -79,7 +77,6 @@ class Stage:
         self.__doc__ = fn.__doc__
 
     def __call__(self, data: Record) -> Any:
-        """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
             return self.apply_unmapped(data)
         return vmap_worlds(world_function(self, Axes(data)), 2)(data)
@@ -351,8 +348,6 @@ def vmap_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _leaf_scopes(tree: object) -> list[str]:
-    """Return the scope of every leaf: the one that its record declares, or ``batch`` outside of records."""
-
     def is_record(x: object) -> bool:
         return isinstance(x, PyTree)
 

@@ -36,7 +36,6 @@ class FlatData:
     __slots__ = ("_record", "leaves", "plan")
 
     def __init__(self, leaves: list[Any] | HostLeaves, plan: Plan):
-        """Store the leaves of the data, followed by the leaves that passes add. Leaves stored as rows are None."""
         self.leaves: Any = leaves
         self.plan = plan
         self._record: Any = None
@@ -98,7 +97,6 @@ def scan(
 
 
 def _read_leaf(leaves: Any, plan: Plan, i: int) -> Any:
-    """Return leaf ``i`` of the data, unpacked if it is stored as rows."""
     x = leaves[i]
     if x is not None or not plan.rows:
         return x
@@ -149,20 +147,6 @@ class Step:
         strict: bool = False,
         check_data: Callable[[Any], None] | None = None,
     ):
-        """Create the step of the stages that the pipeline has now.
-
-        Args:
-            pipeline: The stages.
-            engine: One of ``ENGINES``.
-            platform: ``"cpu"`` or ``"gpu"``.
-            mesh: Devices that the worlds are distributed over; None without a mesh.
-            device: Device that the step runs on; None for any device of the platform.
-            strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
-            check_data: Function that raises an error for data that the stages are not for; None for no check.
-
-        Raises:
-            ConfigError: If there is no engine of that name, or it cannot run here.
-        """
         if not isinstance(engine, str) or engine not in ENGINES:
             raise ConfigError(f"expected an engine of {', '.join(ENGINES)}, got {engine!r}. Use 'auto'.")
         if engine == "fused" and (reason := fused.unavailable_reason(platform)):
@@ -216,19 +200,12 @@ class Step:
         return step
 
     def __eq__(self, other: object) -> bool:
-        """Whether the other is this step for data with the same zeros, so that JAX compiles its callers once."""
         return isinstance(other, Step) and (self._structures is other._structures and self._zeros == other._zeros)
 
     def __hash__(self) -> int:
         return hash((id(self._structures), self._zeros))
 
     def __call__(self, data: T, n_steps: int | Array = 1) -> T:
-        """Return the data some steps later.
-
-        Args:
-            data: The record, such as ``sim.data``.
-            n_steps: Number of steps, at least 0: an integer, or an array of integer type. ()
-        """
         _check_steps(n_steps)
         structure, leaves = self._flat_structure(data)
         plan = self._plan(data, structure, leaves, n_steps)
@@ -307,21 +284,18 @@ class Step:
         return sorted({plan.engine for plan in self._plans})
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
         count = jaxcompat.n_compilations
         called = [plan.host_call is not None and plan.host_call.was_called for plan in self._plans]
         steps = [step for plan in self._plans for step in (plan.traced_count_step, plan.static_count_step)]
         return sum(called) + sum(map(count, steps))
 
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
-        """Return the leaves of the data, followed by the leaves that the plan adds."""
         packed = [self._pack_cache([leaves[i] for i in plan.packed])] if plan.packed else []
         rows = [rows.pack(view_leaves(rows.program.views, leaves)) for rows in plan.rows]
         in_rows = [i for rows in plan.rows for i in rows.source_leaves]
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _make_false_flag(self, old_flag: Any) -> Any:
-        """Return a false flag on the devices of the previous flag: the previous flag itself if this method made it."""
         if old_flag is self._false_flag:
             return old_flag
         traced = isinstance(old_flag, jax.core.Tracer)
@@ -331,7 +305,6 @@ class Step:
         return flag
 
     def _flat_structure(self, data: Record) -> tuple[_Structure, list[Any]]:
-        """Return what is known of records like the data, from the cache if possible, and the leaves of the data."""
         if not isinstance(data, Record):
             raise ConfigError(f"expected the data of a simulation, got {short_repr(data)}. Use sim.data.")
         leaves, treedef = jax.tree.flatten(data)
@@ -364,7 +337,6 @@ class Step:
         n_steps: int | Array | None = None,
         separate: SeparateLeaves = None,
     ) -> Plan:
-        """Return the plan for data of this structure, from the cache if possible."""
         zeros = self._zeros_cache(structure.parameters, leaves) if self._zeros is None else self._zeros
         other_location = self._find_other_location(leaves[structure.located])
         key = (zeros, other_location, separate)
@@ -385,7 +357,6 @@ class Step:
         return plan
 
     def _find_other_location(self, x: Any) -> Location | None:
-        """Return the location of an array; None if it is unknown, or the one that the step was built for."""
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._home_sharding:
             return None

@@ -47,13 +47,6 @@ class Actions:
     """
 
     def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
-        """Create a map.
-
-        Args:
-            centre: Command at a zero action, in the command's units. (k,), or (n_drones, k) if drones differ
-            scale: Change of the command per unit of action, of the same shape.
-            control: Command level.
-        """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
         require(
             self.centre.shape == self.scale.shape and self.centre.ndim in (1, 2),
@@ -77,7 +70,6 @@ class Actions:
         return jnp.concatenate([command, other_fields], axis=-1)
 
     def __str__(self) -> str:
-        """Return the command level, and the commands at -1 and 1."""
         fields = COMMAND_FIELDS[self.control]
         return f"{self.control.value} ({fields}): {self.centre - self.scale} to {self.centre + self.scale}"
 
@@ -102,7 +94,6 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
 
 
 def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt: float, index: int) -> Actions:
-    """Return the default actions of the drone with an index in the first world."""
     params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, index)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     max_thrust = float(airframe.value("rotors.thrust_max", ()))

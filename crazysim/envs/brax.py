@@ -135,7 +135,6 @@ class BraxEnv:
         )
 
     def _seed_key(self, rng: Array) -> Array:
-        """Return the key that seeds all worlds."""
         expect(hasattr(rng, "dtype"), "a random key", rng, "Use jax.random.key(0).")
         n_worlds, is_typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         shape = rng.shape if is_typed else rng.shape[:-1]

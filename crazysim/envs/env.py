@@ -219,7 +219,6 @@ class Env(ABC):
         return self.step_fn.advance(flat.replace([i], [action]), self.n_substeps)
 
     def _check_state(self, state: EnvState) -> None:
-        """Check that a state has the structure of the states of this environment."""
         expect(isinstance(state, EnvState), "a state of this environment", state, "Use env.reset(key).")
         structure = jax.tree.structure(state)
         if structure in self._known_structures:
@@ -233,17 +232,14 @@ class Env(ABC):
 
     @functools.cached_property
     def _action_format(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of the actions of all worlds."""
         shape = self.sim.n_worlds, self.sim.n_drones, self.actions.size
         return jax.ShapeDtypeStruct(shape, self.sim.default_data.states.pos.dtype)
 
     @functools.cached_property
     def _known_structures(self) -> set[Any]:
-        """Structures of the states that ``reset`` has returned."""
         return set()
 
     def _reset_episodes(self, state: EnvState) -> EnvState:
-        """Return the state with new episodes in all worlds."""
         state = self.phases.reset_episode(
             state, self.base.episode_reset.make_default(state.data), vectorize_over_worlds
         )
@@ -253,7 +249,6 @@ class Env(ABC):
         return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
 
     def _add_step_results(self, state: EnvState) -> EnvState:
-        """Return the state at the start of the first episode, with zeros in the fields that only a step computes."""
         state = state if self.reset_policy is None else self.reset_policy.after_step(state)
         state = state.replace(next_action=jnp.zeros_like(state.action), must_reset=jnp.zeros_like(state.terminated))
         leaves, treedef = jax.tree.flatten(state)
@@ -268,7 +263,6 @@ class Env(ABC):
 
     @functools.cached_property
     def _stepped_shapes(self) -> dict[Any, EnvState]:
-        """Cache of the shapes and dtypes of the state after a step, by structure and shapes of the state before it."""
         return {}
 
     def explain(self) -> str:
@@ -309,16 +303,6 @@ class DroneEnv(Env):
     """Environment of many worlds with one task. Without ``AutoReset``, an episode that is over continues."""
 
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
-        """Create an environment of a simulation in which the task is installed.
-
-        Args:
-            sim: The simulation, after ``task.install(sim)``; episodes begin from ``sim.default_data``.
-            task: The task.
-            freq: Environment steps per second, Hz; must divide ``sim.freq`` and ``sim.control_freq``.
-            actions: Meaning of an action; None for ``actions_of``.
-            measured: True to observe the states as the sensors of the simulation measure them. Rewards and the ends of
-                episodes always depend on the true states.
-        """
         freq = positive_integer("freq", freq)
         require_installed(sim, task)
         require(
@@ -401,14 +385,12 @@ class DroneEnv(Env):
 
 
 def _describe_state(state: EnvState) -> str:
-    """Return what distinguishes the states of environments, for a message."""
     names = {"observations": state.obs, "info": state.info, "memory": state.memory}
     task = f"task {state.record.task!r}"
     return ", ".join([task, describe_data(state.data), *(f"{key} {', '.join(names[key]) or 'none'}" for key in names)])
 
 
 def _set_keys(core: SimCore, key: Array) -> SimCore:
-    """Return the core with the key of all worlds, or with one key for each block of worlds."""
     if key.size == 1:
         return core.replace(rng_key=key.reshape(()))
     block_size, remainder = divmod(core.n_worlds, key.size)
@@ -422,6 +404,5 @@ def _set_keys(core: SimCore, key: Array) -> SimCore:
 
 
 def _default_arrays(sim: Sim) -> list[Any]:
-    """Return the arrays from which episodes begin, without arrays of the scene, which change when it is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))

@@ -80,20 +80,11 @@ class EpisodeReset:
 
 
 def _make_batched_reset(sim: Sim) -> Callable[[SimData, SimData], SimData]:
-    """Return a function that resets all worlds with the reset pipeline of a simulation."""
     reset_all, mask = sim.build_reset_fn().plain, np.ones(sim.n_worlds, bool)
     return lambda data, default: reset_all(data, default, mask)
 
 
 def _make_reset(stages: Sequence[Any], keeps_objects: bool) -> Callable[[SimData, SimData], SimData]:
-    """Return a function that resets one world and applies stages of the reset pipeline to it.
-
-    Args:
-        stages: The stages.
-        keeps_objects: True to leave the poses of objects unchanged. If plugins move all objects, nothing reads these
-            poses, and a kernel that resets hundreds of poses would take a minute to compile.
-    """
-
     def reset_and_apply_stages(data: SimData, default: SimData) -> SimData:
         data = reset_world(data, default.replace(objects=data.objects) if keeps_objects else default)
         axes = Axes(data)  # a wrapper may have given each drone its own parameters

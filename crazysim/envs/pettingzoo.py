@@ -34,13 +34,6 @@ class DroneParallelEnv(ParallelEnv):
 
     @check_arguments
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
-        """Wrap a functional environment.
-
-        Args:
-            env: An environment of one world, without automatic resets.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
-            render_size: Width and height of an image, pixels.
-        """
         require(
             env.sim.n_worlds == 1,
             f"expected an environment of one world, got {env.sim.n_worlds} worlds. Make it with n_worlds=1, or use "
@@ -148,7 +141,6 @@ class DroneParallelEnv(ParallelEnv):
         return state, (state.obs, state.reward[0], state.terminated[0], state.truncated[0], state.info)
 
     def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
-        """Return the validated actions of all agents as one array. (n_drones, k)"""
         expect(isinstance(actions, Mapping), "a dict with an action of every drone", actions, "Use {'drone_0': ...}.")
         if unknown_agents := [agent for agent in actions if agent not in self.agents]:
             raise UnknownNameError(f"expected actions of {', '.join(self.agents)}, got one of {unknown_agents[0]}")
@@ -162,8 +154,6 @@ class DroneParallelEnv(ParallelEnv):
         return np.stack(rows)
 
     def _split_by_agent(self, tree: Any) -> dict[str, Any]:
-        """Return the entries of each agent: its row of arrays (1, n_drones, ...), and arrays of the world, (1,)."""
-
         def agent_entry(x: Any, i: int) -> Any:
             # A copy, because arrays from JAX are read-only.
             return (x[0, i] if x.ndim > 1 else x[0]).copy()

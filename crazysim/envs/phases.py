@@ -264,7 +264,6 @@ class Phases:
 
     @staticmethod
     def _apply(owner: Task | Hooks, method: str, vectorize: Vectorize) -> Callable[..., SimData]:
-        """Return a method of the task or of a wrapper that returns data, with a check of its result."""
         title = f"{'task' if isinstance(owner, Task) else 'wrapper'} {owner.name!r}: expected {method}"
 
         # Checked and broadcast before worlds are joined: a leaf without the axis of drones is of its own world.
@@ -274,12 +273,10 @@ class Phases:
         return vectorize(apply, owner.batched)
 
     def _observe_task(self, data: SimData) -> Obs:
-        """Return the observations of the task, from measured states if ``measure_states`` is set."""
         return self.task.observe(data if self.measure_states is None else self.measure_states(data))
 
 
 def _end_bad_world(state: EnvState) -> EnvState:
-    """Return the state of one world, ended if an observation or a reward is not finite: a goal may reach only these."""
     obs, reward, core = state.record.obs, state.reward, state.data.core
     numbers = [reward, *(x for x in obs.values() if jnp.issubdtype(x.dtype, jnp.floating))]
     is_bad = functools.reduce(jnp.logical_or, [~jnp.isfinite(x).all() for x in numbers])
@@ -294,13 +291,11 @@ def _end_bad_world(state: EnvState) -> EnvState:
 
 
 def _flag_nonfinite(data: SimData, vectorize: Vectorize) -> SimData:
-    """Return the data with the flags of non-finite worlds set. Takes one world or all."""
     del vectorize
     return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
 
 def _restore_types(data: SimData, state: EnvState) -> SimData:
-    """Return the data of a state, cast to the dtypes of the earlier data."""
     if jax.tree.structure(state.full_data) != jax.tree.structure(data):
         return state.full_data  # the engine raises an error that names the change
 
@@ -326,16 +321,7 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
 
 
 def _check_data(title: str, batched: bool, before: SimData, after: Any) -> SimData:
-    """Return the data from a method of a task or a wrapper with the shapes and dtypes before it.
-
-    No step is compiled again then. Arrays of fewer axes are those of all drones, unless ``batched`` is True.
-
-    Args:
-        title: Owner and name of the method, such as ``"task 'hover': expected spawn"``.
-        batched: Whether the data is of all worlds.
-        before: Data that the method got.
-        after: Its result.
-    """
+    # No step is compiled again then. Arrays of fewer axes are those of all drones, unless ``batched`` is True.
     require(
         isinstance(after, SimData),
         f"{title} to return the data that it gets with other values, got a {type(after).__name__}. End it with return "

@@ -137,7 +137,6 @@ def _is_task(x: object) -> bool:
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Return the module of a file. Each version of the file is executed once, with its folder on ``sys.path``."""
     try:
         source = _read_code(path)
     except OSError as error:
@@ -176,11 +175,6 @@ def _import_module(name: str) -> ModuleType:
 
 
 def _list_path() -> Path:
-    """Return the path of the file with the references that this user has named, one per line.
-
-    Raises:
-        ConfigError: If the user has no home folder.
-    """
     return caches_folder() / "tasks"
 
 
@@ -193,7 +187,6 @@ def _read_list() -> list[str]:
 
 
 def _add_to_list(reference: str) -> None:
-    """Add a reference to the list. If that fails, the user has to name the reference again in the next process."""
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
         make_private_folder(path.parent)

@@ -238,14 +238,12 @@ def entry_of(task: str | Task, is_named: bool = True) -> Entry:
 
 
 def _check_class(task: object) -> type[Task]:
-    """Return a task class after checking that it is one."""
     if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
     return task
 
 
 def _register_with_gymnasium(name: str, entry: Entry) -> None:
-    """Register a task with Gymnasium, unless its id is already registered."""
     if entry.id not in gymnasium.registry:
         gymnasium.register(
             entry.id,

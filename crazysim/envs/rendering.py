@@ -21,14 +21,6 @@ class Renderer:
     def __init__(
         self, sim: Sim, mode: str | None, worlds: Sequence[int] | None = (0,), size: tuple[int, int] = (640, 480)
     ):
-        """Create a renderer.
-
-        Args:
-            sim: The simulation of the states.
-            mode: ``"rgb_array"`` for images, ``"human"`` for the first world in a window, None for no rendering.
-            worlds: Worlds to render; None for all.
-            size: Width and height of an image, pixels.
-        """
         require(
             mode is None or (isinstance(mode, str) and mode in RENDER_MODES),
             f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}",
@@ -50,11 +42,6 @@ class Renderer:
         self.sim, self.mode, self.worlds, self.size = sim, mode, indices.tolist(), check_image_size(*size)
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
-        """Return an image of each chosen world, (height, width, 3), or an empty list after drawing into the window.
-
-        Raises:
-            RenderError: If this machine cannot render.
-        """
         require(
             self.mode is not None and state is not None,
             "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. "

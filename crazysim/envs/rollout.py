@@ -134,7 +134,6 @@ def rollout(
 
 
 def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
-    """Return action, memory and extras of a policy, after checking that the memory keeps its shapes and types."""
     results = policy(obs, memory, key)
     expect(
         isinstance(results, (tuple, list)) and len(results) == 3,
@@ -151,5 +150,4 @@ def _evaluate(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array,
 
 
 def _formats(tree: Any) -> Any:
-    """Return shape and type of every array of a tree."""
     return jax.tree.map(lambda x: (jnp.shape(x), jnp.asarray(x).dtype), tree)

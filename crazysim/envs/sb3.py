@@ -51,17 +51,6 @@ class DroneVecEnv(VecEnv):
         render_worlds: Sequence[int] = (0,),
         render_size: tuple[int, int] = (640, 480),
     ):
-        """Wrap a functional environment that does not reset automatically.
-
-        Args:
-            env: The environment.
-            dict_obs: True for named observations, for ``MultiInputPolicy``; False for one vector, concatenated by name,
-                for ``MlpPolicy``.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws the first of
-                ``render_worlds`` into a window.
-            render_worlds: Worlds to render.
-            render_size: Width and height of an image, pixels.
-        """
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
         self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self._reset_fn, self._step_fn = jax.jit(self._reset_state), jax.jit(self._step_state)
@@ -188,11 +177,9 @@ class DroneVecEnv(VecEnv):
         return state, results
 
     def _merge_obs(self, obs: Obs) -> Obs:
-        """Return the observations of all drones as one vector named ``all``, or by name with ``dict_obs``."""
         if not self.dict_obs:
             obs = {"all": flatten(obs)}
         return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}
 
     def _to_numpy(self, obs: dict[str, Any]) -> Any:
-        """Return observations as writable arrays, as Torch requires; JAX arrays are read-only."""
         return {name: np.array(x) for name, x in obs.items()} if self.dict_obs else np.array(obs["all"])

@@ -27,13 +27,6 @@ class DroneSingleEnv(gymnasium.Env):
 
     @check_arguments
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
-        """Wrap a functional environment that does not reset automatically.
-
-        Args:
-            env: The environment, of one world.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
-            render_size: Width and height of an image, pixels.
-        """
         require(
             env.sim.n_worlds == 1,
             f"expected an environment of one world, got {env.sim.n_worlds} worlds. Use gymnasium.make_vec.",
@@ -75,7 +68,6 @@ class DroneSingleEnv(gymnasium.Env):
         return None if images is None else images[0]
 
     def explain(self) -> str:
-        """Return how a step is executed, as ``Env.explain`` does."""
         return self.vector.explain()
 
     def close(self) -> None:
@@ -84,7 +76,6 @@ class DroneSingleEnv(gymnasium.Env):
 
 
 def _squeeze_world(tree: Any) -> Any:
-    """Return the arrays of the only world."""
     return jax.tree.map(lambda x: x[0], tree)
 
 

@@ -137,7 +137,6 @@ class EnvState(PyTree):
         return self.record.drone_info.get("final_obs", self.obs)
 
     def replace(self, **changes: Any) -> EnvState:
-        """Return the state with new values of some properties."""
         full_data = changes.pop("full_data", self.full_data)
         record = full_data.plugins[ENV_RECORD_NAME]
         if "data" in changes:
@@ -154,7 +153,6 @@ class EnvState(PyTree):
         return EnvState(full_data.replace(plugins=full_data.plugins | {ENV_RECORD_NAME: record}))
 
     def _drop_images(self, obs: Obs) -> Obs:
-        """Return the observations that are not images, after checking that the images are unchanged."""
         images = self.record.images
         if changed := [name for name, image in images.items() if name in obs and obs[name] is not image]:
             raise ConfigError(
@@ -164,7 +162,6 @@ class EnvState(PyTree):
         return {name: x for name, x in obs.items() if name not in images}
 
     def _split_info(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return the entries of ``info`` divided into ``drone_info`` and ``world_info``."""
         n_world_axes, n_drones = max(self.full_data.core.steps.ndim - 1, 0), self.full_data.core.n_drones
         drone_info, world_info = {}, {}
         for name, entry in info.items():
@@ -182,12 +179,10 @@ class EnvState(PyTree):
         return {"drone_info": drone_info, "world_info": world_info}
 
     def _squeeze_axis(self, x: Any) -> Any:
-        """Return a per-world array without its axis of length 1; unchanged if the state is of one world."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
 
     def _add_axis(self, x: Any) -> Any:
-        """Return a per-world array with an axis of length 1 after the worlds; unchanged in a state of one world."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
 
@@ -197,8 +192,6 @@ def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _map_outside_records(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
-    """Return the memory with a function applied to its arrays outside of records."""
-
     def is_record(x: object) -> bool:
         return isinstance(x, PyTree)
 

@@ -69,11 +69,6 @@ class EnvStepper:
             self._compile(flat)
 
     def __call__(self, actions: Array | np.ndarray) -> tuple[Any, Array, Array]:
-        """Advance the state by one step, and return the output, ``terminated`` and ``truncated``. (n_worlds,) each
-
-        Args:
-            actions: Actions of all drones; the axes after the first may be flattened. (n_worlds, ...)
-        """
         flat = self._flat
         require(flat is not None, "expected a state before the first step, got none. Assign stepper.state.")
         if self._env.sim.mesh is not None:  # the actions may be on one device
@@ -87,7 +82,6 @@ class EnvStepper:
         return output, *self._ends
 
     def _compile(self, flat: FlatData) -> None:
-        """Compile the step. Its carry omits results that the next step does not read."""
         plan, env = flat.plan, self._env
         record, n = plan.leaf_indices.plugins[ENV_RECORD_NAME], len(flat.leaves)
         end_indices = [record.terminated, record.truncated]

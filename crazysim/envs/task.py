@@ -66,7 +66,6 @@ class Task:
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation."""
         check_settings(self)
 
     def install(self, sim: Sim) -> None:
@@ -207,7 +206,6 @@ class _State:
 
 
 def _move_states_to_record(cls: type[Task]) -> None:
-    """Make ``cls.Record`` of the states and static fields that a class declares; the others are settings."""
     fields = {name: f for name, f in vars(cls).items() if isinstance(f, dataclasses.Field)}
     states = {name: f for name, f in fields.items() if "scope" in f.metadata or f.metadata.keys() == {"static"}}
     hints = inspect.get_annotations(cls)
@@ -223,7 +221,6 @@ def _move_states_to_record(cls: type[Task]) -> None:
 
 
 def _initial_states(sim: Sim, record: type[PyTree], initial: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a record for all worlds."""
     fields = {f.name: f.metadata for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     expect(
         initial.keys() <= fields.keys(), f"states among {', '.join(fields)}", ", ".join(initial.keys() - fields.keys())

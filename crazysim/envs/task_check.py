@@ -177,7 +177,6 @@ def _name_missing_record(title: str, data: SimData) -> Iterator[None]:
 
 
 def _world_shape(scope: str, x: Array) -> jax.ShapeDtypeStruct:
-    """Return shape and type of a leaf in one world, without batch axes of worlds."""
     return jax.ShapeDtypeStruct(x.shape[n_world_axes(scope) :], x.dtype)
 
 

@@ -183,6 +183,5 @@ def ranks(x: Array, n: int) -> Array:
 
 
 def _add_height(xy: Array, points: Points) -> Array:
-    """Return horizontal positions with the heights of points. (..., n, 2) -> (..., n, 3)"""
     height = np.asarray(points, float)[:, 2:].astype(xy.dtype)
     return jnp.concatenate([xy, jnp.broadcast_to(height, (*xy.shape[:-1], 1))], axis=-1)

@@ -47,17 +47,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         render_size: tuple[int, int] = (640, 480),
         numpy: bool = False,
     ):
-        """Wrap a functional environment that does not reset automatically.
-
-        Args:
-            env: The environment.
-            autoreset_mode: Mode of automatic resets.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first of
-                ``render_worlds`` into a window.
-            render_worlds: Worlds to render; None for all, as Gymnasium's wrapper ``RecordVideo`` needs.
-            render_size: Width and height of an image, pixels.
-            numpy: True to return NumPy arrays, copies that may be written to.
-        """
         mode = enum_member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
@@ -153,7 +142,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return self._convert((obs, reward, terminated, truncated, self._add_final_info(info)))
 
     def _add_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the info with ``final_info``, the info of the episodes that have ended, as Gymnasium defines it."""
         is_over = info.get("_final_obs")
         if is_over is None:
             return info
@@ -161,16 +149,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return info | {"final_info": final_info | {f"_{k}": is_over for k in final_info}, "_final_info": is_over}
 
     def _convert(self, results: Any) -> Any:
-        """Return results as NumPy copies if the caller asked for them, and unchanged otherwise."""
         return jax.tree.map(np.array, results) if self._numpy else results
 
     def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
-        """Return observations, rewards and infos in Gymnasium's form."""
         reward = state.reward[:, 0] if self._has_single_drone else jnp.mean(state.reward, axis=1)
         return self._squeeze_drones(state.obs), reward, self._convert_info(state)
 
     def _squeeze_drones(self, tree: Any) -> Any:
-        """Return per-drone arrays, without the axis of drones if there is only one drone."""
         return jax.tree.map(lambda x: x[:, 0], tree) if self._has_single_drone else tree
 
     def _convert_info(self, state: EnvState) -> dict[str, Any]:

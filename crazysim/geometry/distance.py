@@ -78,13 +78,11 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
 
 def _inverse_position(pos: Array, rot: Array) -> Array:
-    """Return the position of the inverse of the pose ``pos``, ``rot``. (..., 3)"""
     x, y, z = components(pos)
     return -jnp.stack([rot[..., 0, k] * x + rot[..., 1, k] * y + rot[..., 2, k] * z for k in range(3)], axis=-1)
 
 
 def _support_function(shape: Shape, direction: Array) -> Array:
-    """Return the support function of a capsule or box along a unit direction in its own frame, m. (...)"""
     x, y, z = (magnitude(d) for d in components(direction))
     if shape.kind == "capsule":
         return shape.size[1] * z + shape.size[0]

@@ -52,7 +52,6 @@ def _nearer_hit(a: Hit, b: Hit) -> Hit:
 def _face_hits(
     half: tuple[float, float], origin: Vector, direction: Vector
 ) -> list[tuple[Array, Vector, Array, Array]]:
-    """Return the distance, outward normal, and x and y of the hit, for each of the four walls."""
     zero = jnp.zeros_like(origin.x)
     hits = []
     for side in (-1.0, 1.0):
@@ -67,7 +66,6 @@ def _face_hits(
 
 
 def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the nearest hit of the box below z = 0."""
     x_half, y_half, _, base = shape.size
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
@@ -88,7 +86,6 @@ def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
 
 
 def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the nearest hit of the walls between z = 0 and the surface."""
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
     for t, n, x, y in _face_hits(shape.size[:2], origin, direction):  # type: ignore[arg-type]
@@ -99,7 +96,6 @@ def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
 
 
 def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
-    """Return the nearest hit of the triangles, by traversing the cells below each ray in order."""
     ground = shape.array("heights")
     n_rows, n_columns = ground.shape
     heights = jnp.asarray(ground, origin.x.dtype)
@@ -118,7 +114,6 @@ def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     tolerance = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
     def visit_cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
-        """Intersect a ray with the two triangles of its cell; return the next cell and the nearest hit so far."""
         column, row, hit = carry
         is_inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)

@@ -138,15 +138,7 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
 
 
 def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Return gaps, normal and points of the contact between a face of a box and the nearest face of another box.
-
-    The normal points towards the other box. The face of the other box is clipped to the face of the first.
-
-    Args:
-        face: Half lengths, position and attitude of the box with the face.
-        axis: Axis of the face, 0 to 2.
-        other: Half lengths, position and attitude of the other box.
-    """
+    # The normal points towards the other box. The face of the other box is clipped to the face of the first.
     half, pos, rot = _renumber_axes(face, axis)
     offset = other[1] - pos
     side = jnp.where(jnp.sum(offset * rot[:, 0]) < 0, -1.0, 1.0)
@@ -196,7 +188,6 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
 def _edge_contact(
     boxes: tuple[tuple[Array, ...], ...], edge_pair: Array, axis: Array, offset: Array
 ) -> tuple[Array, Array, Array]:
-    """Return gap, normal and point of the contact of edge ``edge_pair // 3`` of b with edge ``edge_pair % 3`` of a."""
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     edges = []  # middle, direction and half length of the edge of each box
     for (half, pos, rot), number, side in zip(boxes, (edge_pair % 3, edge_pair // 3), (-1.0, 1.0), strict=True):
@@ -216,7 +207,6 @@ def _edge_contact(
 
 
 def _renumber_axes(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
-    """Return half lengths, position and attitude of a box with its axes renumbered so that ``axis`` comes first."""
     half, pos, rot = box
 
     def select_axis(options: list[Array]) -> Array:

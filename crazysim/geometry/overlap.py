@@ -91,14 +91,12 @@ def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDire
 
 
 def _select_best(candidates: BestDirection, best: BestDirection) -> BestDirection:
-    """Return the direction with the largest gap: ``best``, or one of the candidates along the first axis."""
     for k in range(candidates[0].shape[0]):
         best = larger_gap((candidates[0][k], candidates[1][k]), best)
     return best
 
 
 def _best_face_normal(pair: ShapePair) -> BestDirection:
-    """Return the face normal of a mesh with the largest gap."""
     normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
     x, y, z = (jnp.asarray(column, pair.centre.x.dtype) for column in normals.T)
 
@@ -114,7 +112,6 @@ def _best_face_normal(pair: ShapePair) -> BestDirection:
 
 
 def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
-    """Return the direction with the largest gap: ``best``, or an ellipsoid's normal at a point nearest to a corner."""
     shortest_axis = min(range(3), key=lambda k: pair.other.size[k])
 
     def try_corner(k: Array, best: BestDirection) -> BestDirection:
@@ -130,13 +127,10 @@ def _best_ellipsoid_normal(pair: ShapePair, best: BestDirection) -> BestDirectio
 
 
 def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
-    """Return the approximately best direction perpendicular to an axis.
-
-    Projected onto the plane of these directions, the body is a polygon, possibly with curved sides. Between two
-    directions with different support points the gap is largest at the normal of the side between the two points, if
-    there is no further corner between them. Each arc gives such an estimate, and the search is refined in the best
-    arc, on the side where the gap still increases.
-    """
+    # Projected onto the plane of these directions, the body is a polygon, possibly with curved sides. Between two
+    # directions with different support points the gap is largest at the normal of the side between the two points, if
+    # there is no further corner between them. Each arc gives such an estimate, and the search is refined in the best
+    # arc, on the side where the gap still increases.
     # The basis of the plane is (e, f). Angles are measured from e, the cross product with the coordinate axis that is
     # closest to perpendicular.
     x, y, z = (jnp.abs(v) for v in (axis.x, axis.y, axis.z))
@@ -151,12 +145,10 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
         return e * n[0] + f * n[1]
 
     def support_point(n: PlaneVector) -> PlaneVector:
-        """Return the projected support point along a direction in the plane."""
         point, _ = pair.support_point(direction(n))
         return point.dot(e), point.dot(f)
 
     def bisect(n: PlaneVector, p: PlaneVector, m: PlaneVector, q: PlaneVector) -> PlaneVector:
-        """Return the unit direction between two directions along which their support points are equally far."""
         u, v, middle = q[1] - p[1], p[0] - q[0], (n[0] + m[0], n[1] + m[1])
         sign = jnp.where(u * middle[0] + v * middle[1] < 0, -1.0, 1.0)
         is_coincident = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])

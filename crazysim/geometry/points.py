@@ -79,11 +79,8 @@ def _cylinder(shape: Shape, point: Array) -> Array:
 
 
 def _ellipsoid(shape: Shape, point: Array) -> Array:
-    """Return the distance to the tangent plane of the ellipsoid at the nearest point, m. (...)
-
-    For the point p and the semi-axes a it is ``(n.p - |a n|) / |n|``. It is stationary in the normal n, so an error of
-    n changes it only in second order.
-    """
+    # For the point p and the semi-axes a it is ``(n.p - |a n|) / |n|``. It is stationary in the normal n, so an error
+    # of n changes it only in second order.
     normal = ellipsoid_normal(shape, components(point))
     projection = sum(n * p for n, p in zip(normal, components(point), strict=True))
     support = jnp.sqrt(sum((a * n) ** 2 for a, n in zip(shape.size, normal, strict=True)))
@@ -125,7 +122,6 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
 
 def _mesh(shape: Shape, point: Array) -> Array:
-    """Return the distance to the nearest triangle for points outside, and to the nearest plane inside, m. (...)"""
     position = to_vector(point)
     signed_distance = plane_distance(shape.array("normals"), shape.array("offsets"), position)
     triangles = shape.array("vertices")[shape.array("faces")]

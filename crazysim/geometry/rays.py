@@ -83,7 +83,6 @@ def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, dist
 
 
 def _plane_distance(origin: Components, direction: Components) -> tuple[Array, Array]:
-    """Return the distance along rays to the plane z = 0, m, and True where they hit it from above. (...) each"""
     height, descent_rate = origin[2], -direction[2]
     is_hit = (descent_rate > MIN_COMPONENT) & (height >= 0)
     return height / jnp.where(is_hit, descent_rate, 1.0), is_hit
@@ -114,11 +113,8 @@ def union(p: Interval, q: Interval) -> Interval:
 
 
 def _ball_interval(origin: Sequence[Array], direction: Sequence[Array], radius: Array | float) -> Interval:
-    """Return the interval of a line in a ball, or in a cylinder if two components are given.
-
-    It uses the point of the line nearest to the centre, because the usual discriminant loses its
-    precision far from the ball.
-    """
+    # It uses the point of the line nearest to the centre, because the usual discriminant loses its precision far from
+    # the ball.
     square = sum(d * d for d in direction)
     is_parallel = square < MIN_COMPONENT
     inverse = 1 / jnp.where(is_parallel, 1.0, square)
@@ -161,7 +157,6 @@ def _ellipsoid_interval(shape: Shape | SizedShapes, origin: Components, directio
 
 
 def _plane_products(shape: Shape, v: Components) -> Array:
-    """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
     x, y, z = (
         jnp.asarray(column, v[0].dtype) * part[..., None]
         for column, part in zip(shape.array("normals").T, v, strict=True)
@@ -170,7 +165,6 @@ def _plane_products(shape: Shape, v: Components) -> Array:
 
 
 def _mesh_interval(shape: Shape, origin: Components, direction: Components) -> Interval:
-    """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
     depths = jnp.asarray(shape.offsets, origin[0].dtype) - _plane_products(shape, origin)
     rates = _plane_products(shape, direction)
     is_parallel = jnp.abs(rates) < MIN_COMPONENT
@@ -206,7 +200,6 @@ LINE_INTERVALS = {
 
 
 def _z_axis(vector: Array) -> Array:
-    """Return the unit vector along z, one for each point. (..., 3)"""
     zero = jnp.zeros_like(vector[..., 0])
     return jnp.stack([zero, zero, zero + 1], axis=-1)
 
@@ -226,7 +219,6 @@ def _capsule_normal(shape: Shape | SizedShapes, point: Array) -> Array:
 
 
 def _box_normal(shape: Shape | SizedShapes, point: Array) -> Array:
-    """Return the normal of the side nearest to a point. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
     is_x_side = (x >= y) & (x >= z)
     is_y_side = ~is_x_side & (y >= z)

@@ -75,7 +75,6 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
 
 
 def _largest_gap(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
-    """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     face_gaps = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
     largest_gap = maximum(maximum(face_gaps[0], face_gaps[1]), face_gaps[2])
@@ -89,6 +88,5 @@ def _largest_gap(middle: Components, axis: Components, half: Array | float, box:
 
 
 def _stop_gradient(vector: Components) -> Components:
-    """Return the components of a vector without their derivatives. (...) each"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

@@ -178,7 +178,6 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the triangles of a convex hull, which have no vertex above their plane; a flat side is a triangle fan."""
     require(
         len(v) <= MAX_HULL_VERTICES,
         f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "
@@ -211,13 +210,11 @@ def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _is_closed(triangles: np.ndarray) -> bool:
-    """Return True if every edge occurs once in each direction."""
     edges = {(t[k], t[(k + 1) % 3]) for t in triangles.tolist() for k in range(3)}
     return len(edges) == 3 * len(triangles) and all((b, a) in edges for a, b in edges)
 
 
 def _unique_normals(normals: np.ndarray) -> np.ndarray:
-    """Return the unit vectors without near duplicates. (n, 3) -> (m, 3)"""
     unique: list[np.ndarray] = []
     for n in normals:
         if not unique or np.min(np.linalg.norm(np.asarray(unique) - n, axis=1)) > 1e-6:

@@ -75,7 +75,6 @@ def _ellipsoid_point(shape: Shape, n: Vector) -> Vector:
 
 
 def _mesh_products(shape: Shape, n: Vector) -> tuple[Array, list[Array]]:
-    """Return the products of a direction with all vertices, (..., n_vertices), and the x, y and z of the vertices."""
     x, y, z = (jnp.asarray(column, n.x.dtype) for column in shape.array("vertices").T)
     return x * n.x[..., None] + y * n.y[..., None] + z * n.z[..., None], [x, y, z]
 
@@ -85,7 +84,6 @@ def _mesh_function(shape: Shape, n: Vector) -> Array:
 
 
 def _mesh_point(shape: Shape, n: Vector) -> Vector:
-    """Return the support point of a mesh, a weighted mean near a tie, without indexing."""
     products, columns = _mesh_products(shape, n)
     gaps = jnp.max(products, axis=-1, keepdims=True) - products
     weight = jnp.clip(1 - gaps * (sharpness(gaps.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)

@@ -41,13 +41,11 @@ def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
 
 
 def _nearest_on_segment(a: Vector, side: Vector) -> Array:
-    """Return the parameter, 0 to 1, of the point of a segment nearest to the origin. (...)"""
     square = side.dot(side)
     return jnp.clip(-a.dot(side) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
 
 def _nearer_point(candidate: Barycentric, current: Barycentric, a: Vector, b: Vector, c: Vector) -> Barycentric:
-    """Return the point nearer to the origin; on a tie, ``current``."""
     p, q = from_barycentric(candidate, a, b, c), from_barycentric(current, a, b, c)
     square = q.dot(q)
     return _choose(p.dot(p) < square * (1 - rounding_margin(square.dtype)), candidate, current)

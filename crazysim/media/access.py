@@ -32,12 +32,6 @@ class Access:
     """
 
     def __init__(self, host: str, port: int):
-        """Create the access with a new token.
-
-        Args:
-            host: Address that the server listens at.
-            port: Port that the server listens at.
-        """
         self.host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._reported_messages: set[str] = set()

@@ -61,19 +61,6 @@ class Film:
         progress: bool = False,
         total: int | None = None,
     ):
-        """Prepare a film. Until it is closed, its frames are in a file that ends with ``.part``.
-
-        Args:
-            path: Path of an ``.mp4`` or ``.gif`` file.
-            view: View to film; None for world 0 in 1280 x 720 pixels.
-            fps: Frames per second of film.
-            speed: Simulated seconds per second of film: 0.1 is slow motion, 10 a time lapse.
-            progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
-            total: Expected number of frames, for the bar.
-
-        Raises:
-            ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
-        """
         self.path, self.view = Path(path), View() if view is None else view
         check_writable(self.path, tuple(ENCODERS))
         # The working directory may change, and ffmpeg would take the relative path -y.mp4 for an option.

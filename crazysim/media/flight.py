@@ -133,7 +133,6 @@ def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
 
 
 def _read_shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
-    """Return the geoms in the arrays of a file."""
     counts = arrays["shape_n"]
     vertices = np.split(arrays["shape_vertices"], np.cumsum(counts[:, 0])[:-1]) if len(counts) else []
     faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(counts[:, 1])[:-1]) if len(counts) else []
@@ -167,7 +166,6 @@ def pack_sample(sample: dict[str, Any]) -> bytes:
 
 
 def _read_samples(path: Path) -> dict[str, NDArray]:
-    """Return the arrays of a flight in a journal."""
     scene: dict[str, NDArray] = {}
     samples: list[NDArray] = []
     for kind, content in read_journal(path):

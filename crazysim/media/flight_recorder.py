@@ -52,16 +52,6 @@ class Recorder:
 
     @check_arguments
     def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
-        """Create a recorder without samples.
-
-        Args:
-            sim: Simulation.
-            worlds: Indices of the worlds to record; None for all.
-            path: New file; None to record in memory.
-
-        Raises:
-            ConfigError: If a world does not exist, or the file exists or cannot be created.
-        """
         self._sim = sim
         self._worlds = world_indices(sim, worlds)
         self._scene = _constant_fields(sim, self._worlds)
@@ -73,7 +63,6 @@ class Recorder:
             self._journal.append(SCENE_CHUNK, pack_scene(self._scene))
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return self._n_samples
 
     def add(self, time: float | None = None) -> None:
@@ -223,17 +212,14 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
 
 @jax.jit
 def _replace_in_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
-    """Return arrays with new values in some worlds. New values may have a shorter last axis: its rest is unchanged."""
     return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
 
 def _body_ids(sim: Sim) -> NDArray:
-    """Return the mocap ids of bodies other than drones."""
     return np.setdiff1d(np.arange(sim.mj_model.nmocap), np.asarray(sim.data.core.drone_mocap_ids))
 
 
 def _constant_fields(sim: Sim, worlds: NDArray) -> dict[str, Any]:
-    """Return the fields of a flight that do not change with time."""
     ids = _body_ids(sim)
     sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
     return {
@@ -245,7 +231,6 @@ def _constant_fields(sim: Sim, worlds: NDArray) -> dict[str, Any]:
 
 
 def _body_poses(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
-    """Return poses of bodies other than drones. (n_worlds, n_bodies, 3) and (n_worlds, n_bodies, 4), xyzw"""
     ids = _body_ids(sim)
     pos, quat = sim.scene.host_poses(sim.plugins.with_moved_objects(sim.data), worlds)
     return pos[:, ids], quat[:, ids]

@@ -37,15 +37,6 @@ class Journal(Closeable):
     """Path of the file."""
 
     def __init__(self, path: str | Path, replace: bool = False):
-        """Create the file.
-
-        Args:
-            path: Path.
-            replace: True to replace an existing file.
-
-        Raises:
-            ConfigError: If the file exists and ``replace`` is False, or if it cannot be created.
-        """
         self.path = Path(path)
         existing_file_flag = os.O_TRUNC if replace else os.O_EXCL
         try:

@@ -99,11 +99,8 @@ class TopView:
     def _find_obstacles(
         self, model: mujoco.MjModel, data: mujoco.MjData, k: int, is_obstacle: NDArray, grid: Grid
     ) -> NDArray:
-        """Return True for samples that show obstacles. (size[1], size[0])
-
-        Rays are cast over an area of twice the size. The result is reused until the map leaves the area or an obstacle
-        moves.
-        """
+        # Rays are cast over an area of twice the size. The result is reused until the map leaves the area or an
+        # obstacle moves.
         area = Grid(grid.start // grid.size * grid.size, 2 * grid.size, grid.scale)
         poses = (x[is_obstacle].ravel() for x in (data.geom_xpos, data.geom_xmat))
         key = np.concatenate([*poses, area.start, [grid.scale]])
@@ -116,7 +113,6 @@ class TopView:
 
 
 def _geom_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[NDArray, NDArray]:
-    """Return the lowest and highest coordinates of each geom, world frame, m. (n, 3), (n, 3)"""
     rot = data.geom_xmat.reshape(-1, 3, 3)
     middle = data.geom_xpos + (rot @ model.geom_aabb[:, :3, None])[..., 0]
     half_size = (np.abs(rot) @ model.geom_aabb[:, 3:, None])[..., 0]
@@ -124,15 +120,6 @@ def _geom_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[NDArray, N
 
 
 def _choose_grid(low: NDArray, high: NDArray, pos: NDArray, width: int, height: int) -> Grid:
-    """Return the grid of a map of an area, or of the part of the area around ``pos`` if the area is too large.
-
-    Args:
-        low: Smallest coordinates of the area, m. (2,)
-        high: Largest coordinates of the area, m. (2,)
-        pos: Point that the map shows, m. (2,)
-        width: Width of the map, pixels.
-        height: Height of the map, pixels.
-    """
     size = SAMPLES * np.array([width, height])
     scale = float(np.clip(((high - low) / size).max(), MIN_WIDTH / size[0], MAX_WIDTH / size[0]))
     middle, slack = (low + high) / 2, np.maximum((high - low - scale * size) / 2, 0.0)
@@ -141,7 +128,6 @@ def _choose_grid(low: NDArray, high: NDArray, pos: NDArray, width: int, height: 
 
 
 def _cast_rays(model: mujoco.MjModel, data: mujoco.MjData, is_obstacle: NDArray, grid: Grid) -> NDArray:
-    """Return True for samples at which rays from above meet obstacles. (size[1], size[0])"""
     n_rays, pos = int(grid.size.prod()), data.geom_xpos.copy()
     x, y = (grid.scale * (np.arange(n) + 0.5 - n / 2) for n in grid.size)
     rays = np.stack(np.broadcast_arrays(x, -y[:, None], -EYE_HEIGHT), axis=-1).ravel()
@@ -154,14 +140,6 @@ def _cast_rays(model: mujoco.MjModel, data: mujoco.MjData, is_obstacle: NDArray,
 
 
 def _draw_line(canvas: NDArray, points: NDArray, radius: float, rgb: ArrayLike) -> None:
-    """Draw a line with round ends through points; a single point is a disc.
-
-    Args:
-        canvas: Image, changed in place. (height, width, 3)
-        points: Columns and rows. (n, 2)
-        radius: Half the width of the line, samples.
-        rgb: Colour, 0 to 255.
-    """
     points = np.clip(points[np.isfinite(points).all(-1)], -np.max(canvas.shape), 2 * np.max(canvas.shape))
     if not len(points):
         return

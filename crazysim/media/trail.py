@@ -31,11 +31,6 @@ class Trail:
     """
 
     def __init__(self, seconds: float):
-        """Create an empty trail.
-
-        Args:
-            seconds: Duration of the trail, s.
-        """
         require(
             isinstance(seconds, (int, float, np.number)) and 0 < seconds < np.inf,
             f"expected a positive duration of a trail, s, got {seconds!r}",
@@ -44,7 +39,6 @@ class Trail:
         self._samples: deque[tuple[NDArray, NDArray]] = deque()
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return len(self._samples)
 
     def add(self, time: ArrayLike, pos: ArrayLike) -> None:

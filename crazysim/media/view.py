@@ -80,7 +80,6 @@ class View:
     """Time of the last image, s, and aim of its camera: a point and for ``hold`` a distance, by index in ``worlds``."""
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation."""
         check_settings(self)
         self.width, self.height = (
             positive_integer(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height")
@@ -175,7 +174,6 @@ class View:
         )
 
     def _read_worlds(self, sim: Sim) -> tuple[NDArray, NDArray]:
-        """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds; add them to the trails."""
         worlds = world_indices(sim, self.worlds)
         require(
             self.follow is None or self.follow in range(sim.n_drones),
@@ -192,7 +190,6 @@ class View:
         return time, pos
 
     def _draw(self, sim: Sim, k: int, time: float) -> None:
-        """Draw the overlays of the k-th world."""
         if self._trail is not None:
             self._trail.draw(sim.overlays, k, self.rgba)
         if self.setpoints:
@@ -203,7 +200,6 @@ class View:
             draw_text(sim, _format_text(self.text, self.worlds[k], time))
 
     def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
-        """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
         config = self.cam_config(time) if callable(self.cam_config) else self.cam_config
         expect(
             config is None or isinstance(config, Mapping),
@@ -225,7 +221,6 @@ class View:
         return config
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
-        """Return the aim of the camera of the k-th world: ``aim`` with first-order lag, without lag after a reset."""
         last_time, value = self._aim.get(k, (np.inf, aim))
         weight = 1.0 if time < last_time or self.lag == 0 else 1 - np.exp(-(time - last_time) / self.lag)
         if np.isfinite(aim).all():
@@ -235,10 +230,7 @@ class View:
 
 
 def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
-    """Draw a picture with a border at the bottom right of an image.
-
-    Its pixels are repeated as often as fits into a quarter of the image's width and a third of its height.
-    """
+    # Its pixels are repeated as often as fits into a quarter of the image's width and a third of its height.
     if picture is None:
         return
     scale = max(min(tile.shape[1] // (4 * picture.shape[1]), tile.shape[0] // (3 * picture.shape[0])), 1)
@@ -248,19 +240,12 @@ def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:
 
 
 def _draw_top_view(tile: NDArray, picture: NDArray | None) -> None:
-    """Draw a picture with a border at the bottom left of an image."""
     if picture is not None:
         picture = np.pad(picture, ((2, 0), (0, 2), (0, 0)))
         tile[tile.shape[0] - picture.shape[0] :, : picture.shape[1]] = picture
 
 
 def _frame_points(points: NDArray, fovy: float) -> NDArray:
-    """Return the middle of points and the distance from which all points are in view, m. (4,)
-
-    Args:
-        points: Points, m; points that are not finite are left out. (n, 3)
-        fovy: Vertical field of view, degrees; images are at least as wide as high.
-    """
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
         return np.full(4, np.nan)

@@ -142,7 +142,6 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
 
 
 def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
-    """Return viser's recording of the k-th world of a flight."""
     scene = server.scene
     scene.set_up_direction("+z")
     camera = server.initial_camera
@@ -253,7 +252,6 @@ def create_mesh(shapes: list[VisualGeom]) -> Any:
 
 
 def _create_geom_mesh(shape: VisualGeom) -> Any:
-    """Return a geom as a trimesh mesh, in the frame of the geom."""
     import trimesh
 
     radius, half = float(shape.size[0]), float(shape.size[1])

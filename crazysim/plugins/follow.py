@@ -125,7 +125,6 @@ class Follow(Plugin, replaces=("state commands",)):
         return self.slots.evaluate_at_rate(self.index[0], (t - self.start[0]) * rate, rate, self.degrees)
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the errors of position, m, and velocity, m/s: desired minus actual, world frame. (3,) each"""
         s = self.setpoint(data)
         return {"pos_error": s.pos - data.states.pos, "vel_error": s.vel - data.states.vel}
 
@@ -214,10 +213,7 @@ class Follow(Plugin, replaces=("state commands",)):
 
 
 def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
-    """Return a checked index, start or rate, (1,) or (n_worlds, n_drones, 1).
-
-    An array with one axis has a value for each drone, in all worlds.
-    """
+    # An array with one axis has a value for each drone, in all worlds.
     if np.shape(value) == (sim.n_drones,):
         value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
     elif np.ndim(value) == 1 and np.shape(value) != (1,):
@@ -227,7 +223,6 @@ def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int
 
 
 def _check_count(name: str, value: object, minimum: int) -> int:
-    """Return a setting, checked to be an integer of at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
         raise ConfigError(
             f"expected {name} as an integer of at least {minimum}, which the trajectories need, got {value!r}"
@@ -242,14 +237,6 @@ def _replace_slot(old_arrays: list[Array], new_arrays: list[Array], slot: Array)
 
 @jax.jit
 def _future_paths(record: Follow, slot_values: list[Array], times: Array) -> Array:
-    """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)
-
-    Args:
-        record: The trajectories.
-        slot_values: Index, start and rate of every drone. (n_drones, 1) each
-        times: Times of the world, s. (n_times,)
-    """
-
     def drone_path(index: Array, start: Array, rate: Array) -> Array:
         drone_record = record.replace(index=index, start=start, rate=rate)
         return jax.vmap(lambda t: drone_record.setpoint_at(t).pos)(times)

@@ -50,7 +50,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         """True if scene or plugins have changed since ``refresh``."""
 
     def __getitem__(self, name: str) -> Plugin:
-        """Return a plugin."""
         require(
             name in self._stages.plugins,
             f"expected the name of an added plugin, got {name!r}. Added are: {', '.join(self) or 'none'}.",
@@ -116,7 +115,6 @@ class PluginRegistry(Mapping[str, Plugin]):
             self._move_objects.pop(name, None)
 
     def _unmet_need(self, plugin: Plugin) -> ConfigError | None:
-        """Return the error of a plugin that needs another one."""
         try:
             plugin.check_plugins(self._sim)
         except ConfigError as error:
@@ -124,7 +122,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         return None
 
     def _leave_objects(self, name: str) -> None:
-        """Put the objects of a plugin where it has moved them, as ordinary objects."""
         sim, default = self._sim, self._sim.default_data
         if default.objects is not None and not sim.data.objects.recorded:  # type: ignore[union-attr]
             sim.default_data = default.replace(objects=self._moved_objects(name, default))
@@ -152,14 +149,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         self.is_stale = False
 
     def _remake_records(self, name: str) -> None:
-        """Make the records of a plugin again; states, and numbers that were set in them, stay as they are."""
         records, datas = self._make_records(self[name]), (self._sim.data, self._sim.default_data)
         present = [data.plugins.get(name) for data in datas]
         self._put_records(name, *[_carry_over(self[name], *xs, ()) for xs in zip(records, present, strict=True)])
 
     @property
     def _scene_readers(self) -> set[str]:
-        """Names of the plugins that read the scene."""
         return self._record_readers | self._stages.scene_readers
 
     def adapt_records(self, data: SimData, reference: SimData) -> SimData:
@@ -201,7 +196,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         return check
 
     def _make_records(self, plugin: Plugin) -> tuple[PyTree | None, PyTree | None]:
-        """Return record and default record of a plugin, and note whether they depend on the scene."""
         n_reads = self._sim.scene.n_reads
         plugin.check_simulation(self._sim)
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
@@ -245,7 +239,6 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @contextlib.contextmanager
     def _restore_on_error(self) -> Iterator[None]:
-        """Restore the simulation and its scene if an error ends the block."""
         sim, was_changing = self._sim, self._is_changing
         self._is_changing = True  # plugins read the scene again after the change
         try:
@@ -278,7 +271,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
 
     def _require_unused_names(self, plugin: Plugin, used_names: Collection[str]) -> None:
-        """Check that the names of a population's members are not in use."""
         used_names = set(used_names)
         duplicates = [name for name in self.members_of(plugin) if name in used_names]
         if duplicates:
@@ -289,7 +281,6 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @staticmethod
     def _require_unique_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
-        """Check that no other plugin replaces the same term of the model."""
         for other in others:
             if shared_terms := set(plugin.replaced_terms) & set(other.replaced_terms):
                 raise ConfigError(
@@ -365,10 +356,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             plugin.draw(self._sim, world)
 
     def _put_records(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
-        """Put a record into the data and the default data, or remove it, without other changes.
-
-        Each record is first assigned to ``sim.data``, which moves it to the simulation's devices.
-        """
+        # Each record is first assigned to ``sim.data``, which moves it to the simulation's devices.
         self._set_record(name, default)
         current = self._sim.data.plugins.get(name)
         self._sim.default_data = _with_record(self._sim.default_data, name, current)
@@ -383,7 +371,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim.data = _with_record(self._sim.data, name, record)
 
     def _build(self, changed: Plugin | None = None, remake: Collection[str] = ()) -> None:
-        """Build the pipelines, after a plugin was added, replaced or removed."""
         self._is_checked = False
         self._stages.build(remake, changed)
         self._sim.build_step_fn()
@@ -396,7 +383,6 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
 
 
 def _have_same_code(old_plugin: Plugin, new_plugin: Plugin) -> bool:
-    """Return True if two plugins of one class differ at most in numbers of their records."""
     static_settings = [name for name, setting in collect_settings(type(old_plugin)).items() if not setting.is_parameter]
     return all(_are_equal(getattr(old_plugin, name), getattr(new_plugin, name)) for name in static_settings)
 
@@ -413,7 +399,6 @@ def _are_equal(a: Any, b: Any) -> bool:
 
 
 def _require_numbers(plugin: Plugin, record: Any) -> None:
-    """Check that the leaves in which NaN flags a world begin without NaN."""
     flags = zip(jax.tree_util.tree_leaves_with_path(record), jax.tree.leaves(watched_flags(record)), strict=True)
     for (path, x), is_watched in flags:
         if is_watched and x.dtype.kind == "f" and np.isnan(x).any():
@@ -426,15 +411,6 @@ def _require_numbers(plugin: Plugin, record: Any) -> None:
 def _carry_over(
     plugin: Plugin, record: PyTree | None, old_record: PyTree | None, setting_scopes: Sequence[str] = _SETTING_SCOPES
 ) -> PyTree | None:
-    """Return a record with the states of the previous record, as far as possible.
-
-    Args:
-        plugin: The plugin.
-        record: The new record.
-        old_record: The previous record.
-        setting_scopes: Scopes of leaves that are not states; empty to carry over settings, too, except for ``derived``
-            ones.
-    """
     carried_record = _carry_over_states(record, old_record, setting_scopes)
     is_same_kind = carried_record is not None and type(carried_record) is type(old_record)
     return plugin.carry_over(carried_record, old_record) if is_same_kind else carried_record
@@ -443,7 +419,6 @@ def _carry_over(
 def _carry_over_states(
     record: PyTree | None, old_record: PyTree | None, setting_scopes: Sequence[str]
 ) -> PyTree | None:
-    """Return a record with the states of the previous record, wherever structure, shape and type agree."""
     if record is None or type(record) is not type(old_record):
         return record
     states = {}
@@ -458,12 +433,10 @@ def _carry_over_states(
 
 
 def _signature(tree: object) -> tuple[object, list[tuple[object, ...]]]:
-    """Return the structure of a tree, and the shapes and types of its leaves."""
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
 
 
 def _layout(record: PyTree | None) -> tuple[object, list[tuple[int, ...]]]:
-    """Return the structure of a record, and the shapes of its leaves without their first axis."""
     return jax.tree.structure(record), [jnp.shape(x)[1:] for x in jax.tree.leaves(record)]
 
 

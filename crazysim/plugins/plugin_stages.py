@@ -95,7 +95,6 @@ class PluginStages:
         self._set_stages(zip(live, self._built, strict=True))
 
     def _insert_stages(self, pipeline: Pipeline, plugin: Plugin, placements: Sequence[StagePlacement]) -> None:
-        """Insert the stages of a plugin into a pipeline."""
         measurements = {
             placement.name or name
             for name, made in self._made.items()
@@ -140,7 +139,6 @@ class PluginStages:
         return restore
 
     def _set_stages(self, stages: Iterable[tuple[Pipeline, Pipeline]]) -> None:
-        """Set the pipelines of step and reset to given dicts, each with the stages beside it."""
         pipelines = []
         for pipeline, new_stages in stages:
             pipeline.clear()
@@ -203,7 +201,6 @@ def _replaced(pipeline: Pipeline, placements: Sequence[StagePlacement]) -> list[
 
 
 def _make_stages(plugin: Plugin, sim: Simulation) -> MadeStages:
-    """Return the stages of a plugin for ``sim.step_pipeline``, a pipeline without them."""
     pipeline, n_reads = sim.step_pipeline, sim.scene.n_reads
     placements = plugin.stages(sim)
     expect(
@@ -234,7 +231,6 @@ def _make_stages(plugin: Plugin, sim: Simulation) -> MadeStages:
 
 
 def _as_method(plugin: Plugin, stage: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a declared stage as a method of a plugin, which computes with ``Plugin.known_data``."""
     if not isinstance(stage, Stage) or isinstance(stage.fn, BoundMethod):
         return stage
     fn, method_stage = stage.fn, copy.copy(stage)
@@ -243,7 +239,6 @@ def _as_method(plugin: Plugin, stage: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None) -> Pipeline:
-    """Return the pipeline whose integration applies the influences and derivatives of plugins."""
     dynamic_plugins = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
     constraining_names = [p.name for p in dynamic_plugins if p.constrains]
     require(

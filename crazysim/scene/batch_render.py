@@ -31,19 +31,6 @@ class BatchRenderer:
     def __init__(
         self, model: mujoco.MjModel, camera: str | int, width: int, height: int, n_worlds: int, device: jax.Device
     ):
-        """Load MuJoCo Warp. It compiles its kernels at its first run on a machine, which takes some seconds.
-
-        Args:
-            model: Compiled scene.
-            camera: Name or id of a camera.
-            width: Width of each image, pixels.
-            height: Height of each image, pixels.
-            n_worlds: Number of worlds.
-            device: JAX device of the poses.
-
-        Raises:
-            ImportError: If warp-lang is not installed.
-        """
         require(is_installed(), INSTALL_MESSAGE, ImportError)
         check_image_size(width, height)
         camera_index = camera_id(model, camera)
@@ -73,13 +60,6 @@ class BatchRenderer:
             )
 
     def __call__(self, mocap_pos: Array, mocap_quat: Array, qpos: Array) -> Array:
-        """Return the images, on the JAX device. (n_worlds, height, width, 3), uint8
-
-        Args:
-            mocap_pos: Positions of all mocap bodies, m. (n_worlds, n_mocap, 3)
-            mocap_quat: Attitudes of all mocap bodies, wxyz. (n_worlds, n_mocap, 4)
-            qpos: Joint positions. (n_worlds, n_qpos)
-        """
         wp, mjw, d = self._wp, self._mjw, self._data
         with wp.ScopedDevice(self._device):
             for target, x, dtype in (
@@ -99,7 +79,6 @@ class BatchRenderer:
 
 
 def _unpack_colors(pixels: Array, shape: tuple[int, int, int]) -> Array:
-    """Return a copy of packed pixels as red, green and blue; the next call overwrites the packed pixels."""
     return _color_bytes(pixels).reshape(*shape, 3)
 
 

@@ -77,11 +77,8 @@ def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
 
 
 def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
-    """Add the bodies of the drones to a spec, in chunks if there are many.
-
-    MuJoCo goes through the whole spec for every geom that is added and every body that is attached. 4,096 drones
-    take 30 s one by one, and 2 s in chunks that are filled separately.
-    """
+    # MuJoCo goes through the whole spec for every geom that is added and every body that is attached. 4,096 drones take
+    # 30 s one by one, and 2 s in chunks that are filled separately.
     n_drones = len(airframes)
     leds = dict.fromkeys((_material_name(led, i) for i in range(n_drones) for led in LED_MATERIALS), (1, 1, 1, 0.15))
     for name, rgba in (MATERIALS | leds).items():
@@ -96,10 +93,7 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
 
 
 def _handle_warnings_of_mujoco() -> None:
-    """Print MuJoCo's warnings, which it would also append to ``MUJOCO_LOG.TXT`` in the user's folder.
-
-    Its warning that attached names have no prefix is left out: scenes are not saved here.
-    """
+    # Its warning that attached names have no prefix is left out: scenes are not saved here.
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(
             lambda text: None if "empty prefix" in text else print(f"MuJoCo: {text}", file=sys.stderr)
@@ -153,7 +147,6 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
 
 
 def _set_collision_bits(geom: mujoco.MjsGeom, collides: bool) -> None:
-    """Make a geom of a drone collide with the scene, other drones and ``DRONE_TOUCH_BITS``, or with nothing."""
     geom.contype, geom.conaffinity = (3, 1) if collides else (0, 0)
 
 

@@ -76,7 +76,6 @@ class DroneGeoms:
 
 
 def _consecutive_runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Return first and last of each run of consecutive numbers."""
     runs: list[tuple[int, int]] = []
     for k in sorted(numbers):
         if runs and runs[-1][1] == k - 1:
@@ -151,15 +150,6 @@ def _build_model(
     is_included: Callable[[int], bool],
     is_drone_geom: Callable[[int], bool],
 ) -> CollisionModel:
-    """Return the geoms of floor and objects that are included, and the included geoms of a drone of each airframe.
-
-    Args:
-        model: Compiled scene.
-        handles: Names of bodies with handles, in the order of ``data.objects``.
-        drone_groups: Drones of each airframe.
-        is_included: Function from the id of a geom of floor or an object to True if it is included.
-        is_drone_geom: Function from the id of a geom of a drone to True if it is included.
-    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     floor = []
@@ -214,7 +204,6 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
-    """Return a geom in the frame of a body, or in the world frame if ``body`` is None."""
     pos, rot = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     if body is not None:
         to_body = data.xmat[body].reshape(3, 3).T
@@ -240,11 +229,8 @@ def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
 
 
 def _read_hull(model: mujoco.MjModel, mesh: int) -> Shape:
-    """Return the convex hull of a mesh, which MuJoCo also uses for contacts.
-
-    MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
-    of the vertices in the mesh, edges, and three vertices for each face.
-    """
+    # MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
+    # of the vertices in the mesh, edges, and three vertices for each face.
     first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = np.asarray(model.mesh_vert[first : first + n], np.float64)
     start = int(model.mesh_graphadr[mesh])

@@ -199,10 +199,7 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
 
 
 def _group_key(body: CollisionBody) -> tuple[Any, ...]:
-    """Return a key that is equal for objects whose distances can be computed together.
-
-    Its first entry is True for objects that can move.
-    """
+    # Its first entry is True for objects that can move.
     if body.row is not None:
         return (True, body.geoms)
     kinds = tuple([(geom.shape, geom.rot is None) for geom in body.geoms])
@@ -231,12 +228,10 @@ it (...), None if all do."""
 
 
 def _mask_absent(is_present: Array | None, gap: Array) -> Array:
-    """Return distances, infinite for geoms that a drone does not have. (...)"""
     return gap if is_present is None else jnp.where(is_present, gap, jnp.inf)
 
 
 def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
-    """Return the distances to objects with equal geoms, m. (..., n)"""
     geoms = group[0].geoms
     if group[0].row is None:
         if len(group) > MAX_UNROLLED_GEOMS:
@@ -265,10 +260,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
 
 
 def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
-    """Return the distance to the nearest of several geoms in the world frame, m. (...)
-
-    Distances to many geoms of one shape, or to many boxes, are computed together.
-    """
+    # Distances to many geoms of one shape, or to many boxes, are computed together.
     gaps = []
     for geoms_of_kind in _geoms_by_kind(geoms):
         for part, part_pos, is_present in parts:
@@ -292,7 +284,6 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
 
 
 def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
-    """Return geoms in groups of one shape, or of boxes. In each group either all geoms are rotated or none."""
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:
         kinds.setdefault(("box" if geom.shape.kind == "box" else geom.shape, geom.rot is None), []).append(geom)
@@ -324,7 +315,6 @@ class StackedGeoms(NamedTuple):
 def _stacked_distances(
     part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, is_present: Array | None
 ) -> Array:
-    """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
     rot = None
     if drone_rot is not None:
         rot = jnp.broadcast_to(drone_rot[..., None, :, :], (*drone_rot.shape[:-2], len(geoms.pos), 3, 3))
@@ -333,7 +323,6 @@ def _stacked_distances(
 
 
 def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms) -> Array:
-    """Return the distance of a geom of one drone to the nearest stacked geom, m. ()"""
     n, dtype = len(geoms.pos), part_pos.dtype
     offset, half = bounding_box(geoms.shape)
     halves = np.broadcast_to(half, (n, 3)) if geoms.box_sizes is None else geoms.box_sizes
@@ -362,14 +351,6 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
 def _geom_distance(
     part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
 ) -> Array:
-    """Return the distance of a drone's geom to another geom, m. (...)
-
-    Args:
-        part: Geom of the drone.
-        part_pos: Position of that geom in the frame of ``geom.pos``, m. (..., 3)
-        drone_rot: Attitude of the drone in the same frame; None if all geoms of drones are spheres. (..., 3, 3)
-        geom: The other geom, or several geoms along the last batch axis.
-    """
     local_pos = part_pos - jnp.asarray(geom.pos, part_pos.dtype)
     rot = drone_rot
     if geom.rot is not None:
@@ -386,20 +367,16 @@ def _geom_distance(
 
 
 def _matrix_product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` of 3 x 3 matrices, by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
     return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
 
 def _minimum(gaps: list[Array], pos: Array) -> Array:
-    """Return the smallest distance, infinite if there is none. (...)"""
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
 def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
-    """Return the distance of one drone to the nearest other drone of its world, m. ()"""
-
     def pair_distance(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
         positions, presences, rot = other
         inverse = None if rot is None else rot.T
@@ -420,11 +397,8 @@ def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
 
 
 def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, Array]:
-    """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
-
-    In a large swarm the distances of ``DRONES_PER_CHUNK`` drones to all others are computed at a time, so memory grows
-    linearly with the swarm.
-    """
+    # In a large swarm the distances of ``DRONES_PER_CHUNK`` drones to all others are computed at a time, so memory
+    # grows linearly with the swarm.
     n = parts[0][1].shape[-2]
     indices = jnp.arange(n, dtype=np.int32)
 
@@ -458,12 +432,4 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
 
 
 def _argmin(gaps: Array) -> Array:
-    """Return the index of the smallest distance, int32 even if x64 is enabled, since kernels have no int64.
-
-    Args:
-        gaps: Distances, m. (..., n)
-
-    Returns:
-        (...)
-    """
     return jax.lax.argmin(gaps, gaps.ndim - 1, np.int32)

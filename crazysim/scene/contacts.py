@@ -25,7 +25,6 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
 
 @jit_eager_calls()
 def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array) -> Array:
-    """Return True for every slot with contact in which one geom has ``belongs_to_body``. (n_worlds, n_slots)"""
     belongs_to_body = jnp.asarray(belongs_to_body)
     return (dist < 0) & ((geom1 >= 0) & belongs_to_body[geom1] | (geom2 >= 0) & belongs_to_body[geom2])
 

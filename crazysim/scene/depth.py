@@ -235,7 +235,6 @@ def build_depth_fn(
         return untile_results(find_hidden(data, kernels, poses, hits))
 
     def find_hidden(data: SimData, kernels: RayKernels, poses: Sequence[tuple[Array, Array]], hits: Hits) -> Hits:
-        """Return the hits with ``is_hidden``, from a second ray to each point."""
         if not baseline:
             return hits
         origins = [(pos + baseline * rot[..., 0])[..., None, :] for pos, rot in poses]
@@ -249,7 +248,6 @@ def build_depth_fn(
         return hits.replace(is_hidden=is_nearer & jnp.isfinite(hits.distance))
 
     def untile_results(hits: Hits) -> Hits:
-        """Return hits in the order of the tiles as images, with distances along the axis or along the rays."""
         cosine = jnp.asarray(-directions[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
 
         def untile(x: Array, n_trailing: int) -> Array:
@@ -283,7 +281,6 @@ def build_depth_fn(
         return kernels.run_on_each_device(cast_in_parts, data)
 
     def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
-        """Cast the rays of all worlds, in parts of at most ``MAX_RAYS`` or ``MAX_RAYS_OF_KERNEL``."""
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, worlds_per_batch = data.states.pos.shape[0], max(1, max_rays // n_rays)
         if n_worlds <= worlds_per_batch:
@@ -302,12 +299,6 @@ def build_depth_fn(
 
 
 def _rotate_directions(rot: Array, rays: np.ndarray) -> Array:
-    """Return the directions of the rays of one camera, world frame. (n_rays, 3)
-
-    Args:
-        rot: Axes of the camera as columns. (3, 3)
-        rays: Unit directions in the frame of the camera, in the first three columns. (n_rays, 4)
-    """
     # By components: a GPU may round matrix products to 10 bits.
     x, y, z = (rot[:, k] * jnp.asarray(rays[:, k, None], rot.dtype) for k in range(3))
     return x + y + z

@@ -113,14 +113,6 @@ class Targets:
     """Geoms that rays can meet, and their tables."""
 
     def __init__(self, model: CollisionModel, n_drones: int, drones: bool, ignored_drone: int = IGNORES_NONE):
-        """Sort the geoms of a model.
-
-        Args:
-            model: Model, without bodies whose poses are not part of the data.
-            n_drones: Number of drones per world.
-            drones: True for rays to meet drones.
-            ignored_drone: Drone that all rays pass through; ``IGNORES_NONE`` for none.
-        """
         targets = [Target(geom, "world", 0, 0) for geom in model.floor]
         for index, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
@@ -237,7 +229,6 @@ class Targets:
 
 
 def _leaf_set(links: np.ndarray, node: int) -> frozenset[int]:
-    """Return the geoms of the leaves of a node."""
     geoms = links[node : links[node, 0], 1]
     return frozenset(geoms[geoms >= 0].tolist())
 
@@ -315,7 +306,6 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
 
 
 def _camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
-    """Return the world of the ray with an index, and the ray; see ``first_hit``."""
     camera_number = lax.div(index, jnp.int32(n_pixels))
     world = lax.div(camera_number, jnp.int32(n_cameras))
     camera, pixel = camera_number - world * n_cameras, index - camera_number * n_pixels
@@ -344,7 +334,6 @@ def normal_at_hit(
     code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
 
     def normal_in_world_frame(row: Sequence[Array], normal: Components) -> Components:
-        """Return the normal of the geom with the given row."""
         local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
         for k, surface in enumerate(surfaces):
 
@@ -373,7 +362,6 @@ def normal_at_hit(
 def _normal_in_frame(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> Components:
-    """Return the outward unit normal where a ray hits a geom at a distance, m, all in the geom's frame."""
     if isinstance(surface, Shape) and surface.kind == "hfield":
         return components(field_ray(surface, jnp.stack(origin), jnp.stack(direction))[1])
     if isinstance(surface, Shape):
@@ -382,7 +370,6 @@ def _normal_in_frame(
 
 
 def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
-    """Return the normal of the plane of a mesh that is nearest to a point of its surface, in a loop over the planes."""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), x.dtype)
 
     def compare_plane(carry: tuple[Array, Array, Components], _: None) -> tuple[tuple[Array, Array, Components], None]:
@@ -430,17 +417,6 @@ def _walk_hierarchy(
     best: BestHit,
     n_nodes: Array | int,
 ) -> BestHit:
-    """Return the best hit so far, or a nearer hit of a geom in a hierarchy.
-
-    Args:
-        read_node: Function from the index of a node, where nodes of the first order come first, to its box, the index
-            of the node after its subtree, and its geom or -1.
-        hit_geom: Function from a geom, a flag that is True if the ray meets its box, and the best hit so far, to the
-            best hit so far or a nearer hit of that geom.
-        ray: The ray.
-        best: Best hit so far.
-        n_nodes: Number of nodes in one order.
-    """
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     are_negative = [any_lane(d < 0) for d in ray.direction]
@@ -475,15 +451,6 @@ def _meets_box(
     inverse_direction: Sequence[Array],
     best_distance: Array,
 ) -> Array:
-    """Return True where a ray meets a box before its best hit.
-
-    Args:
-        low: Lower corner of the box, m.
-        high: Upper corner, m.
-        scaled_origin: Origin of the ray times ``inverse_direction``.
-        inverse_direction: Inverses of the components of the ray's direction.
-        best_distance: Distance to the best hit so far, m.
-    """
     ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled_origin, inverse_direction, strict=True)]
     x, y, z = (_minimum(*pair) for pair in ends)
     near = _maximum(_maximum(x, y), z)
@@ -495,7 +462,6 @@ def _meets_box(
 def _nearer_hit(
     surfaces: Sequence[Surface], code: Array, geom: Array, row: Sequence[Array], ray: Ray, is_near: Array, best: BestHit
 ) -> BestHit:
-    """Return the best hit so far, or the hit of one geom if it is nearer and ``is_near`` is True."""
     local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
     for surface_index, surface in enumerate(surfaces):
 
@@ -523,7 +489,6 @@ def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
 
 
 def _ray_length(surface: Surface, row: Sequence[Array], origin: Components, direction: Components) -> Array:
-    """Return the distance along one ray in the frame of a geom, m. ()"""
     if isinstance(surface, str):
         return hit_distance(geom_shape(surface, row), origin, direction)
     if surface.kind == "hfield":
@@ -532,7 +497,6 @@ def _ray_length(surface: Surface, row: Sequence[Array], origin: Components, dire
 
 
 def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) -> Array:
-    """Return the distance along one ray to a mesh, m, in a loop over its planes; see ``hit_distance``. ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
     def cut_by_plane(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:

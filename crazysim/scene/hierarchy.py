@@ -56,11 +56,8 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
-    """Return a tree of boxes, built with the surface area heuristic.
-
-    Each split minimises the sum over both parts of surface area times number of boxes. Each part has more than an
-    eighth of the boxes, which bounds the depth.
-    """
+    # Each split minimises the sum over both parts of surface area times number of boxes. Each part has more than an
+    # eighth of the boxes, which bounds the depth.
     node = _Node(low[geoms].min(axis=0), high[geoms].max(axis=0), geom=int(geoms[0]))
     n = len(geoms)
     if n == 1:
@@ -86,7 +83,6 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
 
 
 def _node_rows(roots: list[_Node], order: int) -> list[list[float]]:
-    """Return the rows of all nodes, in the order of an octant."""
     rows: list[list[float]] = []
 
     def visit(node: _Node) -> None:

@@ -51,12 +51,10 @@ def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _to_xyzw(quat: Array) -> Array:
-    """Return MuJoCo's quaternions, wxyz, as xyzw. (..., 4)"""
     return jnp.roll(quat, -1, axis=-1)
 
 
 def _generations(parents: NDArray) -> list[NDArray]:
-    """Return the bodies at each depth, from the grandchildren of the world on. (n_bodies,) each"""
     depth = np.zeros(len(parents), int)
     for body in range(1, len(parents)):  # a parent comes before its children
         depth[body] = depth[parents[body]] + 1

@@ -105,7 +105,6 @@ def _read_ply_map(content: bytes) -> tuple[NDArray, NDArray | None]:
 
 
 def _read_pcd(content: bytes) -> tuple[NDArray, None]:
-    """Return the finite points of a ``.pcd`` file; points that are not finite mark missing returns."""
     header, body = _split_header(content, b"DATA")
     table = {line[0]: line[1:] for line in header if not line[0].startswith("#")}
     n, layout = _parse_count(table["POINTS"][0]), table["DATA"][0]
@@ -128,7 +127,6 @@ def _read_pcd(content: bytes) -> tuple[NDArray, None]:
 
 
 def _read_stl(content: bytes) -> tuple[NDArray, NDArray]:
-    """Return the corners of the triangles of an ``.stl`` file, text or binary."""
     n = int.from_bytes(content[80:84], "little")
     if len(content) == 84 + 50 * n and n:
         rows = np.frombuffer(content, np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("rest", "<u2")]), n, 84)
@@ -142,7 +140,6 @@ def _read_stl(content: bytes) -> tuple[NDArray, NDArray]:
 
 
 def _read_obj(content: bytes) -> tuple[NDArray, NDArray | None]:
-    """Return vertices and triangles of an ``.obj`` file; a negative index counts back from the last vertex so far."""
     vertices, polygons = [], []
     for line in content.decode("utf-8", "replace").splitlines():
         kind, *words = line.split() or [""]
@@ -164,7 +161,6 @@ MAP_READERS: dict[str, Callable[[bytes], tuple[NDArray, NDArray | None]]] = {
 
 
 def _split_header(content: bytes, last_keyword: bytes) -> tuple[list[list[str]], bytes]:
-    """Return the words of each line of the header, and the bytes after the line that begins with ``last_keyword``."""
     lines, start = [], 0
     while start < min(len(content), MAX_HEADER_BYTES):
         end = content.find(b"\n", start)
@@ -180,25 +176,21 @@ def _split_header(content: bytes, last_keyword: bytes) -> tuple[list[list[str]],
 
 
 def _parse_count(number: str | int) -> int:
-    """Return a number of entries, after a check that it is not negative."""
     n = int(number)
     require(n >= 0, f"expected a number of entries, got {n}", ValueError)
     return n
 
 
 def _number_padding_columns(names: list[str]) -> list[str]:
-    """Return names of columns with a number after each ``_``, which is the name of all padding columns."""
     return [f"{name}{k}" if name == "_" else name for k, name in enumerate(names)]
 
 
 def _parse_numbers(words: list[bytes], n: int) -> NDArray[np.float64]:
-    """Return the first ``n`` words as numbers, after a check that there are enough words."""
     require(len(words) >= n, f"expected {n} numbers, got {len(words)}", ValueError)
     return np.array(words[:n], np.float64)
 
 
 def _triangulate(polygons: NDArray | list[NDArray]) -> NDArray[np.int64]:
-    """Return polygons as fans of triangles. (n, 3)"""
     if isinstance(polygons, np.ndarray):
         polygons = list(polygons[None].astype(np.int64)) if polygons.size else []
     else:
@@ -252,13 +244,11 @@ class _BinaryTable:
         return self._read_rows(n, [(p[0], self._order + p[1]) for p in properties])
 
     def _read_rows(self, n: int, fields: list[tuple]) -> dict[str, NDArray]:
-        """Return the fields of the next ``n`` rows of equal length."""
         rows = np.frombuffer(self._body, np.dtype(fields), n, self._position)
         self._position += rows.nbytes
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def _read_lists(self, n: int, properties: list[Property]) -> Columns:
-        """Return the next ``n`` rows with lists, all at once if each list has the same length in every row."""
         start, fields = self._position, []
         lengths = {p[0]: len(self._read_entry(p)) for p in properties}
         for p in properties:
@@ -279,7 +269,6 @@ class _BinaryTable:
 
 
 def _join_columns(properties: list[Property], rows: list[list[NDArray]]) -> Columns:
-    """Return the columns of rows by name: an array, or a list of arrays if their lengths differ."""
     columns = {p[0]: [row[k] for row in rows] for k, p in enumerate(properties)}
     return {
         p[0]: np.concatenate(columns[p[0]]) if len(p) == 2

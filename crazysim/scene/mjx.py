@@ -40,7 +40,6 @@ class _DeferredModule(ModuleType):
 
 @contextlib.contextmanager
 def _defer_imports() -> Iterator[None]:
-    """Make imports of Warp fail, and defer imports of trimesh and ``scipy.spatial``, unless already imported."""
     replacements = {"warp": None, **{name: _DeferredModule(name) for name in ("trimesh", "scipy.spatial")}}
     replacements = (
         {} if "mujoco.mjx" in sys.modules else {k: x for k, x in replacements.items() if k not in sys.modules}

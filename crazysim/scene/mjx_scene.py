@@ -23,14 +23,6 @@ class MjxScene:
     """``mjx.Model`` and ``mjx.Data`` of one compiled scene."""
 
     def __init__(self, mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device, mesh: Mesh | None):
-        """Store the compiled scene; nothing is allocated yet.
-
-        Args:
-            mj_model: Compiled scene.
-            n_worlds: Number of worlds.
-            device: Device of all arrays.
-            mesh: Devices over which the worlds are distributed; None for one device.
-        """
         self._mj_model, self._n_worlds, self._device, self._mesh = mj_model, n_worlds, device, mesh
         self._model: mjx.Model | None = None
         self._data: mjx.Data | None = None

@@ -54,7 +54,6 @@ def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses
 
 
 def _pose_pair(mocap: MocapPoses, data: SimData | None) -> tuple[Array, Array]:
-    """Return positions and attitudes of mocap bodies after a check; ``data`` is None in a function of one world."""
     pos, quat = mocap if isinstance(mocap, (tuple, list)) else (mocap.mocap_pos, mocap.mocap_quat)
     pos, quat = jnp.asarray(pos), jnp.asarray(quat)
     n = None if data is None else data.states.pos.shape[0]

@@ -53,7 +53,6 @@ def nearest_geom(
 
 
 def _box_distance(low: Sequence[Array], high: Sequence[Array], point: Sequence[Array]) -> Array:
-    """Return the signed distance from a point to a box along the axes, m. ()"""
     gaps = [jnp.maximum(a - p, p - b) for a, b, p in zip(low, high, point, strict=True)]
     max_gap = jnp.maximum(jnp.maximum(gaps[0], gaps[1]), gaps[2])
     outside = safe_sqrt(sum(jnp.maximum(gap, 0.0) ** 2 for gap in gaps))  # type: ignore[arg-type]

@@ -55,7 +55,6 @@ class Handle:
         return len(self.numbers)
 
     def __getitem__(self, k: int | slice) -> Handle:
-        """Return the handle of the objects at an index or slice."""
         n = len(self)
         if not isinstance(k, slice) and (not isinstance(k, (int, np.integer)) or not -n <= k < n):
             raise IndexError(f"expected an index from 0 to {n - 1} or a slice, got {short_repr(k)}, of {self.name!r}")
@@ -118,10 +117,7 @@ class Handle:
 def _replace_rows(
     old: Array, value: Array | NDArray, mask: Array | None, row_indices: tuple[int, ...], is_quat: bool
 ) -> Array:
-    """Return positions, attitudes (normalised) or velocities of all objects with the selected rows replaced.
-
-    Arrays are (n_worlds, 1, n_objects, k) for all worlds, or (n_objects, k) for one world.
-    """
+    # Arrays are (n_worlds, 1, n_objects, k) for all worlds, or (n_objects, k) for one world.
     n, size = len(row_indices), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:
@@ -140,12 +136,6 @@ def _replace_rows(
 
 @jit_eager_calls("row_indices")
 def _select_rows(poses: Array, row_indices: tuple[int, ...]) -> Array:
-    """Return positions or attitudes of the selected objects. (n, k), or (n_worlds, n, k) for all worlds
-
-    Args:
-        poses: Positions or attitudes of all objects. (n_objects, k), or (n_worlds, 1, n_objects, k) for all worlds
-        row_indices: Rows of the selected objects.
-    """
     return (poses if poses.ndim == 2 else poses[:, 0])[..., np.array(row_indices), :]
 
 
@@ -278,7 +268,6 @@ class SceneObjects:
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
-    """Return the elements that attached specs add, in the order of deletion: bodies before the assets that they use."""
     return spec.worldbody.bodies, spec.materials, spec.textures, spec.meshes, spec.hfields
 
 
@@ -323,7 +312,6 @@ def add_bodies(
 
 
 def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
-    """Return a spec or body to attach. It is loaded for every new body, because attaching may consume it."""
     if isinstance(source, mujoco.MjsBody):
         return source
     kinds = f"{', '.join(PRIMITIVES)}, an MJCF file, MJCF text, an MjSpec or a body of one"
@@ -347,7 +335,6 @@ def _load_source(source: Source) -> mujoco.MjSpec | mujoco.MjsBody:
 
 
 def _default_name(source: Source | list[Source]) -> str:
-    """Return the name of objects that are added without a name."""
     if isinstance(source, mujoco.MjsBody):
         return source.name or "object"
     if isinstance(source, mujoco.MjSpec):

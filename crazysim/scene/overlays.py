@@ -35,7 +35,6 @@ class Overlays:
     _texts: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Return the number of geoms for the next image."""
         return len(self._geoms)
 
     def line(self, points: NDArray, rgba: ArrayLike, start_size: float, end_size: float) -> None:
@@ -128,7 +127,6 @@ class Overlays:
 
 
 def _printable_text(text: str, max_length: int | None = None) -> str:
-    """Return a text after a check that MuJoCo's font can show it."""
     require(isinstance(text, str) and text, f"expected a string that is not empty as text, got {text!r}")
     unprintable = sorted({character for character in text if character != "\n" and not 32 <= ord(character) < 127})
     require(not unprintable, f"expected ASCII text, got {text!r} with {''.join(unprintable)!r}")

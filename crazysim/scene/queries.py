@@ -59,7 +59,6 @@ class SceneQueries:
     def _run(
         self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
     ) -> Any:
-        """Return the result of a query of poses; it is compiled once for each set of settings."""
         compiled_model, compiled = self._compiled
         if compiled_model is not self._scene.mj_model:
             _, compiled = self._compiled = self._scene.mj_model, {}
@@ -74,7 +73,6 @@ class SceneQueries:
             return compiled[name, *settings](*poses, mocap)
 
     def _build_contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
-        """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
         # Plugins have already moved their objects in the data.
         model, kernels = self._scene.collision_model, self._scene.ray_kernels
         platform = kernels.platform if kernels.mesh is None else None
@@ -106,7 +104,6 @@ class SceneQueries:
 
 
 def _restrict_to_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
-    """Return a function of poses that calls ``fn`` with data in which everything except the poses is None."""
     empty_data = jax.tree.map(lambda _: None, data)
 
     def query_poses(

@@ -164,7 +164,6 @@ def cast_rays(
 
 
 def _hit_points(origin: Array, direction: Array, distance: Array) -> Array:
-    """Return the points at distances along rays, m, zero where a distance is infinite. (..., 3)"""
     is_hit = jnp.isfinite(distance)[..., None]
     return jnp.where(is_hit, origin + jnp.where(is_hit, distance[..., None], 0.0) * direction, 0.0)
 
@@ -179,19 +178,6 @@ def _hit_bodies(
     direction: Array,
     ignored_rows: np.ndarray | None,
 ) -> Hits:
-    """Return earlier hits, or hits of movable bodies with equal geoms where they are nearer.
-
-    Args:
-        best: Earlier hits.
-        geoms: Geoms of each body, in its frame.
-        pos: Positions of all movable bodies, m. (..., n, 3)
-        quat: Attitudes of all movable bodies, xyzw. (..., n, 4)
-        group: For each body with these geoms, its row in ``pos`` and its index in ``Hits.names``. (k, 2)
-        origin: Origins of the rays. (..., n_rays, 3)
-        direction: Directions of the rays. (..., n_rays, 3)
-        ignored_rows: Row of the body that a ray passes through. (n_rays,)
-    """
-
     def nearer_hits_of_body(best: Hits, row: Array, body_index: Array) -> Hits:
         p, q = (jnp.take(x, row, axis=-2)[..., None, :] for x in (pos, quat))
         local_origin, local_direction = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
@@ -207,7 +193,6 @@ def _hit_bodies(
 
 
 def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the lengths of rays to a geom, and the normals where they meet it; all in the frame of ``geom.pos``."""
     local_origin = origin - jnp.asarray(geom.pos, origin.dtype)
     if geom.rot is None:
         return ray_distance(geom.shape, local_origin, direction)
@@ -219,7 +204,6 @@ def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Arr
 
 
 def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
-    """Return a constant matrix times vectors, without products with its zeros. (..., 3)"""
     x = [vectors[..., k] for k in range(3)]
     terms = [[float(m) * v for m, v in zip(row, x, strict=True) if m] for row in matrix]
     return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=-1)
@@ -237,21 +221,7 @@ def _nearer_hits(best: Hits, distance: Array, normal: Array, body_index: Array |
 def _hit_fixed_geoms(
     targets: Targets, origin: Array, direction: Array, limit: Array | float
 ) -> tuple[Array, Array, Array]:
-    """Return the first fixed geoms that rays of one world or drone meet, in a hierarchy.
-
-    A loop over the rays finds the nearest geoms without derivatives. The distances to these geoms have derivatives.
-
-    Args:
-        targets: The geoms.
-        origin: Origins of the rays, world frame, m. (n_rays, 3)
-        direction: Unit directions, world frame. (n_rays, 3)
-        limit: Distance beyond which geoms may be missed, m.
-
-    Returns:
-        Distance, m; infinite if a ray meets no geom. (n_rays,)
-        Unit normal, world frame; zero if it meets none. (n_rays, 3)
-        Index of the body, as in ``Hits.body_index``. (n_rays,)
-    """
+    # A loop over the rays finds the nearest geoms without derivatives. The distances to these geoms have derivatives.
     tables = targets.build_fixed_hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed_geoms), 0].max()]
     origins, directions = jax.lax.stop_gradient((origin, direction))
@@ -277,16 +247,6 @@ def _hit_fixed_geoms(
 def _hit_rows(
     surfaces: Sequence[Surface], codes: np.ndarray, geom_index: Array, rows: Array, origin: Array, direction: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
-    """Return the distance along each ray to its geom, and a function from distances to unit normals, world frame.
-
-    Args:
-        surfaces: ``Targets.surfaces``, at least the surfaces of the geoms.
-        codes: Index of the surface of each geom in the first column. (n, 2)
-        geom_index: Index of the geom of each ray, -1 for none. (...)
-        rows: Rows of these geoms; see ``Target.table_row``. (..., 16)
-        origin: Origins of the rays, world frame, m. (..., 3)
-        direction: Unit directions, world frame. (..., 3)
-    """
     row = [rows[..., k] for k in range(16)]
     local_origin, local_direction = ray_in_frame(row, components(origin), components(direction))
     ray_start, ray_direction = jnp.stack(local_origin, axis=-1), jnp.stack(local_direction, axis=-1)
@@ -445,12 +405,6 @@ class RayKernels:
         return hits, platform
 
     def _map_indices(self, fn: Callable[..., Any], n: int, tables: Sequence[Array]) -> tuple[list[Array], str | None]:
-        """Return the results of ``map_indices``, by a kernel if possible.
-
-        Returns:
-            The results. (n,) each
-            Platform of the kernel that computed them; None for XLA.
-        """
         if self.platform is not None and self.mesh is None:
             try:
                 return map_indices(fn, n, tables, self.platform), self.platform
@@ -462,7 +416,6 @@ class RayKernels:
 
 @jax.custom_jvp
 def _replace_derivative(value: Array, differentiable: Array) -> Array:
-    """Return ``value`` with the derivative of ``differentiable``."""
     del differentiable
     return value
 

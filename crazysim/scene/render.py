@@ -154,7 +154,6 @@ class ModelRenderer:
 
 
 def _opengl_message(error: Exception) -> str:
-    """Return why MuJoCo cannot draw; it chooses a way to draw when it is imported, from ``MUJOCO_GL``."""
     wanted = startup.refused_variables.get("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
     context = getattr(gl_context, "GLContext", None)
     if context is None or context.__module__ == gl_context.__name__:  # a placeholder
@@ -208,11 +207,8 @@ def _close_all(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[
 
 
 def _release_context() -> None:
-    """Release the OpenGL context that is current in this thread.
-
-    While a context is current in one thread, even after that thread has ended, no other thread can use or free it. The
-    garbage collector, which runs in any thread, must be able to free renderers.
-    """
+    # While a context is current in one thread, even after that thread has ended, no other thread can use or free it.
+    # The garbage collector, which runs in any thread, must be able to free renderers.
     backend = gl_context.GLContext.__module__
     if backend == "mujoco.egl":
         from OpenGL import EGL

@@ -78,22 +78,6 @@ class Scene:
         plugins: ListPlugins,
         ray_kernels: RayKernels,
     ):
-        """Build and compile the spec.
-
-        Args:
-            xml_path: MJCF scene without drones; None for floor, light and sky.
-            airframes: Airframe of each drone. (n_drones,)
-            n_worlds: Number of worlds.
-            n_drones: Number of drones per world.
-            freq: Physics steps per second, Hz.
-            device: Device of the scene of all worlds.
-            mesh: Devices over which the worlds are distributed; None for one device.
-            plugins: Function that returns the plugins of the simulation.
-            ray_kernels: Kernels that cast rays and answer contact reports.
-
-        Raises:
-            ConfigError: If the scene cannot be read or compiled.
-        """
         self.n_worlds, self.n_drones, self.device, self.mesh = n_worlds, n_drones, device, mesh
         self.drone_groups = _group_drones(airframes)
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
@@ -282,12 +266,10 @@ class Scene:
         )
 
     def _check_image_memory(self, n_cameras: int, size: tuple[int, int], bytes_per_pixel: float) -> None:
-        """Check that the images of all worlds fit into the memory of their devices."""
         n_devices = 1 if self.mesh is None else self.mesh.size
         depth.check_image_memory(self.n_worlds * n_cameras, *size, bytes_per_pixel, self.device, n_devices)
 
     def _spec_mocap_ids(self, names: Sequence[str]) -> list[int]:
-        """Return the mocap ids of bodies in the next compiled model, without compiling it."""
         ids = build.spec_mocap_ids(self.spec)
         missing_names = [name for name in names if name not in ids]
         if missing_names:
@@ -527,7 +509,6 @@ class Scene:
 
 
 def _group_drones(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
-    """Return the indices of the drones of each airframe, or a single None if all drones have the same airframe."""
     groups: dict[int, list[int]] = {}
     for k, airframe in enumerate(airframes):
         groups.setdefault(id(airframe), []).append(k)

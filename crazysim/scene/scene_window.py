@@ -32,11 +32,6 @@ class SceneWindow:
     """
 
     def __init__(self, model: mujoco.MjModel, max_geom: int, width: int, height: int):
-        """Open the window.
-
-        Raises:
-            RenderError: If there is no screen, or no window can be opened on it.
-        """
         self._model = model
         self._glfw = glfw = _load_glfw()
         # One thread cannot use an EGL context, for images in memory, together with a context of another kind.
@@ -162,7 +157,6 @@ class SceneWindow:
         )
 
     def _tile_rectangles(self, n: int) -> list[mujoco.MjrRect]:
-        """Return the rectangles of n tiles, row by row from the top left, pixels."""
         width, height = self._glfw.get_framebuffer_size(self._window)
         columns = int(np.ceil(np.sqrt(n)))
         rows = -(-n // columns)

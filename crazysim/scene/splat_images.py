@@ -110,7 +110,6 @@ def build_splat_fn(
 
 
 def _choose_renderer(renderer: Renderer, platform: str) -> Callable[..., tuple[Array, Array, Array]]:
-    """Return ``_draw_with_splax`` or ``_draw_with_jax``."""
     require(
         isinstance(renderer, str) and renderer in RENDERERS,
         f"expected renderer {' or '.join(map(repr, RENDERERS))}, got {renderer!r}",
@@ -157,7 +156,6 @@ def _draw_with_splax(
     background: np.ndarray,
     batch_size: int,
 ) -> tuple[Array, Array, Array]:
-    """Return the same as ``_draw_with_jax``. ``batch_size`` is not used, since kernels store no alphas."""
     del batch_size
     parameters = (
         gaussians.pos, jnp.minimum(gaussians.log_scale, MAX_LOG_SCALE), jnp.roll(gaussians.quat, 1, axis=-1),
@@ -201,7 +199,6 @@ def _draw_with_jax(
     background: np.ndarray,
     batch_size: int,
 ) -> tuple[Array, Array, Array]:
-    """Return colours (n, height, width, 3), depths and coverages (n, height, width) of images."""
     draw = functools.partial(_draw_image, gaussians, focal=focal, width=width, height=height, background=background)
     return jax.lax.map(draw, camera_poses, batch_size=min(batch_size, len(camera_poses[0])))
 
@@ -209,10 +206,7 @@ def _draw_with_jax(
 def _draw_image(
     gaussians: Gaussians, camera_pose: CameraPoses, focal: float, width: int, height: int, background: np.ndarray
 ) -> tuple[Array, Array, Array]:
-    """Return colour (height, width, 3), depth and coverage (height, width) of an image (Kerbl et al. 2023).
-
-    Gaussians are projected to Gaussians in the image plane (Zwicker et al. 2001) and blended from near to far.
-    """
+    # Gaussians are projected to Gaussians in the image plane (Zwicker et al. 2001) and blended from near to far.
     pos, rot = camera_pose
     order = jnp.argsort(jnp.sum((gaussians.pos - pos) * -rot[:, 2], axis=-1))
     order = jnp.pad(order, (0, -len(order) % BLOCK_SIZE), constant_values=-1).reshape(-1, BLOCK_SIZE)
@@ -249,7 +243,6 @@ def _draw_image(
 def _project(
     gaussians: Gaussians, pos: Array, rot: Array, focal: float, width: int, height: int
 ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array], Array, Array]:
-    """Return centres in the image, pixels, entries xx, xy and yy of the inverse covariances, depths, and opacities."""
     right, up, back = (rot[:, k] for k in range(3))
     offset = gaussians.pos - pos
     z = -jnp.sum(offset * back, axis=-1)
@@ -279,7 +272,6 @@ def _max_slopes(focal: float, width: int, height: int) -> tuple[float, float]:
 
 
 def _colors(gaussians: Gaussians, pos: Array) -> Array:
-    """Return the colours of Gaussians as seen from a position. (n, 3)"""
     direction = rotation.safe_normalize(gaussians.pos - pos, jnp.array([1.0, 0.0, 0.0], gaussians.pos.dtype))
     harmonics = spherical_harmonics(direction, gaussians.color.shape[1])
     colors = sum(h[:, None] * gaussians.color[:, k] for k, h in enumerate(harmonics))

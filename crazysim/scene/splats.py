@@ -59,18 +59,6 @@ class SplatScene:
         quat: ArrayLike = IDENTITY_QUAT,
         scale: float | None = None,
     ):
-        """Read the scene.
-
-        Args:
-            path: A ``.ply`` file as programs for 3D Gaussian splatting write it (Kerbl et al. 2023).
-            pos: Origin of the file's frame, world frame, m. (3,)
-            quat: Attitude of the file's frame, file to world, xyzw. (4,)
-            scale: Metres per unit of the file; None for 1, which requires an extent of the scene of 1 cm to 10 km.
-
-        Raises:
-            DamagedFileError: If the file is damaged, cut off, or of another kind.
-            ConfigError: If it does not exist, has no Gaussians or non-finite Gaussians, or has no plausible scale.
-        """
         values = _read_gaussians(path)
         points = values["pos"]
         central_points = np.percentile(points, CENTRAL_PERCENTILES, axis=0) if len(points) > 100 else points
@@ -123,7 +111,6 @@ def spherical_harmonics(direction: Any, n: int) -> list[Any]:
 
 
 def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Return the fields of ``Gaussians`` in the frame and unit of the file."""
     compressed = ConfigError(
         f"expected splats as an uncompressed .ply file, got {str(path)!r}, which is compressed. Convert it, for "
         f"example with splat-transform or SuperSplat of PlayCanvas."
@@ -169,11 +156,8 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _rotate_colors(color: NDArray, rot: NDArray) -> NDArray:
-    """Return coefficients of spherical harmonics in a frame that is turned by a rotation matrix. (n, n_colors, 3)
-
-    The colour seen along a direction d in the new frame equals the colour seen along ``rot.T @ d`` in the old frame.
-    Both are linear in the coefficients of a band, so directions that span the bands determine the new coefficients.
-    """
+    # The colour seen along a direction d in the new frame equals the colour seen along ``rot.T @ d`` in the old frame.
+    # Both are linear in the coefficients of a band, so directions that span the bands determine the new coefficients.
     n = color.shape[1]
     directions = np.random.default_rng(0).normal(size=(4 * n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

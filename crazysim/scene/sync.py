@@ -70,16 +70,12 @@ def sync_poses(poses: Poses, mjx_data: mjx.Data, mjx_model: mjx.Model) -> mjx.Da
 
 
 def _groups(poses: Poses) -> list[tuple[Array, Array, Array]]:
-    """Return mocap ids, positions and attitudes of drones, and of objects with handles."""
     drones, *objects = poses
     return [drones, *[(ids, pos[:, 0], quat[:, 0]) for ids, pos, quat in objects]]
 
 
 def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
-    """Return a model with the mocap bodies at this world's poses, if any of them has children.
-
-    MJX 3.17 applies mocap poses after it has traversed the tree, which leaves the children at the model's poses.
-    """
+    # MJX 3.17 applies mocap poses after it has traversed the tree, which leaves the children at the model's poses.
     mocap = np.flatnonzero(mjx_model.body_mocapid >= 0)
     if not np.isin(mjx_model.body_parentid, mocap).any():
         return mjx_model

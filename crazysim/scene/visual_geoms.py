@@ -81,10 +81,7 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualG
 
 
 def _geom_color(model: mujoco.MjModel, geom: int) -> NDArray:
-    """Return the colour of a geom, RGBA. (4,)
-
-    For a geom of the default colour it is the colour of the material times the mean colour of the texture.
-    """
+    # For a geom of the default colour it is the colour of the material times the mean colour of the texture.
     material = int(model.geom_matid[geom])
     if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
         return model.geom_rgba[geom].astype(float)

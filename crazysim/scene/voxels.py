@@ -33,7 +33,6 @@ def count_candidates(corners: NDArray, resolution: float) -> int:
 
 
 def _voxel_range(corners: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first voxel of the box around each triangle, and the number of its voxels along each axis. (n, 3)"""
     first = np.floor(corners.min(axis=1) + 0.5).astype(np.int64)
     return first, np.floor(corners.max(axis=1) + 0.5).astype(np.int64) - first + 1
 
@@ -67,12 +66,10 @@ def voxels_of_triangles(corners: NDArray, resolution: float) -> NDArray[np.int64
 
 
 def _meets_cube(corners: NDArray) -> NDArray[np.bool_]:
-    """Return True for triangles that meet the cube of edge 1 around the origin. (n, 3, 3) -> (n,)"""
     n = len(corners)
     near = np.arange(len(corners))
 
     def reject(axis: NDArray) -> None:
-        """Leave out triangles that an axis separates from the cube."""
         nonlocal corners, near
         projections = np.einsum("nkc,nc->nk", corners, axis)
         half_width = np.abs(axis).sum(axis=1) * (0.5 + TOLERANCE) + TOLERANCE
@@ -111,7 +108,6 @@ def merge_voxels(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _merge_along(boxes: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
-    """Return boxes after joining neighbours along an axis that have the same cross section. (n, 6) -> (m, 6)"""
     other_columns = [k for k in range(6) if k % 3 != axis]
     order = np.lexsort((boxes[:, axis], *boxes[:, other_columns].T))
     boxes = boxes[order]

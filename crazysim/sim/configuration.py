@@ -177,7 +177,6 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
 
 
 def _check_fields(name: str, record: Any, reference: Any, fields: Sequence[str]) -> None:
-    """Check that fields of a record are arrays with the same last axis and kind of numbers as in a reference."""
     for field in fields:
         value, expected = getattr(record, field, None), getattr(reference, field, None)
         if value is expected:
@@ -195,7 +194,6 @@ def _check_fields(name: str, record: Any, reference: Any, fields: Sequence[str])
 
 
 def _describe_leaf(leaf: Any) -> str:
-    """Return shape and type of an array for a message."""
     has_type = hasattr(leaf, "shape") and hasattr(leaf, "dtype")
     return f"an array of shape {leaf.shape} and type {leaf.dtype}" if has_type else short_repr(leaf)
 
@@ -210,7 +208,6 @@ def describe_data(data: SimData) -> str:
 
 
 def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, is_fitted: bool) -> str:
-    """Return the settings of data for a message."""
     dynamics = "fitted" if is_fitted else "first-principles"
     return (
         f"{n_worlds} worlds of {n_drones} drones at {freq} Hz with {control.value!r} commands and {dynamics} dynamics"

@@ -87,7 +87,6 @@ def render_depth(
 
 
 def _select_in_worlds(mask: Any, new: Any, old: Any) -> Array:
-    """Check the mask, and return new values in its worlds and old values elsewhere."""
     new = jnp.asarray(new)
     n_worlds = np.broadcast_shapes(new.shape, np.shape(old))[:1]
     return select_worlds(as_mask(mask, n_worlds), new, old)

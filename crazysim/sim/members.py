@@ -56,7 +56,6 @@ class Member:
     """Name of its population; ``"drone"`` for a drone."""
 
     def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage_command: StageCommand):
-        """Create the view; ``index`` is the row in the arrays of drones or members, ``plugin`` is None for a drone."""
         self._sim, self.name, self.index, self._plugin, self._stage_command = sim, name, index, plugin, stage_command
         self.population, self.lock = DRONE_POPULATION if plugin is None else plugin.name, sim.lock
 
@@ -111,7 +110,6 @@ class Member:
         self._stage_command(staged_command, *feedforward)
 
     def _pad_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
-        """Return rotor speeds padded with zeros for the rotors that this drone lacks."""
         n_own_rotors = self._sim.airframes[self.index].n_rotors
         if np.shape(command)[-1:] != (n_own_rotors,) or n_own_rotors == n_rotors:
             return command
@@ -146,7 +144,6 @@ class Member:
 
 
 def _read_row(x: Array | NDArray, index: int) -> Any:
-    """Return the row of one drone or member. (n_worlds, ...)"""
     if isinstance(x, np.ndarray):
         return x[:, index]
     if is_on_host(x) and not jaxcompat.is_key(x):
@@ -155,10 +152,7 @@ def _read_row(x: Array | NDArray, index: int) -> Any:
 
 
 def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
-    """Return an array with the row of one drone or member replaced. (n_worlds, n, ...)
-
-    The result is a NumPy array if ``x`` is on the host and ``value`` is not a JAX array.
-    """
+    # The result is a NumPy array if ``x`` is on the host and ``value`` is not a JAX array.
     if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
         rows[:, index] = value

@@ -29,13 +29,6 @@ class Reset:
         self._compiled = jax.jit(self.plain)
 
     def __call__(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
-        """Return the data after a reset.
-
-        Args:
-            data: The simulation.
-            default_data: The data to return to.
-            mask: True in the worlds to reset; None for all. (n_worlds,)
-        """
         require_data(data)
         require_data(default_data)
         shared_records = data.plugins.keys() & default_data.plugins.keys()
@@ -79,5 +72,4 @@ class Reset:
         return self._compiled.lower(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
 
     def _cache_size(self) -> int:
-        """Return the number of compiled programs, as for a jitted function, for tests that nothing is retraced."""
         return jaxcompat.n_compilations(self._compiled)

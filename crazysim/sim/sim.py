@@ -112,44 +112,6 @@ class Sim:
         aero: str | None = None,
         plugins: Sequence[Plugin] = (),
     ):
-        """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
-
-        Args:
-            n_worlds: Number of worlds.
-            n_drones: Number of drones in each world.
-            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe; or a list of these, one for each
-                drone. The length of a list replaces an ``n_drones`` of 1.
-            dynamics: Dynamics model.
-            control: Command level.
-            integrator: Integration scheme.
-            freq: Physics steps per second, Hz.
-            state_freq: Rate of the state controller, Hz. None for the largest divisor of ``freq`` up to 100 Hz for the
-                controllers ``"auto"``, ``"pid"`` and ``"crazyflow"``, and up to 500 Hz for others.
-            attitude_freq: Rate of the attitude controller, Hz; None for the largest divisor of ``freq`` up to 500 Hz.
-            body_rate_freq: Rate of the body-rate controller, Hz; None as for ``attitude_freq``.
-            force_torque_freq: Rate of the allocation, Hz; None as for ``attitude_freq``.
-            device: Device of the data: a platform such as ``"cpu"`` or ``"gpu"``, or a device.
-            xml_path: MJCF scene; None for floor, light and sky.
-            rng_key: Seed, or a key.
-            mesh: Devices over which the worlds are distributed, from ``crazysim.engine.sharding.world_mesh``.
-            engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` selects the fastest that
-                can run the step pipeline here, which ``explain`` names.
-            strict: True to raise an error instead of using a slower engine with a warning.
-            controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
-                ``crazysim.control.controllers.CONTROLLERS``, such as ``"crazyflow"`` for the cascade of Crazyflow, or a
-                ``crazysim.control.Controller``; or a list of several. The rates above replace the controller's rates.
-            switch: Index of the controller in use, for a list of controllers: a function
-                ``(state, setpoint, time) -> index`` of one drone, or indices, () or (n_worlds, n_drones).
-            estimator: Filter that provides the state for the controllers: ``"kalman"``, with an ``IMU`` and a
-                ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with its
-                sensors, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state. The
-                sensors and the estimator are added before ``plugins``.
-            aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
-                for the dynamics model only. Shorthand for ``Residual()`` before ``plugins``.
-            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. If the initial
-                state of a plugin depends on the drones' poses, such as that of a load, place the drones first, and then
-                call ``add``.
-        """
         require_unforked_process()
         rates = {
             Control.state: state_freq,
@@ -198,7 +160,6 @@ class Sim:
             self.add(plugin)
 
     def _use_scene(self, scene: Scene) -> None:
-        """Replace the scene of a new simulation by another with its drones, and the data by data with its objects."""
         self._scene, self._queries, self._adopted_revision = scene, SceneQueries(scene), scene.revision
         self.build_data()
         self._default_data = self._stepper.data
@@ -248,7 +209,6 @@ class Sim:
         return sim
 
     def __getstate__(self) -> Any:
-        """Refuse to be pickled or copied: compiled programs, locks and MuJoCo's scene cannot be."""
         raise TypeError(
             "expected an object that can be pickled or copied, got a simulation, or an environment with one. Make it "
             "again with the same settings, and pickle or copy its data: sim.data, or the state of an environment."
@@ -273,11 +233,6 @@ class Sim:
 
     @check_arguments
     def __getitem__(self, name: str) -> Member:
-        """Return a view of a drone or member by its name, to read and to command: ``sim["Crazyflie_0"].pos``.
-
-        Raises:
-            UnknownNameError: If there is none of that name.
-        """
         return find_member(self, self.plugins, name, self._stepper.stage_command)  # type: ignore[arg-type]  # as in __init__
 
     # Data -------------------------------------------------------------------------------------------------------------
@@ -309,10 +264,7 @@ class Sim:
         self._default_data = self._stepper.put_on_device(self._adapt_to_scene(data))
 
     def _adopt_scene(self) -> None:
-        """After an edit of the scene, update objects and mocap ids in the data, and the plugins that read the scene.
-
-        Only these plugins compile the scene.
-        """
+        # Only these plugins compile the scene.
         if self._adopted_revision == self._scene.revision and not self.plugins.is_stale:
             return
         with self.lock, jax.ensure_compile_time_eval():  # keeps arrays from becoming tracers inside a user's trace
@@ -324,7 +276,6 @@ class Sim:
             self.plugins.refresh()
 
     def _adapt_to_scene(self, data: SimData) -> SimData:
-        """Return data that may be from before an edit of the scene with the present objects and records."""
         if object_names(data) != object_names(self._default_data):
             data = self._update_objects(data)
         return self.plugins.adapt_records(data, self._default_data)
@@ -698,7 +649,6 @@ class Sim:
             self._stepper.set_synced(True)
 
     def _data_with_moved_objects(self) -> SimData:
-        """Return the data with the objects of plugins, such as loads, at their poses."""
         return self.plugins.with_moved_objects(self.data)
 
     @locked

@@ -39,14 +39,6 @@ class Stepper:
     """The compiled step, from ``build``."""
 
     def __init__(self, device: jax.Device, mesh: Mesh | None, engine: str, strict: bool):
-        """Create a stepper that has neither data nor a step; ``assign`` and ``build`` set them.
-
-        Args:
-            device: Device of the data.
-            mesh: Devices to distribute the data over instead; None to hold it on ``device``.
-            engine: One of ``crazysim.engine.ENGINES``.
-            strict: As for ``Step``.
-        """
         self.device, self.mesh, self.engine, self.strict = device, mesh, engine, strict
         self._data: SimData | FlatData | None = None
         self._shapes: tuple[Plan, SimData] | None = None
@@ -192,7 +184,6 @@ class Stepper:
         self._max_step_count += n_steps
 
     def _as_array(self, n_steps: int) -> Array:
-        """Return a number of steps as an array; arrays are cached, because making one takes longer than a step."""
         if n_steps not in self._step_counts:
             with jax.default_device(self.device):
                 self._step_counts[n_steps] = jnp.int32(n_steps)
@@ -200,7 +191,6 @@ class Stepper:
 
 
 def _require_values(*values: Any) -> None:
-    """Check that arrays are not traced: they would stay in the simulation after the trace."""
     require(
         not is_traced(values),
         "expected arrays with values, got traced ones, of a function inside jit, grad or vmap, which a simulation "

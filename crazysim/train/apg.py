@@ -54,7 +54,6 @@ class Config:
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_hyperparameters(self)
 
 
@@ -129,7 +128,6 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         return jax.lax.with_sharding_constraint(copies, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))
 
     def loss(policies: Layers) -> tuple[Array, Any]:
-        """Sum the losses of all seeds. The gradient is the stack of the gradients of all copies."""
         copies = Policy(copy(agents.stats), policies)
         state, _, records = rollout_seeds(
             env, initial_state, act, record, (copies,), copy(agents.key), configs[0].n_steps

@@ -169,7 +169,6 @@ class TrainConfig:
     files of a run do not hold them: a resumed run may use other devices."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         require(
             isinstance(self.algorithm, str) and self.algorithm in ALGORITHMS,
             f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}",
@@ -312,7 +311,6 @@ class TrainConfig:
 
 
 def _is_same_setting(x: Any, y: Any) -> bool:
-    """Return True if two values of a setting have the same JSON, in which lists and tuples do not differ."""
     try:
         return json.dumps(x) == json.dumps(y)
     except (TypeError, ValueError):

@@ -108,7 +108,6 @@ def convolve(layers: Sequence[tuple[Array, Array]], image: Array) -> Array:
 
 
 def _patches(x: Array) -> Array:
-    """Return the patches of an image. (height, width, n) -> (height / 2, width / 2, 9 n), rounded up"""
     height, width = x.shape[:2]
     padded = jnp.pad(x, ((1, 1), (1, 1), (0, 0)))
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)

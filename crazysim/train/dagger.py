@@ -79,7 +79,6 @@ class Config:
     """Largest global norm of a gradient; larger ones are scaled down to it."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_hyperparameters(self)
         if self.teacher:  # so that the run can be resumed from any folder
             object.__setattr__(self, "teacher", str(Path(self.teacher).resolve()))
@@ -131,13 +130,6 @@ class TeacherObservation(Wrapper):
     """Add the teacher's observations, ``teacher NAME``, to the student's."""
 
     def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
-        """Wrap the student's environment.
-
-        Args:
-            env: Environment without automatic resets.
-            observe: Function from the true data to the teacher's observations: of one world, or of all worlds if the
-                task of the environment is batched.
-        """
         super().__init__(env)
         self.observe, self.batched = observe, env.task.batched
 
@@ -320,7 +312,6 @@ def split_obs(obs: Obs) -> tuple[Obs, Obs]:
 
 
 def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
-    """Return the result of ``load_policy`` for a teacher's folder; the error for a missing folder names the teacher."""
     from crazysim.train.training import load_policy
 
     require(
@@ -332,7 +323,6 @@ def _load_teacher_run(folder: str) -> tuple[Policy, Any, dict[str, Any]]:
 
 
 def _check_teacher(teacher: Any, env: Env, teacher_obs: Obs, folder: str) -> None:
-    """Check that a teacher acts on its observations, and with the meaning of the student's actions."""
     require(
         not isinstance(teacher, Policy) or not teacher.has_memory,
         "expected a teacher without memory, got one with a memory. Train the teacher with memory=0.",

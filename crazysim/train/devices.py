@@ -177,7 +177,6 @@ def exchanged_bytes(program: str) -> dict[str, int]:
 
 
 def _read_devices(devices: Devices) -> int | tuple[int, ...] | None:
-    """Return a number of devices, or the indices of devices; None for all devices."""
     if devices == "all":
         return None
     try:

@@ -40,7 +40,6 @@ class _FunctionPolicy(PyTree):
     """Function from observations to actions."""
 
     def __call__(self, obs: Obs) -> Array:
-        """Return the actions for observations."""
         return self.fn(obs)
 
 
@@ -110,10 +109,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
     last_step = jnp.minimum(jnp.arange(env.max_steps)[:, None], was_over.shape[0] - was_over.sum(axis=0) - 1)[..., None]
 
     def split_blocks(x: Array) -> Array:
-        """Return an array with an additional axis of blocks.
-
-        (n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)
-        """
+        # (n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)
         return x.reshape(x.shape[0], n_blocks, -1, x.shape[-1])
 
     flight = {
@@ -177,7 +173,6 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
 
 
 def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
-    """Return the metrics of ``evaluate`` for the worlds of a block."""
     has_own_criterion = "succeeded" in flight
     n_final_steps = 1 if has_own_criterion else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over_by_step = flight["over"][:, worlds]

@@ -201,7 +201,6 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
 def _add_convolutions(
     add_node: Callable[..., str], constants: dict[str, Any], numbers: PolicyNumbers, normalized: str
 ) -> str:
-    """Add the nodes that replace images by features, and return the name of their output."""
     constants |= {"axis": np.array([1]), "one_metre": np.float32(1.0), "flat": np.array([0, -1])}
 
     def add_slice(source: str, indices: range) -> str:
@@ -293,7 +292,6 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
 
 def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
-    """Return the numbers of a policy after a check of their sizes and values."""
     require_type(policy, Policy, POLICY_REMEDY)
     described = Interface.read(meta)
     if policy.interface is not None:
@@ -332,7 +330,6 @@ def _action_units(actions: Mapping[str, Any]) -> list[str]:
 
 
 def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines that describe inputs and outputs."""
     if meta.get("freq") is not None:
         yield f"Policy of the task {meta['task']}, {meta['freq']} actions per second."
     yield "Observation, concatenated:"
@@ -352,7 +349,6 @@ def _description_lines(meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
-    """Yield the lines of the body of the C function."""
     n_inputs, n_memory, limit = numbers.n_inputs, numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_inputs + n_memory}];"
     offset = 0
@@ -392,7 +388,6 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
 
 
 def _convolution_lines(name: str, i: int, image: Image, layers: Sequence[Any], offset: int) -> Iterator[str]:
-    """Yield the lines that write the features of an image into ``x0``, from index ``offset`` on."""
     shapes = list(image.shapes([len(bias) for _, bias in layers]))
     yield f"float image{i}_0[{len(image.pixels)}];"
     yield f"for (int p = 0; p < {len(image.pixels)}; ++p) {{"

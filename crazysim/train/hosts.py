@@ -44,7 +44,6 @@ def require_same_settings(settings: Mapping[str, Any]) -> None:
 
 
 def _require_same_values(kind: str, values: Mapping[str, Any], remedy: str) -> None:
-    """Check that all hosts have the same values by name."""
     hosts = jaxcompat.connected_hosts()
     if hosts is None:
         return
@@ -59,7 +58,6 @@ def _require_same_values(kind: str, values: Mapping[str, Any], remedy: str) -> N
 
 
 def _exchange_texts(text: str, hosts: jaxcompat.Hosts) -> list[str]:
-    """Return the texts of all hosts, in the order of the hosts. The coordinator transfers them, not the devices."""
     client, host_id, n_hosts = hosts
     folder = f"crazysim/exchange-{next(_exchange_numbers)}"
     client.key_value_set(f"{folder}/{host_id}", text)

@@ -313,11 +313,8 @@ class DistributedMlp(NamedTuple):
     """The devices."""
 
     def __call__(self, layers: Layers, x: Array) -> Array:
-        """Return the outputs, (..., n_out), for inputs (n_steps, n_groups, k, n_drones, n_in) or (n_worlds, ..., n_in).
-
-        A minibatch of PPO has the five axes, with k worlds of each group. The groups of a minibatch, or the
-        worlds of other inputs, are distributed; if the devices do not divide them, XLA computes the outputs.
-        """
+        # A minibatch of PPO has the five axes, with k worlds of each group. The groups of a minibatch, or the worlds of
+        # other inputs, are distributed; if the devices do not divide them, XLA computes the outputs.
         axis = 1 if x.ndim == 5 else 0
         if x.shape[axis] % self.mesh.size:
             return mlp(layers, x)
@@ -348,8 +345,6 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
 
 
 def _make_launcher(is_gradient: bool) -> Callable[..., Array]:
-    """Return ``_launch`` for the network of one seed; ``jax.vmap`` over seeds launches one kernel for all of them."""
-
     @jaxcompat.custom_vmap
     def run(*args: Any) -> Array:
         return _launch(is_gradient, *_add_seed_axis(1, None, *args))[0]
@@ -366,7 +361,6 @@ _compute_outputs, _compute_gradients = _make_launcher(False), _make_launcher(Tru
 
 @jax.custom_vjp
 def _apply(layers: Layers, x: Array) -> Array:
-    """Return outputs, (n, n_out), for inputs (n, n_in)."""
     return _compute_outputs(layers, x)
 
 
@@ -389,8 +383,6 @@ _apply.defvjp(_forward, _backward)
 
 
 def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
-    """Return the arguments with a first axis of seeds; arguments that are True in ``batched`` already have it."""
-
     def stack(x: Array, is_stacked: bool = False) -> Array:
         return x if is_stacked else jnp.broadcast_to(x, (n_seeds, *x.shape))
 
@@ -398,17 +390,6 @@ def _add_seed_axis(n_seeds: int, batched: Any, *args: Any) -> Any:
 
 
 def _launch(is_gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> Array:
-    """Return the results of a kernel for the networks of all seeds.
-
-    Args:
-        is_gradient: True for the kernel of gradients, False for the kernel of outputs.
-        layers: Weights (n_seeds, n_in, n_out) and biases (n_seeds, n_out).
-        x: Inputs. (n_seeds, n, n_in)
-        cotangent: For gradients, their scale, (n_seeds,), and the gradients of the outputs, (n_seeds, n, n_out).
-
-    Returns:
-        Outputs, (n_seeds, n, n_out), or gradients of all weights, summed by blocks, (n_seeds, n_blocks, n_weights).
-    """
     (n_seeds, n, _), sizes = x.shape, _layer_sizes(layers)
     source, shared_bytes = cuda_source(sizes, is_gradient)
     n_warps, blocks_per_multiprocessor = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
@@ -421,7 +402,6 @@ def _launch(is_gradient: bool, layers: Layers, x: Array, *cotangent: Array) -> A
 
 
 def _run_kernel(source: str, name: str, grid: tuple[int, ...], arrays: list[Any], result: Any) -> Array:
-    """Return the result of a kernel; ``grid`` is blocks along x and y, threads per block, shared bytes per block."""
     names = ("grid_x", "grid_y", "block_x", "shared_mem_bytes", "grid_z", "block_y", "block_z")
     integers: dict[str, Any] = {name: np.int32(x) for name, x in zip(names, (*grid, 1, 1, 1), strict=True)}
     code = cuda.compile_source(INTRINSICS + source, f"compute_{CAPABILITY}", "PTX").decode()
@@ -430,5 +410,4 @@ def _run_kernel(source: str, name: str, grid: tuple[int, ...], arrays: list[Any]
 
 
 def _layer_sizes(layers: Layers) -> tuple[int, ...]:
-    """Return the number of inputs, the sizes of the hidden layers and the number of outputs."""
     return layers[0][0].shape[-2], *(weight.shape[-1] for weight, _ in layers)

@@ -127,7 +127,6 @@ class Gru(PyTree):
     """Biases. (3 n_memory,)"""
 
     def __call__(self, obs: Array, memory: Array) -> Array:
-        """Return the memory after a step. (n_memory,)"""
         reset_x, update_x, candidate_x = jnp.split(obs @ self.inputs + self.bias, 3)
         reset_h, update_h, candidate_h = jnp.split(memory @ self.recurrent, 3)
         update = jax.nn.sigmoid(update_x + update_h)
@@ -146,8 +145,6 @@ def gru_network(size: int) -> Network:
 
 @functools.cache
 def _gru_network(size: int, dtype: np.dtype) -> Network:
-    """Return the network of ``gru_network``: the same object for the same size and dtype of the memory."""
-
     def init(key: Array, n_obs: int) -> Gru:
         k_inputs, k_recurrent = jax.random.split(key)
         ((inputs, bias),) = init_mlp(k_inputs, (n_obs, 3 * size), 1.0)
@@ -173,8 +170,6 @@ class Encoder(PyTree):
 
 @functools.cache
 def _convolution_network(channels: tuple[int, ...], images: tuple[Image, ...], base: Network) -> Network:
-    """Return a network that replaces images by features of convolutions, and then applies the network ``base``."""
-
     def init(key: Array, n_obs: int) -> Encoder:
         keys = jax.random.split(jax.random.fold_in(key, 2), (len(images), len(channels)))
         convolutions = tuple(
@@ -318,7 +313,6 @@ def unroll(
 
 
 def _batch_apply(network: Network, weights: Weights, n_axes: int) -> Callable[[Array, Any], tuple[Array, Any]]:
-    """Return ``network.apply`` with its weights, mapped over ``n_axes`` leading axes of observations and memory."""
     apply: Any = functools.partial(network.apply, weights.body)
     for _ in range(n_axes):
         apply = jax.vmap(apply)
@@ -349,11 +343,6 @@ class Policy(PyTree):
         return self.network.has_memory
 
     def __call__(self, obs: dict[str, Array]) -> Array:
-        """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)
-
-        Raises:
-            ConfigError: If the policy has a memory, or was trained with observations of other names or sizes.
-        """
         require(
             not self.has_memory,
             "expected a memory besides the observations, got none for a policy that has one. Use action, memory = "
@@ -401,7 +390,6 @@ class Policies(PyTree):
         return self.policies.interface
 
     def __call__(self, obs: dict[str, Array]) -> Array:
-        """Return the action, between -1 and 1, for observations. (n_worlds, n_drones, n_obs) -> (..., n_actions)"""
         return self._map_seeds(lambda policy, obs: policy(obs), obs)
 
     def act(self, obs: dict[str, Array], memory: Any) -> tuple[Array, Any]:

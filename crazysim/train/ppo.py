@@ -70,7 +70,6 @@ class Config:
     """Initial standard deviation of the actions."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_hyperparameters(self)
 
     @property

@@ -248,11 +248,6 @@ def _train_variants(
     options: Mapping[str, Any],
     on_iteration: Callable[[int, dict[str, Any]], None] | None,
 ) -> tuple[Path, dict[str, TrainConfig], dict[str, TrainResult]]:
-    """Train the teacher of the recipe if it has one, and then the variants, with ``options`` of ``train_many``.
-
-    Returns:
-        The folder of the run, and configurations and results by the name of the variant.
-    """
     first_seed, _ = next(iter(variants.values()))
     config = TrainConfig.create(task, **{**settings, "seed": first_seed})
     folder = Path("out") / config.title if folder is None else as_path(folder)
@@ -270,14 +265,6 @@ def _train_variants(
 
 
 def _train_teacher(student: TrainConfig, folder: Path, resume: bool, options: Mapping[str, Any]) -> bool:
-    """Train the teacher of a student's recipe; return False if there is none, or if the student has begun.
-
-    Args:
-        student: Configuration of the student.
-        folder: Folder of the student's run.
-        resume: True to continue an interrupted run, of the teacher or of the student.
-        options: Further options of ``train``.
-    """
     teacher = student.teacher_config()
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
         return False
@@ -296,14 +283,12 @@ def _train_teacher(student: TrainConfig, folder: Path, resume: bool, options: Ma
 
 
 def _check_student(student: TrainConfig) -> None:
-    """Raise the errors of a student's settings, which would otherwise be raised after its teacher has been trained."""
     env = student.make_training_env()
     if student.config["convolution"]:
         images_of(env, jax.eval_shape(env.reset, jax.random.key(0)).obs)
 
 
 def _check_settings(settings: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Check the names of the settings of ``TrainConfig.create``."""
     if unknown := settings.keys() - set(names):
         raise ConfigError(
             f"expected settings among {', '.join(names)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "

@@ -162,7 +162,6 @@ def plot_episode(
 
 
 def _use_log_scale(axis: Any) -> None:
-    """Make the vertical axis logarithmic if all values are positive; the error of a finished race is zero."""
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines] or [np.zeros(0)])
     values = values[np.isfinite(values)]
     if len(values) and (values > 0).all():
@@ -172,11 +171,6 @@ def _use_log_scale(axis: Any) -> None:
 
 
 def _make_figure(n: int) -> Any:
-    """Return a figure and the axes of ``n`` panels in a row.
-
-    Raises:
-        ImportError: If matplotlib is not installed.
-    """
     try:
         import matplotlib
 
@@ -191,7 +185,6 @@ def _make_figure(n: int) -> Any:
 
 
 def _save_figure(figure: Any, path: Path) -> None:
-    """Write a figure and close it."""
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -49,7 +49,6 @@ def task_digest(task: type[Task]) -> str | None:
 
 
 def _values_used_by(function: Any, task: type[Task]) -> Iterator[tuple[str, Any]]:
-    """Yield the globals, names of modules, closed-over values and methods of the task that a function refers to."""
     if not isinstance(function, FunctionType):
         return
     names = _names(function.__code__)
@@ -70,7 +69,6 @@ def _names(code: CodeType) -> set[str]:
 
 
 def _is_own(module_name: str, libraries: set[str]) -> bool:
-    """Return True for modules of crazysim and of the task's package, and for files that are not installed."""
     root, file = module_name.partition(".")[0], getattr(sys.modules.get(module_name), "__file__", None)
     return root in libraries or (file is not None and root not in sys.stdlib_module_names and "-packages" not in file)
 

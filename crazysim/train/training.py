@@ -289,7 +289,6 @@ class _Run:
         return learner.as_policy().replace(interface=Interface.read(self.description))
 
     def _evaluate_policies(self, policies: Policy, key: Array | None) -> list[dict[str, float]]:
-        """Return the metrics of each training's policy. The policies are host arrays, so slices need no compilation."""
         n_trainings, device = len(self.trainings), self.eval_env.sim.device
         policy = take_seed(policies, 0) if n_trainings == 1 else Policies(policies)
         return evaluate_blocks(self.eval_env, jax.device_put(policy, device), key, n_trainings)
@@ -337,7 +336,6 @@ class _Run:
         self.saved_iteration, self.save_time = int(self.learner.iteration), time.perf_counter()
 
     def _mark_diverged(self, metrics: dict[str, Array], iteration: int) -> None:
-        """Mark the trainings that have diverged in an iteration; raise an error if all have."""
         finite = np.asarray(metrics.get("finite", np.full(len(self.trainings), True)))
         for training, is_finite in zip(self.trainings, finite, strict=True):
             if not is_finite and training.divergence_iteration is None:
@@ -489,7 +487,6 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _host_metrics(metrics: dict[str, Array], evaluation: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return the metrics of an iteration and of an evaluation after it: numbers, or arrays for several trainings."""
     numbers = {name: x for name, x in jax.device_get(metrics).items() if x.dtype != bool}
     numbers |= {f"evaluation {name}": x for name, x in evaluation.items() if name != "iteration"}
     return {name: float(x[0]) if len(x) == 1 else x for name, x in numbers.items()}
@@ -569,7 +566,6 @@ def load_policy(
 
 
 def _run_metadata(config: TrainConfig) -> dict[str, Any]:
-    """Return the metadata of the files of a run."""
     stored_fields = [f.name for f in dataclasses.fields(config) if f.name not in ("network", "devices")]
     settings = {name: getattr(config, name) for name in stored_fields}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
@@ -597,11 +593,6 @@ def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
 def _read_run(
     path: Path, metadata: Mapping[str, dict[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
-    """Return the contents of a checkpoint: arrays, metadata by training, hash of the task's code, and time so far, s.
-
-    Raises:
-        ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
-    """
     arrays, meta = checkpoint.read(path)
     with checkpoint.wrap_checkpoint_errors(path):
         require(
@@ -622,7 +613,6 @@ def _read_run(
 
 
 def _require_same_settings(path: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:
-    """Check that the settings of a stored run equal others, except for settings that may change."""
     has_own_network = stored.get("own_network", False)
     require(
         has_own_network == requested["own_network"],
@@ -641,7 +631,6 @@ def _require_same_settings(path: Path, stored: dict[str, Any], requested: dict[s
 
 
 def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings, options and hyperparameters that a resumed run must keep, by name."""
     location, name = split_reference(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
     run_settings = {k: x for k, x in settings.items() if k not in ("options", "config")}
     hyperparameters = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}
@@ -650,7 +639,6 @@ def _fixed_settings(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **other_settings: Any) -> None:
-    """Check that all hosts have the same settings of each training, by its name, and the same other settings."""
     runs = {
         name: _fixed_settings(x["settings"]) | x["settings"]["config"] | {"code": x["code"]}
         for name, x in metadata.items()
@@ -661,7 +649,6 @@ def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **other_setti
 
 @contextmanager
 def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows metrics on a progress bar; it does nothing if not ``enabled``, or without tqdm."""
     bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None

@@ -130,7 +130,6 @@ def _lower_bounds(
     min_distances: Floats,
     closest_times: Floats,
 ) -> Floats:
-    """Return a lower bound of the distance in each cell; update the least distance and time of each pair in place."""
     start, end, acc, jerk = (a - b for a, b in zip(motion_i[:4], motion_j[:4], strict=True))
     deviation = dt**2 / 8 * (_norm(acc) + dt / 2 * _norm(jerk)) + motion_i[4] + motion_j[4]
     step = end - start

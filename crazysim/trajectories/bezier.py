@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 @lru_cache
 def _power_matrix(degree: int) -> NDArray:
-    """Return the matrix that converts control points to power coefficients. (degree + 1, degree + 1)"""
     orders = range(degree + 1)
     return np.array([[(-1) ** (j + i) * comb(degree, j) * comb(j, i) for i in orders] for j in orders], float)
 

@@ -87,17 +87,6 @@ def fill_in_corridors(
 
 
 def _height_half_spaces(coefficients: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
-    """Return the half-spaces that are bounded by a height, at the times at which curves are farthest beyond it.
-
-    Args:
-        coefficients: Coefficients of z. (n_pieces, degree + 1)
-        limit: Height, m.
-        sign: 1 for the largest height, -1 for the smallest.
-
-    Returns:
-        Pieces, times within them, normals, and bounds of ``normal . pos``. (n,), (n,), (n, 3), (n,)
-    """
-
     def height_excess(piece: np.ndarray, u: Floats) -> Floats:
         return sign * (
             np.einsum("n...k,nk->n...", u[..., None] ** np.arange(coefficients.shape[-1]), coefficients[piece]) - limit
@@ -110,17 +99,6 @@ def _height_half_spaces(coefficients: Floats, limit: float, sign: int) -> tuple[
 
 
 def _deviation(coefficients: Floats, start: Floats, end: Floats, u: Floats) -> Deviations:
-    """Return the vectors from line segments to curves, the nearest points on the segments, and the vectors' lengths.
-
-    Args:
-        coefficients: Coefficients of x, y and z. (n, 3, degree + 1)
-        start: First points of the segments, m. (n, 3)
-        end: Last points, m. (n, 3)
-        u: Time within each piece over its length. (n,) or (n, n_times)
-
-    Returns:
-        Vectors and points: (n, 3) or (n, n_times, 3) each; lengths: (n,) or (n, n_times).
-    """
     u, segment = np.asarray(u), end - start
     shape = (len(u), *[1] * (u.ndim - 1), 3)
     start, segment = start.reshape(shape), segment.reshape(shape)
@@ -132,12 +110,6 @@ def _deviation(coefficients: Floats, start: Floats, end: Floats, u: Floats) -> D
 
 
 def _find_maxima(quantity: Callable[[np.ndarray, Floats], Floats], thresholds: Floats) -> tuple[np.ndarray, Floats]:
-    """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
-
-    Args:
-        quantity: Function from pieces (n,) and times within them (n, n_times) to the quantity (n, n_times).
-        thresholds: Threshold of each piece; maxima that do not exceed it are left out. (n_pieces,)
-    """
     samples = np.linspace(0.0, 1.0, N_SAMPLES)
     sampled_values = quantity(np.arange(len(thresholds)), np.broadcast_to(samples, (len(thresholds), N_SAMPLES)))
     padded = np.pad(sampled_values, ((0, 0), (1, 1)), constant_values=-np.inf)

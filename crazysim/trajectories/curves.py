@@ -201,7 +201,6 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
 
 
 def _resolve_period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
-    """Return ``period``, s, or ``length``, m, divided by ``speed``; the default period if both are None."""
     require(
         period is None or speed is None,
         f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.",

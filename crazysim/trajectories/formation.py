@@ -99,7 +99,6 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
 
 
 def _rotate_and_translate(level_pos: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
-    """Return level positions, (n, 2), rotated around the origin and moved to a centre. (n, 3)"""
     angle, middle = float(require_vector("yaw", yaw, ())), require_vector("center", center)
     cos, sin = math.cos(angle), math.sin(angle)
     return np.pad(level_pos @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + middle

@@ -38,7 +38,6 @@ def hermite_basis(order: int) -> Floats:
 
 @functools.cache
 def _exact_basis(order: int) -> list[list[Fraction]]:
-    """Return the rows of ``hermite_basis`` as exact fractions; each column is a polynomial."""
     k = order
     columns = []
     for j in range(k):
@@ -70,7 +69,6 @@ def unit_cost(order: int) -> Floats:
 
 
 def _duration_exponents(order: int) -> NDArray[np.int64]:
-    """Return the exponents of the duration in the factors that scale ``unit_cost``. (2k, 2k)"""
     j = np.tile(np.arange(order), 2)
     return 1 - 2 * order + j[:, None] + j
 
@@ -106,7 +104,6 @@ def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
 
 
 def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:
-    """Return the derivatives at all waypoints for one axis, with the cost matrices in ``blocks``. (n_pieces + 1, k)"""
     from scipy.linalg import solveh_banded  # a fifth of a second to import
 
     order = nodes.shape[1]

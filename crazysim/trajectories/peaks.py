@@ -40,17 +40,14 @@ class Quantity:
 
 
 def _specific_thrust(acc: Floats) -> Floats:
-    """Return the thrust divided by the mass, world frame, m/s^2. (..., 3)"""
     return acc[..., :3] + np.array([0.0, 0.0, GRAVITY_MAGNITUDE])
 
 
 def _thrust(acc: Floats) -> Floats:
-    """Return the thrust divided by the weight. (...)"""
     return np.linalg.norm(_specific_thrust(acc), axis=-1) / GRAVITY_MAGNITUDE
 
 
 def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
-    """Return the angular speed of a drone that flies a trajectory with these derivatives exactly, rad/s. (...)"""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
     small_batch, large_batch = BATCH_SIZES
@@ -144,14 +141,12 @@ def _find_peak(table: PieceTable, quantity: Quantity) -> Peak:
 
 
 def _find_candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
-    """Return piece and sample of local maxima at or above their piece's threshold; the first of a plateau. (n,) each"""
     padded_samples = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded_samples[:, :-2]) & (samples >= padded_samples[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
 
 
 def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the maximum of a function in each interval, and its argument; expects one local maximum. (n,) each"""
     ratio = (np.sqrt(5) - 1) / 2
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     left_value, right_value = function(left), function(right)

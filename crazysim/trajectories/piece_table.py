@@ -82,12 +82,10 @@ class PieceTable:
 
     @functools.cached_property
     def _keys(self) -> Floats:
-        """Starts of the pieces, offset by drone, so that one binary search finds pieces of all drones. (n_pieces,)"""
         return self.drone * (self.duration + 1) + self.start
 
     @functools.cached_property
     def _derivatives(self) -> list[Floats]:
-        """Coefficients of the derivatives with respect to time, up to snap."""
         derivatives, c = [self.coefficients], self.coefficients
         for _ in range(N_DERIVATIVES):
             c = c[..., 1:] * np.arange(1, c.shape[-1]) if c.shape[-1] > 1 else np.zeros_like(c)
@@ -131,7 +129,6 @@ class PieceTable:
 def _collect_pieces(
     trajectory: Trajectory, start: float, duration: float, n_coefficients: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return starts, lengths and coefficients of the pieces of one trajectory between time zero and ``duration``."""
     ends = np.asarray(trajectory.ends, float)
     starts = np.concatenate([[0.0], ends[:-1]])
     has_length = ends > starts  # the others are padding
@@ -157,7 +154,6 @@ def _collect_pieces(
 
 
 def _cut_at_zero(starts: Floats, lengths: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the pieces that end after time zero; a piece that starts before time zero is cut there."""
     ends_after_zero = starts + lengths > 0
     starts, lengths, coefficients = starts[ends_after_zero], lengths[ends_after_zero], coefficients[ends_after_zero]
     if len(starts) and starts[0] < 0:
@@ -167,5 +163,4 @@ def _cut_at_zero(starts: Floats, lengths: Floats, coefficients: Floats) -> tuple
 
 
 def _resting_piece(start: float, length: float, pose: Floats, n_coefficients: int) -> tuple[Floats, Floats, Floats]:
-    """Return a piece that stays at one position and yaw, (4, 1)."""
     return np.array([start]), np.array([length]), np.pad(pose, ((0, 0), (0, n_coefficients - 1)))[None]

@@ -296,11 +296,6 @@ class Trajectory(PyTree):
         )
 
     def _require_single(self, remedy: str) -> None:
-        """Check that this is a trajectory of one vehicle.
-
-        Args:
-            remedy: Method to use for several trajectories.
-        """
         require(
             np.ndim(self.ends) == 1,
             f"expected a trajectory of one vehicle, got several, with ends of shape {np.shape(self.ends)}. Use "
@@ -308,7 +303,6 @@ class Trajectory(PyTree):
         )
 
     def _end_derivatives(self, at_end: bool) -> np.ndarray:
-        """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
         lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
         k = np.flatnonzero(lengths > 0)[-1 if at_end else 0]
         coefficients = np.asarray(self.coefficients[k], float).T
@@ -372,17 +366,14 @@ def trajectory_list(trajectories: Trajectory | Sequence[Trajectory]) -> list[Tra
 
 
 def _array_module(tree: object) -> Any:
-    """Return ``jax.numpy`` if a pytree contains a JAX array, else ``numpy``, which needs no compilation."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
 def _clipped_entry(x: Array, *index: Array | int) -> Array:
-    """Return an entry of an array; an index that is too large or too small selects the last or the first entry."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
-    """Return a time mapped into the duration of a trajectory, s, and True while the trajectory is flown. () each"""
     local_time = jnp.where(t < 0, 0.0, t)
     # floor is a vector instruction; lax.rem would call a function for each number.
     local_time = local_time - jnp.where(repeats, end * lax.floor(local_time / end), 0.0)
@@ -391,23 +382,15 @@ def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
 
 
 def _inverse_length(xp: Any, length: Array) -> Array:
-    """Return the inverse of the length of a piece, 1/s; 1 for padding, whose length is zero. (...)"""
     return 1 / xp.where(length > 0, length, xp.ones_like(length))
 
 
 def _scale_derivatives(derivatives: list[Array], rate: Array) -> list[Array]:
-    """Return derivatives with respect to time in seconds, computed from derivatives with respect to ``u``.
-
-    Args:
-        derivatives: Value, first derivative, and so on. (4,) each
-        rate: Change of ``u`` per second, 1/s. ()
-    """
     factors = itertools.accumulate([rate] * (len(derivatives) - 1), lambda a, b: a * b)
     return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
 
 
 def _build_setpoint(derivatives: list[Array]) -> Setpoint:
-    """Return the setpoint of x, y, z and yaw and their derivatives up to snap. (4,) each"""
     pos, vel, acc, jerk, snap = derivatives
     return Setpoint(
         pos=pos[:3], vel=vel[:3], acc=acc[:3], jerk=jerk[:3], snap=snap[:3],
@@ -416,13 +399,6 @@ def _build_setpoint(derivatives: list[Array]) -> Setpoint:
 
 
 def _find_piece(ends: Array, index: Array | int, t: Array) -> Array:
-    """Return the index of the piece at a time: the number of ends at or before it, at most the last index. ()
-
-    Args:
-        ends: Ends of the pieces of all trajectories, s. (n, n_pieces)
-        index: Index of the trajectory. ()
-        t: Time within the duration of the trajectory, s. ()
-    """
     n = ends.shape[1]
     if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
         return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)
@@ -434,15 +410,7 @@ def _find_piece(ends: Array, index: Array | int, t: Array) -> Array:
 
 
 def _polynomial_derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
-    """Return a polynomial and its derivatives up to an order, by Horner's scheme. (...) each
-
-    The scheme, repeated on its own partial results, gives ``p^(k)(u) / k!``.
-
-    Args:
-        coefficients: Constant term first. (..., degree + 1)
-        u: Argument. ()
-        order: Highest derivative.
-    """
+    # The scheme, repeated on its own partial results, gives ``p^(k)(u) / k!``.
     columns = [coefficients[..., k] for k in reversed(range(coefficients.shape[-1]))]
     if not columns:
         return [jnp.zeros(coefficients.shape[:-1], coefficients.dtype)] * (order + 1)

@@ -151,7 +151,6 @@ def _plan_trajectory(
     yaw: ArrayLike,
     corridors: ArrayLike | None,
 ) -> Trajectory:
-    """Return the trajectory of ``minimum_snap`` or ``minimum_jerk``, which pass 3 or 2 ``fixed_derivatives``."""
     nodes = _waypoint_nodes(waypoints, fixed_derivatives)
     if limits is not None:
         require_limits(limits)
@@ -207,7 +206,6 @@ def _plan_trajectory(
 
 
 def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike | None]) -> Floats:
-    """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     positions = read_floats("waypoints", waypoints)
     require(
         positions.ndim == 2 and positions.shape[1] == 3 and len(positions) >= 2,
@@ -233,7 +231,6 @@ def _waypoint_nodes(waypoints: ArrayLike, fixed_derivatives: Sequence[ArrayLike 
 
 
 def _corridor_radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
-    """Return the radius of the corridor of each piece, m. (n_pieces,)"""
     radii = read_floats("corridors", np.inf if corridors is None else corridors)
     if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
         raise ConfigError(f"expected positive corridors, one or {n_pieces}, got {corridors!r}. Use inf for no bound.")
@@ -241,7 +238,6 @@ def _corridor_radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
 
 
 def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float]:
-    """Return the smallest and largest height of the limits, m, infinite for none, after a check of the waypoints."""
     low, high = (None, None) if limits is None else (limits.floor, limits.height)
     bounds = -np.inf if low is None else low, np.inf if high is None else high
     for k, z in enumerate(heights):
@@ -255,7 +251,6 @@ def _height_bounds(limits: Limits | None, heights: Floats) -> tuple[float, float
 
 
 def _check_durations(durations: ArrayLike, n_pieces: int) -> Floats:
-    """Return the durations of the pieces, s, after a check. (n_pieces,)"""
     lengths = read_floats("durations", durations)
     require(
         lengths.shape == (n_pieces,),

@@ -113,7 +113,6 @@ def fit_translation(
     model = Dynamics(dynamics)
 
     def solve_for_rate(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
-        """Return the sum of squared residuals, coefficients, their terms, and residuals for a rate of the lag."""
         parts = [_acceleration_terms(model, mass, log, rate, gravity) for log in logs]
         terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
         coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
@@ -177,7 +176,6 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 def _acceleration_terms(
     model: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
-    """Return the acceleration per coefficient, (n, 3, k), and the acceleration without gravity, (n, 3), m/s^2."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
@@ -214,17 +212,13 @@ def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
 
 
 def _angle_samples(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
-    """Return sample time, commands, angles, (n, len(axes)), and the first angles and rates, (2, len(axes))."""
     time = np.asarray(log["time"], np.float64)
     cmd, rpy, rates = (jnp.asarray(log[key])[:, jnp.asarray(axes)] for key in ("SVF_cmd_rpy", "SVF_rpy", "SVF_drpy"))
     return float(time[-1] - time[0]) / (len(time) - 1), cmd, rpy, jnp.stack([rpy[0], rates[0]])
 
 
 def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
-    """Return the angles of damped springs, exact for commands that are linear between samples. (n, k)
-
-    ``x`` is stiffness, damping and gain; ``start`` has the first angles and their rates.
-    """
+    # ``x`` is stiffness, damping and gain; ``start`` has the first angles and their rates.
     stiffness, damping, gain = x
     zero = jnp.zeros_like(gain)
     system = jnp.array([
@@ -246,7 +240,6 @@ def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
 
 @jax.jit
 def _residual(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Array:
-    """Return the logged angles minus the simulated ones; for the arguments see ``_simulate``. (n, k)"""
     return rpy - _simulate(x, dt, cmd, start)
 
 
@@ -259,7 +252,6 @@ def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
 
 
 def _influences(jacobian: NDArray, residuals: NDArray) -> NDArray:
-    """Return the influences of samples on parameters that minimise the squared residuals. (n, k)"""
     inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
     return np.einsum("nri,nr->ni", jacobian, residuals) @ inverse
 

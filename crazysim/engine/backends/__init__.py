@@ -25,10 +25,4 @@ If the number of steps is a Python number, the loop can be differentiated in rev
 class Build(Protocol):
     """Builder of the function that runs a program."""
 
-    def __call__(self, program: Program, location: Location) -> Run:
-        """Return the function that runs a program on some devices.
-
-        Raises:
-            UnsupportedError: If the backend cannot run it.
-        """
-        ...
+    def __call__(self, program: Program, location: Location) -> Run: ...

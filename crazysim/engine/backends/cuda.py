@@ -119,17 +119,14 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
 
 @functools.cache
 def _launching_handler() -> str:
-    """Register the handler that launches kernels where XLA does not, and return its name."""
     ffi_handlers.register("crazysim_launch", "CUDA", ffi_handlers.launch_kernel)
     return "crazysim_launch"
 
 
 def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
-    """Return the number of blocks of a kernel that stores states, its numbers of steps, and the memory that it needs.
-
-    The numbers of steps are the number of all steps and the number of steps of an interval. If the memory would exceed
-    ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, and each block processes several groups of lanes in turn.
-    """
+    # The numbers of steps are the number of all steps and the number of steps of an interval. If the memory would
+    # exceed ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, and each block processes several groups of lanes in
+    # turn.
     interval = steps_per_interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.state_bytes, MAX_GRADIENT_MEMORY_BYTES)
     n_states = interval + max(-(-n_steps // interval), 1)
     size = n_states * kernel.state_bytes * kernel.threads
@@ -277,7 +274,6 @@ def compile_source(source: str, arch: str, kind: str) -> bytes:
 
 
 def _compile_with_nvrtc(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
-    """Compile a source by NVRTC, and return the image."""
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
     try:

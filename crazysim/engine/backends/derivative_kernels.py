@@ -32,13 +32,6 @@ class DerivativeKernels:
     """Kernels of the derivatives of one program, each compiled when it is first used."""
 
     def __init__(self, program: Program, location: Location, run_on_lanes: Run):
-        """Prepare the kernels, without compiling any.
-
-        Args:
-            program: The program.
-            location: Devices that it is planned for.
-            run_on_lanes: The program on lanes, for derivatives without a kernel.
-        """
         self.program, self.location, self.run_on_lanes = program, location, run_on_lanes
         self.descriptions: dict[str, None] = {}
         """Descriptions of how derivatives were computed so far, for ``explain``, as keys in order."""
@@ -77,7 +70,6 @@ class DerivativeKernels:
         perturbed: tuple[int, ...],
         platform: str,
     ) -> tuple[Any, Launch] | None:
-        """Return the transformed program and the function that calls its kernel; None if there is no such kernel."""
         key, launch_key = (kind, perturbed), (kind, perturbed, platform)
         try:
             if key not in self._programs:
@@ -101,7 +93,6 @@ class DerivativeKernels:
 
 
 def _kernel_inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
-    """Return the leaves that a kernel reads. Random keys are returned as their 32-bit integers."""
     arrays = [values[i] for i in leaves]
     return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in arrays]
 
@@ -116,12 +107,10 @@ def _launch_tangents(
     n_batches: int,
     result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
-    """Launch a kernel from ``tangent_kernel``, and return the tangents after the steps."""
     n_leaves = len(kernels.program.leaves)
     n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
 
     def broadcast_tangent(i: int, x: Array) -> Array:
-        """Return the tangent of a leaf, repeated for each world if all drones share the leaf."""
         if kernels.has_world_axis(i):
             return x
         return jnp.broadcast_to(x[:, None, None], (n_batches, n_worlds // n_batches, 1, *x.shape[1:])).reshape(
@@ -146,12 +135,10 @@ def _launch_cotangents(
     n_steps: int,
     n_batches: int,
 ) -> Leaves:
-    """Launch a kernel from ``cotangent_kernel``, and return the cotangents before the steps."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, list(values))
 
     def pad_seed(i: int) -> Array:
-        """Return the cotangent of a leaf with one row for each drone; a leaf of the world has it in the first row."""
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 
@@ -161,7 +148,6 @@ def _launch_cotangents(
     lane_cotangents = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
     def sum_cotangent(i: int, x: Array) -> Array:
-        """Return the cotangent of a leaf, summed over the drones that share it."""
         if program.leaves[i].scope == "world":
             return jnp.sum(x, axis=1)
         return (

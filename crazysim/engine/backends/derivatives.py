@@ -76,7 +76,6 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
 
 
 def _float0_zeros(x: Any) -> np.ndarray:
-    """Return the tangent of an array whose type is not floating-point."""
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
@@ -211,7 +210,6 @@ def _transpose(operands: Sequence[Any], seeds: Sequence[Any], spec: DerivativeSp
 
 
 def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequence[Any]) -> list[Array]:
-    """Return the written floats after the steps, as a function of the perturbed floats."""
     kernels = spec.kernels
     written, _ = kernels.run_on_lanes(replace_leaves(values, spec.perturbed, floats), spec.n_steps)
     return [x for i, x in zip(kernels.program.written_leaves, written, strict=True) if i in kernels.floats]
@@ -220,7 +218,6 @@ def _advance_floats(spec: DerivativeSpec, values: Sequence[Any], floats: Sequenc
 def _batching_rule(
     primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], spec: DerivativeSpec, **params: Any
 ) -> Any:
-    """Return the results of a primitive for ``n`` batches, by one call if all batches have the same parameters."""
     n_nonlinear = len(spec.array_leaves)
     have_world_axis = [*spec.world_axis_flags(spec.array_leaves), *(True for _ in args[n_nonlinear:])]
     if any(b and not has_axis for b, has_axis in zip(batched, have_world_axis, strict=True)):

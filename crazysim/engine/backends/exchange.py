@@ -138,7 +138,6 @@ class SharedMemory(UnsplitLane):
     """Threads of one block of a GPU, which exchange numbers through the block's memory."""
 
     def __init__(self, lanes: int):
-        """Exchange numbers between the first ``lanes`` threads of a block, which have a drone each."""
         if lanes > MAX_THREADS:
             raise UnsupportedError(
                 f"the {lanes} drones of a world read each other's numbers; on a GPU at most {MAX_THREADS} can"

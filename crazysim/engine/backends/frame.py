@@ -72,14 +72,12 @@ def steps_per_interval(n_steps: int, state_bytes: int, memory_bytes: int) -> int
 
 
 def _preamble(target: str) -> str:
-    """Return the types and functions of a target."""
     files = resources.files("crazysim.engine.backends").joinpath("targets")
     text = files.joinpath(f"{target}.h").read_text()
     return text.replace('#include "scalar.h"\n', files.joinpath("scalar.h").read_text())
 
 
 def _epilogue(target: str) -> str:
-    """Return the code that calls the kernel on a target; empty for CUDA."""
     if target == "cuda":
         return ""
     return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
@@ -136,16 +134,12 @@ def make_kernel(
 
 
 def _n_operations(block: Block) -> int:
-    """Return the number of operations of a block; operations that run for each drone of a world count for each."""
     inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
     return len(block.operations) + sum(inner)
 
 
 def _cuda_function(pointers: Sequence[str], shared: str, body: str, stores_states: bool) -> str:
-    """Return the CUDA kernel. Each thread computes the numbers that all lanes share, and then the numbers of its lane.
-
-    In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
-    """
+    # In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, *(["StoredNumber* __restrict__ stored"] if stores_states else [])])
     interval, loop = "", "const int first = blockIdx.x * BLOCK_LANES;"
@@ -171,7 +165,6 @@ extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {MIN_BLOCKS_PLACEHOL
 
 
 def _host_function(pointers: Sequence[str], shared: str, body: str, in_memory: bool, stores_states: bool) -> str:
-    """Return the host function for a range of lanes. It computes shared numbers once, then each vector of lanes."""
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
     definitions = []

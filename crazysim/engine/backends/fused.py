@@ -39,12 +39,6 @@ class Kernels:
     """
 
     def __init__(self, program: Program, location: Location):
-        """Compile the kernel for some devices.
-
-        Args:
-            program: The program, which one kernel can run.
-            location: The devices.
-        """
         self.program = program
         self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written_leaves)
         self._launches = {location.platform: self._compile(location)}
@@ -92,7 +86,6 @@ def unavailable_reason(platform: str) -> str | None:
 
 @functools.cache
 def _announce_missing_compiler() -> None:
-    """Print, once, that simulations on the CPU are slow, and the remedy."""
     print(f"simulations run on XLA, up to ten times slower: {native.MISSING_COMPILER}", file=sys.stderr)
 
 
@@ -103,7 +96,6 @@ class FusedRun:
         self._run, self.kernels = run, kernels
 
     def __call__(self, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        """Return the written leaves some steps later, and the worlds that are flagged as not finite."""
         return self._run(leaves, n_steps)
 
 
@@ -149,8 +141,6 @@ def describe_derivatives(program: Program) -> list[str]:
 
 
 def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
-    """Return a kernel call with a rule for ``jax.vmap``, which treats batches as further worlds."""
-
     def batching_rule(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         leaves_batched, count_batched = in_batched
         have_world_axis = [leaf.scope in ("drone", "world") for leaf in program.leaves]
@@ -190,7 +180,6 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
 
 
 def _run_without_rows(program: Program, unpacked_program: Program, location: Location) -> Run:
-    """Return a function that runs a program with rows by the same program without rows, compiled at the first call."""
     built_runs: list[Run] = []
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -210,12 +199,10 @@ def _run_without_rows(program: Program, unpacked_program: Program, location: Loc
 
 
 def _parts(program: Program) -> list[Program]:
-    """Return the parts of a program that run one after the other: each is one kernel or one unfused stage."""
     return [program] if program.fused else list(program.parts())
 
 
 def _run_parts(program: Program, location: Location) -> CountedRun:
-    """Return a function that runs a step that unfused stages split; the stages between two of these have one kernel."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
         kernels = list(pool.map(lambda part: Kernels(part, location) if part.fused else None, parts))
@@ -255,7 +242,6 @@ def _run_parts(program: Program, location: Location) -> CountedRun:
 
 
 def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-    """Return the outputs of a kernel: leaves, and the worlds that are flagged."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
     inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
@@ -270,5 +256,4 @@ def _call_kernel(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[lis
 
 
 def _as_numbers(x: Any) -> Array:
-    """Return an array unchanged, or an array of random keys as their 32-bit integers."""
     return jax.random.key_data(x) if jaxcompat.is_key(x) else x

@@ -64,7 +64,6 @@ def run_block(
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Broadcast a value to all lanes only if needed, because ``np.broadcast_to`` takes as long as an operation."""
     return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
@@ -127,8 +126,6 @@ _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_PreparedBlock, list[Any]]] = W
 
 
 def _prepare_block(block: Block, indices: dict[Any, int], constants: list[Any]) -> _PreparedBlock:
-    """Prepare a block, and add its values to ``indices`` and its constants to ``constants``."""
-
     def get_index(x: Any) -> int:
         if isinstance(x, Value):
             if x not in indices:
@@ -150,7 +147,6 @@ def _prepare_block(block: Block, indices: dict[Any, int], constants: list[Any]) 
 
 
 def _numpy_function(op: Operation) -> Callable[..., Any] | None:
-    """Return the NumPy function of an operation; None for a structured operation."""
     row = ops.TABLE[op.name]
     if row.structured:
         return None
@@ -163,14 +159,6 @@ def _numpy_function(op: Operation) -> Callable[..., Any] | None:
 
 
 def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_BlockRun]) -> list[Any]:
-    """Return the results of a structured operation, which is not one NumPy function of its operands.
-
-    Args:
-        op: The operation.
-        args: Its operands.
-        shape: Shape of the lanes.
-        runs: Functions that run its blocks.
-    """
     match op.name:
         case "barrier":
             return []
@@ -205,7 +193,6 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
 
 
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _BlockRun) -> list[np.ndarray]:
-    """Run a block for each pair of drones of a world, and combine the results of each drone."""
     n = op.param("n_members")
     member_number = np.arange(shape[0]) % n
     combining_functions: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
@@ -319,7 +306,6 @@ def flush_subnormals() -> Iterator[None]:
 
 @functools.cache
 def _c_library() -> ctypes.CDLL | None:
-    """Return the C library; None on platforms other than x86-64 Linux, where ``fenv_t`` has another layout."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return None
     for dtype in (np.float32, np.float64):

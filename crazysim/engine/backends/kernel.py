@@ -165,7 +165,6 @@ class KernelBody:
         )  # fmt: skip
 
     def _collect_slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
-        """Return the numbers that the stages write, and all numbers that the kernel uses, as ordered sets."""
         program, segments = self.program, self.program.fused_segments
         written_slots = dict.fromkeys(slot for s in segments for slot in program.drone_slots(s, s.writes))
         read_slots = dict.fromkeys(
@@ -175,7 +174,6 @@ class KernelBody:
         return written_slots, dict.fromkeys([*read_slots, *written_slots, *checked_slots, *self.stored_slots])
 
     def _write_hoisted(self, segment: Segment) -> list[str]:
-        """Write the hoisted block of a segment, and return the names of the results."""
         writer, define_constant = self.writer, self.exchange.define_constant
         outs = writer.write_block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
         ctypes = [type_name(x.dtype) for x in segment.hoisted.outputs]
@@ -207,12 +205,10 @@ def needed_leaves(program: Program) -> tuple[int, ...]:
 
 
 def _written_slots(program: Program) -> list[Slot]:
-    """Return the numbers that a kernel writes: all numbers of each leaf that it writes to."""
     return [(leaf, k) for leaf in program.written_leaves for k in range(program.leaves[leaf].size)]
 
 
 def _loaded_slots(program: Program) -> set[Slot]:
-    """Return the slots to load: the kernel may use them before a stage has written them."""
     loaded_slots: set[Slot] = set()
     written_slots: set[Slot] = set()
 
@@ -277,10 +273,7 @@ def write_segment(
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
-    """Return the slots that are used either by stages at ticks or by the check after the loop, but not at each step.
-
-    Unless a stage writes them, they are loaded where they are used, and take no register in between.
-    """
+    # Unless a stage writes them, they are loaded where they are used, and take no register in between.
     slots_of_ticks: set[Slot] = set()
     slots_of_each_step: set[Slot] = set()
     for segment in program.fused_segments:
@@ -340,5 +333,4 @@ def write_results(writer: Writer, pointer: str, ctype: str, n_sharing: int, valu
 
 
 def _n_sharing_lanes(program: Program, leaf: int) -> int:
-    """Return the number of lanes that share each number of a leaf."""
     return program.n_drones if program.leaves[leaf].scope == "world" else 1

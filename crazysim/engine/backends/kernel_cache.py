@@ -65,7 +65,6 @@ def folder() -> Path:
 
 @functools.cache
 def _warn_once(kernel_folder: Path, reason: str) -> None:
-    """Warn, once, that a folder is not used."""
     warn(
         f"expected a folder of kernels that only this user can write, got {str(kernel_folder)!r}: {reason}, so kernels "
         f"are compiled again in every process. {FOLDER_REMEDY}"
@@ -74,7 +73,6 @@ def _warn_once(kernel_folder: Path, reason: str) -> None:
 
 @functools.cache
 def _remove_abandoned_files_once(kernel_folder: Path) -> None:
-    """Remove unfinished files of processes that have ended from a folder, once."""
     remove_abandoned_files(kernel_folder, f"*{UNFINISHED_SUFFIX}")
 
 

@@ -37,14 +37,6 @@ class LeafValues:
     """
 
     def __init__(self, program: Program, leaves: list[Any], execute: BlockRunner = xla.run_block, library: Any = jnp):
-        """Store leaves as arrays.
-
-        Args:
-            program: The program.
-            leaves: Leaves of all worlds; None for a leaf that is written before it is read.
-            execute: Function that runs blocks.
-            library: Array library: ``jax.numpy``, or ``numpy``, in which random keys are stored as 32-bit integers.
-        """
         self.program, self.execute, self.library = program, execute, library
         self.n_worlds, self.n_drones = batch_counts(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
@@ -170,10 +162,7 @@ def _run_drones(segment: Segment, values: LeafValues, hoisted_results: Sequence[
 
 
 def _run_worlds(segment: Segment, values: LeafValues) -> None:
-    """Run a segment with scope ``world``, with one lane per world.
-
-    The slots of the segment in a leaf of drones count the scalars of all drones of a world, drone after drone.
-    """
+    # The slots of the segment in a leaf of drones count the scalars of all drones of a world, drone after drone.
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
     def get_world_value(slot: Slot) -> Any:

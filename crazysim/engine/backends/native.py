@@ -124,7 +124,6 @@ def compiler() -> str | None:
 
 
 def _zig() -> str | None:
-    """Return the command of the compiler in the package ziglang, which the extra ``compiler`` installs."""
     package = importlib.util.find_spec("ziglang")
     folders = [] if package is None else package.submodule_search_locations or []
     return next(
@@ -151,7 +150,6 @@ def compiler_command(with_options: bool = True) -> list[str]:
 
 
 def _split_variable(variable: str) -> list[str]:
-    """Return the words of an environment variable, none if it is not set."""
     text = os.environ.get(variable, "")
     try:
         return shlex.split(text)
@@ -216,7 +214,6 @@ def toolchain(words: tuple[str, ...]) -> str:
 
 
 def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
-    """Return a kernel's library: from the cache, or compiled."""
     cache_folder = kernel_cache.folder()
     for path in kernel_cache.find_files(cache_folder, key):
         library = _load_library(path)
@@ -238,7 +235,6 @@ def _get_library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
 
 
 def _load_library(path: Path) -> ctypes.CDLL | None:
-    """Return a library, or None if it cannot be loaded or holds no kernel."""
     try:
         library = ctypes.CDLL(str(path))
     except OSError:
@@ -247,7 +243,6 @@ def _load_library(path: Path) -> ctypes.CDLL | None:
 
 
 def _compile(words: Sequence[str], source: str) -> bytes:
-    """Compile a kernel, and return the library's contents."""
     seconds, n_lines = time_limit(), source.count("\n")
     if n_lines + (SELECTING_LINE_WEIGHT - 1) * len(SELECTING_LINE.findall(source)) > LINES_IN_ONE_SECOND * math.sqrt(
         seconds
@@ -270,11 +265,6 @@ def _compile(words: Sequence[str], source: str) -> bytes:
 
 
 def _check_settings(work_folder: Path) -> None:
-    """Raise an error if the compiler cannot compile an empty file because of CXX or CXXFLAGS.
-
-    Args:
-        work_folder: Folder for the compiler's files.
-    """
     (work_folder / "empty.cpp").write_text("")
 
     def compile_empty_file(with_options: bool) -> str:
@@ -326,14 +316,6 @@ _COMPILER_PIPES: set[IO[str]] = set()
 def _run_compiler(
     words: Sequence[str], work_folder: Path, seconds: float, cwd: str | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run the compiler. It is killed with all its children when its time is up or this process ends.
-
-    Args:
-        words: Command of the compiler.
-        work_folder: Folder of its temporary files.
-        seconds: Time that it may take, s.
-        cwd: Working directory; None for the directory of this process.
-    """
     pipe = subprocess.PIPE
     reader, writer = os.pipe()
     with os.fdopen(reader) as read_end, os.fdopen(writer, "w") as write_end:

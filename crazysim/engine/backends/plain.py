@@ -70,6 +70,5 @@ def build(stages: Sequence[Stage], data: Record) -> tuple[Run, list[int]]:
 
 
 def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
-    """Return the indices of the leaves that a function of leaves does not return unchanged."""
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
     return [i for i, (before, after) in enumerate(pairs) if before is not after]

@@ -112,32 +112,19 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
 
 
 def _used_slots(program: Program, s: Segment) -> list[Slot]:
-    """Return the slots of the inputs that a segment uses."""
     used_values, slots = s.block.used_values(), program.drone_slots(s, s.reads)
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used_values]
 
 
 def _float_type(block: Block) -> np.dtype:
-    """Return the type of the floats of a block; all floats of a program have the same type."""
     return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
 
 
 def _reverse_segment(
     program: Program, n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int], hoisted_leaf: int
 ) -> Segment:
-    """Return the segment that replaces the cotangents after a segment by the cotangents before the segment.
-
-    In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
-    cotangents of the written numbers over the drones, and adds its results to the cotangents of the first drone.
-
-    Args:
-        program: The program with the leaves of cotangents.
-        n_leaves: Number of leaves of the program before the leaves of cotangents.
-        s: The segment.
-        changed: Slots whose numbers depend differentiably on the perturbed leaves.
-        hoisted_indices: Indices of the hoisted numbers that depend differentiably on the perturbed leaves.
-        hoisted_leaf: Leaf of the cotangents of hoisted numbers; -1 for a segment before or after the steps.
-    """
+    # In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
+    # cotangents of the written numbers over the drones, and adds its results to the cotangents of the first drone.
     n_drones, is_world_segment = program.n_drones, s.scope == "world"
     reads = program.drone_slots(s, s.reads)
     input_indices = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
@@ -148,10 +135,7 @@ def _reverse_segment(
     n_inputs = len(s.block.inputs)
 
     def cotangent_slots(slot: Slot) -> list[Slot]:
-        """Return the slots of the cotangents of a number.
-
-        In a segment of worlds, a number that drones share has one cotangent for each drone. Other numbers have one.
-        """
+        # In a segment of worlds, a number that drones share has one cotangent for each drone. Other numbers have one.
         i, k = slot
         if not is_world_segment or program.leaves[i].scope == "drone":
             return [(n_leaves + i, k)]
@@ -197,7 +181,6 @@ def _reverse_segment(
 def _reverse_hoisted(
     n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int], hoisted_leaf: int
 ) -> Segment:
-    """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
     input_indices = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
               if slot in changed and x.dtype.kind == "f"]  # fmt: skip
@@ -342,16 +325,6 @@ def _write_backward(
     names: dict[Slot, str],
     depth: int,
 ) -> None:
-    """Write the backward pass through the segments of a phase, after recomputing all segments but the last.
-
-    Args:
-        kernel_body: Kernel that the lines are added to.
-        reverse: The transposed derivatives.
-        segments: The segments.
-        constants: Expressions of their hoisted numbers.
-        names: Expressions of the numbers before the first segment; changed in place.
-        depth: Depth of the lines.
-    """
     program, writer = reverse.program, kernel_body.writer
     names_by_segment = []
     for s, segment_constants in zip(segments, constants, strict=True):

@@ -50,11 +50,6 @@ class Writer(LineWriter):
     """Writer of the source of blocks, line by line."""
 
     def __init__(self, exchange: Exchange | None = None) -> None:
-        """Create a writer without lines.
-
-        Args:
-            exchange: Exchange of numbers between lanes; None for registers.
-        """
         self.exchange = Registers() if exchange is None else exchange
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
@@ -100,7 +95,6 @@ class Writer(LineWriter):
         return self.names[x] if isinstance(x, Value) else literal(x)
 
     def _write_operation(self, op: Operation, depth: int) -> None:
-        """Write an operation, and name its results."""
         args = [self.element(a) for a in op.args]
         match op.name:
             case "barrier":
@@ -138,19 +132,16 @@ class Writer(LineWriter):
                 self.write_line(f"const auto {name} = {text};", depth)
 
     def _name_results(self, op: Operation, name: str | None = None) -> str:
-        """Name the results of an operation with several results, and return the prefix of their names."""
         name = name or self.new_name()
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
         return name
 
     def _write_table(self, op: Operation) -> None:
-        """Write a table of constants, which stands before the kernel."""
         name = self.names[op.results[0]] = self.new_name("t")
         numbers = ", ".join(_table_entry(x) for x in op.param("numbers").array)
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
     def _write_lookup(self, op: Operation, args: list[str], depth: int) -> None:
-        """Write the read of a table entry. A group of four entries is read at once if the block reads three of them."""
         offset, key = op.param("offset"), _entry_group(op)
         if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new_name()
@@ -162,7 +153,6 @@ class Writer(LineWriter):
         self.names[op.results[0]] = f"{self.entry_groups[key]}.x[{offset % 4}]"
 
     def _write_sin_cos(self, op: Operation, x: str, depth: int) -> None:
-        """Write sine and cosine together, as they share most of their work."""
         if x not in self.sin_cos_names:
             pair = self.sin_cos_names[x] = self.new_name()
             ctype = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
@@ -189,7 +179,6 @@ class Writer(LineWriter):
         self.write_line("}", depth)
 
     def _write_over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
-        """Write a loop over the drones of the world, which reads their published numbers."""
         (body,) = op.blocks
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
@@ -234,7 +223,6 @@ class Writer(LineWriter):
         self.write_line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
-        """Return whether all lanes share each number that a loop carries, and mark shared inputs of its blocks."""
         shared_flags = shared_carry(op, self.shared)
         for block in op.blocks:
             self.shared.update(
@@ -243,7 +231,6 @@ class Writer(LineWriter):
         return shared_flags
 
     def _define_carry(self, op: Operation, initial: Sequence[str], shared_flags: Sequence[bool], depth: int) -> str:
-        """Write a variable with its initial number for each result of an operation; return the prefix of the names."""
         name = self._name_results(op)
         for k, (x, value, is_shared_number) in enumerate(zip(op.results, initial, shared_flags, strict=True)):
             ctype = type_name(x.dtype)
@@ -256,10 +243,7 @@ class Writer(LineWriter):
     def _assign_carry(
         self, op: Operation, name: str, outs: Sequence[str], shared_flags: Sequence[bool], mask: str | None, depth: int
     ) -> None:
-        """Write the assignments at the end of an iteration; lanes where ``mask`` is false keep their old values.
-
-        All new values are written first, because a new value may be the old value of another variable.
-        """
+        # All new values are written first, because a new value may be the old value of another variable.
         new_names = [self.new_name() for _ in outs]
         for k, (new_name, result) in enumerate(zip(new_names, outs, strict=True)):
             text = result if mask is None or shared_flags[k] else f"select_n_({mask}, {name}_{k}, {result})"
@@ -270,7 +254,6 @@ class Writer(LineWriter):
 
 
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
-    """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
     earlier_values = [x for op in block.operations[:position] for x in op.results if not x.size]
     used = dataclasses.replace(block, operations=block.operations[position + 1 :]).used_values()
     used = used.union(*(inner.used_values() for inner in block.operations[position].blocks))
@@ -278,12 +261,10 @@ def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
 
 
 def _entry_group(op: Operation) -> EntryGroup:
-    """Return the group of four entries that a lookup belongs to."""
     return op.args[0], op.args[1], op.param("offset") // 4
 
 
 def _entry_groups(block: Block) -> list[EntryGroup]:
-    """Return the aligned groups of four float32 entries from which a block reads at least three."""
     lookups = [op for op in block.operations if op.name == "lookup" and op.param("aligned") and op.dtype == np.float32]
     counts = collections.Counter(_entry_group(op) for op in lookups if isinstance(op.args[1], Value))
     sizes = {_entry_group(op): op.args[0].size for op in lookups}
@@ -299,14 +280,7 @@ def expression(op: Operation, args: Sequence[str]) -> str:
 
 
 def _limiting_function(op: Operation, comparisons: Mapping[Value, Operation]) -> str | None:
-    """Return the name of the function that can replace a selection that limits a number; None for other operations.
-
-    A target may have an instruction for it. An example is ``x < low ? low : x``, which becomes ``at_least``.
-
-    Args:
-        op: The selection.
-        comparisons: Comparisons by their results.
-    """
+    # A target may have an instruction for it. An example is ``x < low ? low : x``, which becomes ``at_least``.
     if op.name != "select_n" or op.dtype.kind != "f" or op.args[0] not in comparisons:
         return None
     test, (x, limit) = comparisons[op.args[0]], op.args[1:]
@@ -328,7 +302,6 @@ def type_name(dtype: DTypeLike) -> str:
 
 
 def _table_entry(x: np.generic) -> str:
-    """Return a finite constant as a plain literal, for the initialiser of a table."""
     return f"{float(x).hex()}{'f' * (x.dtype == np.float32)}" if x.dtype.kind == "f" else f"{int(x)}"
 
 

@@ -49,7 +49,6 @@ def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
 
 
 def _shared_in_body(block: Block, inputs_are_shared: list[bool], shared: Set[Value]) -> set[Value]:
-    """Return the values that all lanes share at the end of a block, given which of its inputs they share."""
     shared_inside = {
         *shared,
         *(x for x, is_shared_input in zip(block.inputs, inputs_are_shared, strict=True) if is_shared_input),

@@ -50,7 +50,6 @@ def _get_array(env: Env, x: Element) -> Any:
 
 
 def _last_uses(block: Block) -> dict[Value, int]:
-    """Return the position of the last operation that uses each value; an output is used after the end."""
     last_uses: dict[Value, int] = {}
     for position, op in enumerate(block.operations):
         used = {x for x in op.args if isinstance(x, Value)}.union(*(b.used_values() for b in op.blocks))
@@ -60,7 +59,6 @@ def _last_uses(block: Block) -> dict[Value, int]:
 
 
 def _add_barrier(env: Env, block: Block, position: int, last_uses: dict[Value, int]) -> None:
-    """Put a barrier on all values that are used later. Without it XLA's CPU backend recomputes them for each result."""
     results = [x for op in block.operations[:position] for x in op.results]
     live = [x for x in results if last_uses.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, jaxcompat.barrier([env[x] for x in live]), strict=True))
@@ -91,7 +89,6 @@ def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
 
 
 def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Repeat until no lane continues; lanes that are finished keep their values."""
     test, body = op.blocks
 
     def is_continuing(carry: list[Any]) -> Array:
@@ -108,7 +105,6 @@ def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> 
 
 
 def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Compute a block only if some lane needs it."""
     (body,) = op.blocks
     mask, old_values = args[0], [jnp.broadcast_to(x, shape) for x in args[1:]]
 
@@ -144,7 +140,6 @@ axis for the other drones."""
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Run a block for each pair of drones of a world, and combine the results of each drone."""
     (block,), n = op.blocks, op.param("n_members")
     n_worlds = shape[0] // n
     used = [v for v in block.used_values() if v in env]

@@ -82,7 +82,6 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
 
 
 def _without_zero_terms(name: str, args: tuple[Element, ...], dtype: np.dtype) -> Element | None:
-    """Return the element that an operation with a zero of a shared parameter reduces to; None if it does not reduce."""
     zeros = [is_known_zero(x) for x in args]
     match name:
         case "mul" | "neg" | "convert_element_type":

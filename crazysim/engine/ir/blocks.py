@@ -110,12 +110,6 @@ class Builder:
     """Builder of a block, operation by operation."""
 
     def __init__(self, outer: Builder | None = None, stage: str = ""):
-        """Create the builder of an empty block.
-
-        Args:
-            outer: Builder of the enclosing block; None for an outermost block.
-            stage: Name of the stage of the operations; an inner block has the stage of ``outer``.
-        """
         self.outer = outer
         self.stage = outer.stage if outer is not None else stage
         self.inputs: list[Value] = []
@@ -228,7 +222,6 @@ def _prune(block: Block, used: set[Value]) -> Block:
 
 
 def _drop_results(op: Operation, used_values: Collection[Value]) -> Operation:
-    """Return a ``when`` operation without the results that are not used."""
     (mask, *old_values), (block,) = op.args, op.blocks
     used_indices = [k for k, x in enumerate(op.results) if x in used_values]
     if len(used_indices) == len(op.results):

@@ -58,7 +58,6 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
 
 
 def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
-    """Yield the lines of a segment."""
     phase_text = {"before": "before the first step", "each": "at each step", "after": "after the last step"}[
         segment.phase
     ]

@@ -88,7 +88,6 @@ def unsupported_error(name: str, dtypes: Sequence[np.dtype], result: Any = bool)
 
 
 def _casadi_erf_inv(ca: Any, x: Any) -> Any:
-    """Return the inverse error function: CasADi's result has six correct digits, and each Newton step doubles them."""
     y = ca.erfinv(x)
     for _ in range(2):
         y = y - (ca.erf(y) - x) * (np.sqrt(np.pi) / 2) * ca.exp(y * y)
@@ -105,7 +104,6 @@ _LARGEST_FLOAT64 = float(np.finfo(np.float64).max)
 
 
 def _rows() -> list[OperationForm]:
-    """Return the rows of the table, grouped by kind of operation."""
     any_number, integer = "fiu", "iu"
 
     def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **fields: Any) -> OperationForm:

@@ -80,7 +80,6 @@ def _verify_slots(
 
 
 def _verify_block(block: Block, defined: set[Value]) -> None:
-    """Check a block; ``defined`` holds all values so far, and the block's values are added to it."""
     visible = set(defined)
 
     def define(values: tuple[Value, ...]) -> None:
@@ -112,7 +111,6 @@ def _definitions(block: Block) -> list[Value]:
 
 
 def _verify_types(op: Operation) -> None:
-    """Check the types and blocks of an operation against the table of operations."""
     _require(op.name in ops.TABLE, f"operation {op.name!r} is not in the table")
     row, dtypes, results = ops.TABLE[op.name], [x.dtype for x in op.args], [x.dtype for x in op.results]
     description = f"operation {op.name!r} of {', '.join(map(str, dtypes))} to {', '.join(map(str, results))}"

@@ -79,7 +79,6 @@ def active_values(block: Block, perturbed: Collection[Value]) -> set[Value]:
 
 
 def _propagate(block: Block, active: set[Value]) -> None:
-    """Add the values of a block that depend differentiably on active values to ``active``."""
     for op in block.operations:
         if op.name == "over_others":
             (body,) = op.blocks

@@ -82,7 +82,6 @@ def _find_access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
 
 
 def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
-    """Return the stages that use neither a leaf of a population nor a leaf that a stage outside the set writes."""
     clocks = {k for k, a in enumerate(accesses) if not any(has_members(axes.scopes[i]) for i in a.used_leaves)}
     while True:
         other_leaves = frozenset().union(*(a.written_leaves for k, a in enumerate(accesses) if k not in clocks))
@@ -93,10 +92,7 @@ def _find_clocks(accesses: Sequence[_Access], axes: Axes) -> set[int]:
 
 
 def _find_components(stages: Iterable[int], accesses: Sequence[_Access], drones: str) -> list[set[int]]:
-    """Return sets of stages that depend on each other, directly or through other stages.
-
-    A stage without a population is treated as a stage of the drones.
-    """
+    # A stage without a population is treated as a stage of the drones.
     components: list[set[int]] = []
     for k in stages:
         joined_component, other_components = {k}, []
@@ -115,7 +111,6 @@ def _are_dependent(a: _Access, b: _Access, drones: str) -> bool:
 
 
 def _add_clocks(stages: Collection[int], clocks: Collection[int], accesses: Sequence[_Access]) -> set[int]:
-    """Return stages with the clocks whose results they read."""
     result = set(stages)
     while True:
         read_leaves = frozenset().union(*(accesses[k].read_leaves for k in result))

@@ -67,13 +67,6 @@ class Lowering:
     def __init__(
         self, builder: Builder | None = None, entries: dict[Value, TableEntry] | None = None, n_members: int = 0
     ):
-        """Create a lowering that adds operations to a block.
-
-        Args:
-            builder: Builder of the block; None for a new one.
-            entries: Table entries of numbers that can also be looked up; more are added. None for no entries.
-            n_members: Number of drones of a world, for a function of one drone; 0 if it cannot read other drones.
-        """
         self.builder = Builder() if builder is None else builder
         self.entries = {} if entries is None else entries
         self.n_members = n_members
@@ -156,12 +149,6 @@ class TableRows:
     """A table in memory with any number of rows, from which a function reads whole rows (``table_row``)."""
 
     def __init__(self, builder: Builder, aval: Any):
-        """Add the table as an input of a block.
-
-        Args:
-            builder: Builder that the input is added to.
-            aval: Shape and type of the table, (n_rows, row_size).
-        """
         self._size = int(aval.shape[1])
         self._table = builder.input(aval.dtype, self._size)
 

@@ -34,7 +34,6 @@ def add_selections(block: Block) -> Block:
 
 
 def _selected_results(op: Operation) -> list[int]:
-    """Return the indices of the results of an operation that are a minimum or maximum of floats."""
     if op.name != "over_others":
         return []
     pairs = zip(op.param("reduce"), op.results, strict=True)
@@ -44,16 +43,12 @@ def _selected_results(op: Operation) -> list[int]:
 def _add_selection(
     builder: Builder, op: Operation, indices: list[int], values: dict[Value, Element]
 ) -> tuple[Value, ...]:
-    """Add the two loops for some results of an operation, and return the selected numbers."""
     (body,) = op.blocks
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
     def copy_body(n_extra: int) -> tuple[Builder, list[Value], list[Element]]:
-        """Return the builder of a copy of the body, its last inputs, and its candidates.
-
-        The copy has ``n_extra`` further inputs for published integers, before the input that marks the drone itself.
-        """
+        # The copy has ``n_extra`` further inputs for published integers, before the input that marks the drone itself.
         inner = Builder(builder)
         new_inputs = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_extra)]
         is_self = inner.input(bool)

@@ -88,11 +88,8 @@ def lower_stages(
 def _move_before_steps(
     segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], step_count_leaf: Any
 ) -> list[Segment | UnfusedStage]:
-    """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
-
-    If at most one stage writes the leaf of step counts, no episode can begin during a call. Numbers that only the moved
-    segments write are then constant during the steps, and can be hoisted.
-    """
+    # If at most one stage writes the leaf of step counts, no episode can begin during a call. Numbers that only the
+    # moved segments write are then constant during the steps, and can be hoisted.
     if sum(step_count_leaf in s.written_leaves for s in segments) > 1:
         return list(segments)
     acts_at_first_step = [
@@ -112,7 +109,6 @@ def _lower_stage(
     n_drones: int,
     tracer: Tracer,
 ) -> Segment | UnfusedStage:
-    """Return the segment of a stage, or the unfused stage with the reason if it cannot be lowered."""
     try:
         if stage.scope == "batch":
             raise LimitError(stage.unfused_reason)
@@ -152,7 +148,6 @@ def _make_segment(
     shared_leaves: Sequence[int],
     n_members: int,
 ) -> Segment:
-    """Return the segment of a traced stage, which may read ``shared_leaves`` as tables."""
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     elements_before = {
         i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.input_leaves
@@ -184,7 +179,6 @@ def _make_segment(
 
 
 def _add_table(lowering: Lowering, elements: ElementArray) -> Value:
-    """Return a table of the elements of a shared array, and register the entry of each element in it."""
     items = elements.reshape(-1)
     table = lowering.builder.input(items[0].dtype, len(items))
     zero = constant(0, np.int32)
@@ -195,11 +189,8 @@ def _add_table(lowering: Lowering, elements: ElementArray) -> Value:
 def _lower_guarded(
     lowering: Lowering, mask: Element, traced: TracedStage, args: list[ElementArray], old_arrays: list[ElementArray]
 ) -> list[ElementArray]:
-    """Return the written leaves after a stage that acts where a mask is true.
-
-    A stage that reduces over other drones is computed at every step, and the mask selects its results. Drones need each
-    other's values even if their stages act at different steps.
-    """
+    # A stage that reduces over other drones is computed at every step, and the mask selects its results. Drones need
+    # each other's values even if their stages act at different steps.
     reads_other_drones = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
     inner = lowering if reads_other_drones else lowering.make_inner()
     new_arrays = inner.lower(traced.fn, args)
@@ -222,7 +213,6 @@ def _lower_guarded(
 
 
 def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> ElementArray:
-    """Return scalars as an array of the template's shape; where the template has a random key, it takes two scalars."""
     scalar = iter(items)
     elements = [(next(scalar), next(scalar)) if isinstance(x, tuple) else next(scalar) for x in template.reshape(-1)]
     return as_elements(elements, template.shape)
@@ -231,12 +221,9 @@ def _replace_scalars(template: ElementArray, items: Sequence[Element]) -> Elemen
 def _make_finite_check(
     axes: Axes, leaves: Sequence[Any], flag: int, steps: int, checked_leaves: Mapping[int, bool]
 ) -> Segment:
-    """Return a segment that flags a drone if its world was flagged or one of its checked numbers is not valid.
-
-    A number is valid if it is finite or, where ``checked_leaves`` is False for its leaf, if it is not NaN.
-    It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
-    count has overflowed and is negative.
-    """
+    # A number is valid if it is finite or, where ``checked_leaves`` is False for its leaf, if it is not NaN. It also
+    # flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the count
+    # has overflowed and is negative.
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []
     is_valid: Element = constant(True, bool)

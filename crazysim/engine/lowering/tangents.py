@@ -71,7 +71,6 @@ def _tangent_leaf(leaf: Leaf) -> Leaf:
 def _add_segment_tangents(
     program: Program, n_leaves: int, s: Segment, changed: set[Slot], hoisted_indices: Sequence[int]
 ) -> Segment:
-    """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.drone_slots(s, s.reads), len(s.reads)
     input_indices = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
     input_indices = [k for k in input_indices if not s.block.inputs[k].size]
@@ -132,7 +131,6 @@ def add_block_tangents(block: Block, perturbed: Sequence[Value]) -> Block:
 
 
 def _collect_tangents(elements: Sequence[Element], tangents: Values) -> list[Element]:
-    """Return the tangents of the floats among some elements; a missing tangent is zero."""
     return [_get_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
 
 
@@ -142,14 +140,6 @@ def _get_tangent(x: Element, tangents: Values) -> Element:
 
 
 def _add_with_tangents(builder: Builder, block: Block, values: Values, tangents: Values) -> list[Element]:
-    """Add a block's operations with their derivatives to a builder, and return its outputs.
-
-    Args:
-        builder: Builder that the operations are added to.
-        block: The block.
-        values: Elements of the builder for the block's inputs and for values of enclosing blocks. Results are added.
-        tangents: Tangents of these values that are not zero. The tangents of the block's results are added.
-    """
     for op in block.operations:
         builder.stage = op.stage
         rule = STRUCTURED_RULES.get(op.name)
@@ -173,13 +163,11 @@ def _map_element(x: Element, values: Values) -> Element:
 
 
 def _store_tangents(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
-    """Add the tangents of some results to ``tangents``, unless they are zero."""
     tangents.update((x, t) for x, t in zip(results, elements, strict=True) if isinstance(t, Value) or t != 0)
 
 
 @functools.lru_cache(maxsize=1024)
 def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block that computes the tangent of an operation from its operands and the tangents of its floats."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def tangent(*args: Any) -> Any:
@@ -214,7 +202,6 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 
 
 def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Add the function, and its custom derivative."""
     (block,) = op.blocks
     args = [_map_element(x, values) for x in op.args]
     results = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
@@ -229,7 +216,6 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
 
 
 def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Carry a tangent for each float: any float may depend on a perturbed number after further iterations."""
     *tests, body = op.blocks
     if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.used_values())):
         inline(builder, Block((), (op,), ()), values)
@@ -252,7 +238,6 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Publish the tangents of published numbers too, and sum the tangents of outputs that are summed."""
     (body,) = op.blocks
     *other_inputs, is_self = body.inputs
     inner = Builder(builder)

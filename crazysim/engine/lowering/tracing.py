@@ -17,13 +17,6 @@ class TracedStage:
     """A stage as jaxprs on flat lists of leaves: its function, and its condition if it has one."""
 
     def __init__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]):
-        """Trace a stage for data of its scope: one drone, one world, or the batch.
-
-        Args:
-            stage: The stage.
-            axes: Batch axes of the leaves.
-            leaves: Leaves of all worlds, or their shapes and types.
-        """
         self.avals = axes.unbatched_shapes(list(leaves), stage.scope)
         """Shapes and types of all leaves, as the stage receives them."""
         self.written_leaves: list[int] = []
@@ -67,7 +60,6 @@ class Tracer:
         self._traced: dict[Any, tuple[Stage, TracedStage]] = {}  # with the stage, so that ids in keys stay valid
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
-        """Return ``TracedStage(stage, axes, leaves)``, from the cache if possible."""
         shapes = tuple([(x.shape, x.dtype) for x in axes.unbatched_shapes(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._traced:
@@ -87,10 +79,7 @@ MAX_TRACED_STAGES = 256
 
 
 def _get_shared_trace(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
-    """Return a traced stage with ``trace_once``, from the cache of this process if possible.
-
-    The stage must not read what ``Record.without_sizes`` leaves out.
-    """
+    # The stage must not read what ``Record.without_sizes`` leaves out.
     data = axes.treedef.unflatten(leaves)
     structure = jax.tree.structure(data.without_sizes())
     key = (stage.fn, stage.when, structure, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)

@@ -66,7 +66,6 @@ OPERATIONS_PER_PART = 60
 
 
 def _split_into_parts(block: Block) -> list[Block]:
-    """Return the operations of a block in parts, one after the other."""
     operations = [op for op in block.operations if op.name != "barrier"]
     return [
         Block((), tuple(operations[k : k + OPERATIONS_PER_PART]))
@@ -77,11 +76,8 @@ def _split_into_parts(block: Block) -> list[Block]:
 def _recompute(
     builder: Builder, part: Block, part_number: int, values: dict[Value, Element], active_set: set[Value]
 ) -> dict[Value, Element]:
-    """Recompute a part of a block from the values that it uses, and return the new elements by value.
-
-    Without this, all results of the forward pass would take registers until the backward pass needs them. Reductions
-    over other drones and loops are not recomputed.
-    """
+    # Without this, all results of the forward pass would take registers until the backward pass needs them. Reductions
+    # over other drones and loops are not recomputed.
     operations = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
     recomputed, used_values = {x for op in operations for x in op.results}, part.used_values()
     inputs = [
@@ -98,16 +94,6 @@ def _recompute(
 def _add_cotangents(
     builder: Builder, block: Block, values: dict[Value, Element], active_set: set[Value], cts: Cotangents
 ) -> None:
-    """Add the cotangents of the values that a block uses, computed backwards from the cotangents of its results.
-
-    Args:
-        builder: Builder that the operations are added to.
-        block: The block.
-        values: Elements of the builder by the values of the block.
-        active_set: Values whose cotangents are computed.
-        cts: Cotangents so far; changed in place.
-    """
-
     def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
@@ -132,13 +118,11 @@ def _add_cotangents(
 
 
 def _accumulate(builder: Builder, cts: Cotangents, x: Value, contribution: Element) -> None:
-    """Add a contribution to the cotangent of a value."""
     cts[x] = builder.add("add", (cts[x], contribution), x.dtype) if x in cts else contribution
 
 
 @functools.lru_cache(maxsize=1024)
 def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block that computes the cotangents of float operands from all operands and the result's cotangent."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def cotangents(*args: Any) -> list[Any]:
@@ -159,7 +143,6 @@ ResultCotangents = Sequence[Element | None]
 def _when(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Pass cotangents through the block where the mask is true, and to the old numbers elsewhere."""
     mask, *old_values = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks
@@ -184,7 +167,6 @@ def _when(
 def _custom_jvp(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Transpose the function's custom derivative."""
     derivative = _transpose_derivative(op.param("derivative")())
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, result_cts, strict=True)
@@ -205,7 +187,6 @@ def _transpose_derivative(derivative: Block) -> Block:
 def _over_others(
     builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Add the cotangents of numbers that the block uses from outside, and of the numbers that each drone published."""
     known_cts = [ct for ct in result_cts if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
@@ -222,14 +203,6 @@ def _over_others(
         perturbed: Sequence[Value],
         published_elements: Sequence[Element],
     ) -> None:
-        """Add a loop over the other drones, which sums the cotangents of some values.
-
-        Args:
-            read_values: Values that have the numbers of the other drone.
-            own_values: Elements of values that have the numbers of the drone itself.
-            perturbed: Values whose cotangents are computed.
-            published_elements: Elements that the drones publish for ``read_values``.
-        """
         inner, inner_values, inner_cts = Builder(builder), dict(values), Cotangents()
         new_inputs = [inner.input(x.dtype) for x in (*read_values, body.inputs[-1])]
         inner_values.update(own_values)
@@ -270,10 +243,7 @@ STRUCTURED_RULES: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "
 
 
 def _unroll_loops(block: Block) -> Block:
-    """Return a block whose loops of fixed length are unrolled: the backward pass needs the carry of every iteration.
-
-    Loops that carry no float have no derivative and are not unrolled.
-    """
+    # Loops that carry no float have no derivative and are not unrolled.
     if not any(_is_differentiable_loop(op) for inner in block.blocks() for op in inner.operations):
         return block
     builder = Builder()
@@ -287,8 +257,6 @@ def _is_differentiable_loop(op: Operation) -> bool:
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
-    """Add the operations of a block, with its loops unrolled, to a builder, and return its outputs."""
-
     def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 

@@ -113,8 +113,6 @@ def packed_rows(program: Program) -> list[PackedRows]:
 
 
 def _move_slots(program: Program, move_slot: Callable[[Slot], Slot]) -> Program:
-    """Return a program in which ``move_slot`` replaces every slot."""
-
     def move_segment(s: Segment) -> Segment:
         reads, writes, hoisted = ([move_slot(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
         return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))

@@ -40,7 +40,6 @@ def fuse(program: Program) -> Program:
 
 
 def _join_segments(segments: list[Segment]) -> Segment:
-    """Return one segment that does what several segments do one after the other."""
     builder = Builder()
     inputs: dict[Slot, Value] = {}
     outputs: dict[Slot, Element] = {}
@@ -86,7 +85,6 @@ def _join_block_ticks(block: Block) -> Block:
 
 
 def _join_two_ticks(first: Operation, second: Operation) -> Operation:
-    """Merge two ``when`` operations with the same condition."""
     builder = Builder(stage=first.stage)
     new_values = inline(builder, first.blocks[0], {})
     builder.barrier()
@@ -144,7 +142,6 @@ def hoist(program: Program) -> Program:
 
 
 def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
-    """Return a segment whose expensive values are computed in its hoisted block if no changing slot affects them."""
     block, slots = segment.block, dict(zip(segment.block.inputs, segment.reads, strict=True))
     fixed_values = {x for x, slot in slots.items() if slot not in changing}
     hoistable: set[Value] = set()
@@ -177,10 +174,7 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
 
 
 def _replace_divisions(block: Block, fixed_values: set[Value]) -> Iterable[Operation]:
-    """Yield the operations of a block, with divisions by fixed numbers replaced by products.
-
-    The caller adds to ``fixed_values`` while it iterates.
-    """
+    # The caller adds to ``fixed_values`` while it iterates.
     inverses: dict[Any, Element] = {}
     for op in block.operations:
         if op.name != "div" or op.dtype.kind != "f":

@@ -51,8 +51,6 @@ def explain(step: Step, data: Record, measure: bool = False) -> str:
 
 
 def _measure_split_cost(step: Step, data: Record, unfused_names: list[str]) -> str:
-    """Return the cost of the stages that split a step, measured against the same step without them."""
-
     def measure_seconds(step: Step, n: int = 64) -> float:
         jax.block_until_ready(step(data, jnp.int32(n)))  # compiles
         start_time = time.perf_counter()

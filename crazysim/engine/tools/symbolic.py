@@ -53,7 +53,6 @@ def require_casadi(block: Block) -> None:
 
 
 def _refusal_reason(op: Operation) -> str | None:
-    """Return the reason why CasADi has no form for an operation; None if it has a form."""
     match op.name:
         case "threefry2x32":
             return RANDOM_REASON
@@ -98,7 +97,6 @@ class _Interpreter:
         return self.env[x] if isinstance(x, Value) else self.casadi.SX(float(x))
 
     def _results(self, op: Operation, args: list[Expression]) -> list[Expression]:
-        """Return the expressions of the results of an operation."""
         match op.name:
             case "when":
                 mask, *old_values = args
@@ -141,17 +139,13 @@ class _Interpreter:
         return x if is_in_range else self._wrap(x, float(limits.min), 2.0 ** (8 * new_type.itemsize))
 
     def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
-        """Wrap a whole number around to the range from ``low`` to ``low + length - 1``, as integer types do."""
         return x - length * self.casadi.floor((x - low) / length)
 
     def _round_towards_zero(self, x: Expression) -> Expression:
         return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))
 
     def _guarded_sqrt(self, x: Expression) -> Expression:
-        """Return a square root whose derivative at zero is zero.
-
-        It is used in functions with a custom derivative, such as norms, whose arithmetic has an infinite derivative at
-        zero.
-        """
+        # It is used in functions with a custom derivative, such as norms, whose arithmetic has an infinite derivative
+        # at zero.
         ca = self.casadi
         return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)

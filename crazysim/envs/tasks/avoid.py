@@ -136,7 +136,6 @@ class Avoid(OutcomeTask):
         self.add_states(sim, placements, handles=tuple(handles))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight before the field, and obstacles in different cells."""
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
         x = draw(key, cells=N_CELLS_ALONG * field.n_cells_across, obstacles=(n, 4), drones=(n_drones, 12))
@@ -226,7 +225,6 @@ class Avoid(OutcomeTask):
         return terms.only_where(~record.flight_over_before, reward_terms)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the goal, m."""
         return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:

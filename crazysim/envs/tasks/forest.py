@@ -125,7 +125,6 @@ class Forest(OutcomeTask):
         self.add_states(sim, [*collision_placements(sim), StagePlacement(judge, before="increment_steps")])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight in front of a new forest."""
         n_drones, dtype = data.core.n_drones, data.states.pos.dtype
         x = draw(key, n_drones, start=3, goal=3, rpy=3, vel=3)
         start_shift, goal_shift, rpy, vel = (2 * x[name] - 1 for name in ("start", "goal", "rpy", "vel"))
@@ -208,7 +207,6 @@ class Forest(OutcomeTask):
         return terms.only_where(~record.flight_over_before, reward_terms)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the goal line, m."""
         return jnp.maximum(self.length - data.states.pos[..., 0], 0.0)
 
     def target(self, data: SimData) -> Array:

@@ -37,7 +37,6 @@ class GoalTask(Task):
         return self.write(data, goal=pos)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the vector to its goal, m."""
         return state_of(data) | {"difference_to_goal": self.read(data).goal - data.states.pos}
 
     def crashed(self, data: SimData) -> Array:
@@ -48,7 +47,6 @@ class GoalTask(Task):
         return jnp.any(self.crashed(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the goal, m."""
         return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:

@@ -36,7 +36,6 @@ class Hover(GoalTask):
     """Distance below which the drone is at its goal, m."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight, and their goals."""
         x = draw(key, data.core.n_drones, start=3, goal=3, rpy=3, vel=3, ang_vel=3)
         box = np.array([self.reach, self.reach, 0.7 * self.reach])
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
@@ -45,7 +44,6 @@ class Hover(GoalTask):
         return self.write(data, goal=MIDDLE + scale_symmetric(x["goal"], box))
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return proximity to the goal, and costs of turning, of changing actions and of a crash."""
         return {
             "proximity": terms.proximity(self.error(data)),
             "spin": -0.002 * terms.spin(data),

@@ -66,7 +66,6 @@ class Land(TouchDown):
     """Handle of the pads, one per drone."""
 
     def install(self, sim: Sim) -> None:
-        """Add the pads, their motion and the check of contacts."""
         pads = sim.scene.add(
             "landing_pad", PAD, count=sim.n_drones, pos=self.path_centres(sim.n_drones), radius=self.radius
         )
@@ -74,7 +73,6 @@ class Land(TouchDown):
 
         @stage("world")
         def move_pads(data: SimData) -> SimData:
-            """Move the pads to their positions at the end of this step."""
             pos, vel = self.pad_motion(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
@@ -84,7 +82,6 @@ class Land(TouchDown):
         self.add_states(sim, placements, pads=pads)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight about a metre above their pads."""
         n_drones = data.core.n_drones
         x = draw(key, n_drones, start=3, rpy=3, vel=3, circle=1, direction=1, phase=1)
         dtype = data.states.pos.dtype
@@ -103,7 +100,6 @@ class Land(TouchDown):
         return self.read(data).pads.set_pose(data, pos, vel=pad_vel) if self.speed > 0 else data
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's pad, world frame. (..., 3) each"""
         return self.pad_motion(data, data.core.steps + steps_ahead if steps_ahead else data.core.steps)
 
     def has_left_arena(self, data: SimData) -> Array:
@@ -133,6 +129,5 @@ class Land(TouchDown):
         return self.path_centre(data) + record.circle * radial, record.circle * record.ang_vel * tangential
 
     def subjects(self, data: SimData) -> Array:
-        """Return four points on the rim of each pad, m. (4 n_drones, 3)"""
         rim = self.radius * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], data.states.pos.dtype)
         return (self.target(data)[:, None] + rim).reshape(-1, 3)

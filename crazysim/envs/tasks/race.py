@@ -139,7 +139,6 @@ class Race(OutcomeTask):
         self.add_states(sim, placements, gates=gates, obstacles=obstacles, **numbers)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight, and gates and obstacles, with the randomness of the level."""
         course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
         sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:
@@ -180,14 +179,12 @@ class Race(OutcomeTask):
         )
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the observations; see ``race_observations.observe``."""
         return observe(data, self.sensor_range)
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         return self.reward(data, action, last_action)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the next gate, m; zero where all gates are passed."""
         return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:
@@ -201,7 +198,6 @@ class Race(OutcomeTask):
             return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
 
     def _displace_objects(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
-        """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""
         course, dtype = self.track, data.states.pos.dtype
         start, pos, quat, poles = course.start, course.gates_pos, self._gates_quat(), course.obstacles_pos
         if self.level == 3:
@@ -216,8 +212,6 @@ class Race(OutcomeTask):
 
 
 def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
-    """Repeat parameters of a simulation for every drone; ``names`` has their numbers of dimensions by name."""
-
     def repeat_params(data: SimData) -> SimData:
         params, shape, per_drone = data.params, data.states.pos.shape[:2], {}
         for name, ndim in names.items():  # a parameter may already have one value per drone
@@ -229,7 +223,6 @@ def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
 
 
 def _randomize_inertia(params: SimParams, x: Array) -> SimParams:
-    """Return parameters with randomised masses and inertias; ``x`` are numbers in [-1, 1]. (n_drones, 4)"""
     mass = params.mass * (1 + MASS_DEVIATION * x[..., :1])
     root = jnp.sqrt(1 + INERTIA_DEVIATION * x[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
@@ -237,17 +230,6 @@ def _randomize_inertia(params: SimParams, x: Array) -> SimParams:
 
 
 def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
-    """Return positions 0.15 to 0.3 m behind the last gates passed, m, and velocities along the gates' axes, m/s.
-
-    Args:
-        data: The data of one world.
-        passed: Number of gates passed; where it is zero, positions are behind the first gate and velocities are zero.
-            (n_drones,)
-        x: Numbers in [0, 1). (n_drones, 2)
-
-    Returns:
-        (n_drones, 3) each
-    """
     pos, quat = (pick_entry(v, jnp.maximum(passed - 1, 0)) for v in gates_of(data))
     gate_axis = rotation.rotate(quat, jnp.asarray([1.0, 0.0, 0.0], pos.dtype))
     return pos + (0.15 + 0.15 * x[..., :1]) * gate_axis, jnp.where(passed[..., None] > 0, x[..., 1:], 0) * gate_axis

@@ -70,7 +70,6 @@ class RaceByCamera(Race):
         return obs | (self.privileged(data) if self.gates_observed else {})
 
     def privileged(self, data: SimData) -> dict[str, Array]:
-        """Return true vectors to the corners of the next two gates and to the nearest two obstacles, body frame, m."""
         obs = observe(data, np.inf)
         return {name: obs[name] for name in PRIVILEGED_NAMES}
 

@@ -40,7 +40,6 @@ class ReachVel(Task):
     """Target velocity, world frame, m/s."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight, and their target velocities."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, goal=3)
         start = scale_symmetric(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
@@ -48,7 +47,6 @@ class ReachVel(Task):
         return self.write(data, target_vel=scale_symmetric(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the target velocity minus its velocity, m/s."""
         return state_of(data) | {"difference_to_target_vel": self.read(data).target_vel - data.states.vel}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
@@ -63,5 +61,4 @@ class ReachVel(Task):
         return jnp.any(on_floor(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the norm of the difference from the target velocity, m/s."""
         return rotation.safe_norm(self.read(data).target_vel - data.states.vel)[..., 0]

@@ -37,7 +37,6 @@ class Recover(GoalTask):
     """Distance below which the drone is at its goal, m."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones that were just thrown, and their goals."""
         x = draw(key, data.core.n_drones, start=3, vel=3, ang_vel=3, attitude=3)
         goal = GOAL.astype(data.states.pos.dtype)
         pos = goal + 2 * x["start"] - 1

@@ -76,7 +76,6 @@ class Swarm(Task):
         self.add_states(sim, closest=np.inf)
 
     def after_substep(self, data: SimData) -> SimData:
-        """Keep the smallest separation from another drone."""
         scaled_pos = data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
 
         def square_separation(other_pos: Array, is_self: Array) -> Array:
@@ -86,7 +85,6 @@ class Swarm(Task):
         return self.write(data, closest=jnp.minimum(self.read(data).closest, nearest))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight on the circle, and their goals."""
         n, dtype = data.core.n_drones, data.states.pos.dtype
         x = draw(key, turn=1, places=1, drones=(n, 9))
         offset, rpy, vel = jnp.split(2 * x["drones"] - 1, 3, axis=-1)
@@ -105,7 +103,6 @@ class Swarm(Task):
         return self.write(data, goal=goal, closest=separation(data.states.pos))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the vector to its goal, m, and relative motion of other drones, m and m/s."""
         relative_pos, relative_vel = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
         return state_of(data) | {
             "difference_to_goal": self.read(data).goal - data.states.pos,
@@ -114,7 +111,6 @@ class Swarm(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return proximity to the goal, and costs of crowding, turning, changing actions and ending the episode."""
         nearest_separation = separation(data.states.pos)
         return {
             "proximity": terms.proximity(self.error(data)),
@@ -145,7 +141,6 @@ class Swarm(Task):
         return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the goal, m."""
         return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:

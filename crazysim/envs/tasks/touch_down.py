@@ -88,7 +88,6 @@ class TouchDown(OutcomeTask):
         return self.write(super().before_step(data), remaining_way_before=self.error(data))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the vector to its target, m, and the target's relative velocity, m/s."""
         return state_of(data) | self.relative_target_motion(data)
 
     def relative_target_motion(self, data: SimData) -> dict[str, Array]:
@@ -113,7 +112,6 @@ class TouchDown(OutcomeTask):
         return terms.only_where(~record.flight_over_before, reward_terms)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the target, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:

@@ -59,7 +59,6 @@ class TrackTrajectory(Task):
     """Time on the trajectory at the start of the episode, s."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones near the trajectory, moving along it."""
         x = draw(key, data.core.n_drones, offset=3, rpy=3, vel=3, start_time=1)
         dtype = data.states.pos.dtype
         offset = (2 * x["offset"] - 1) * np.asarray(self.spread, dtype)
@@ -79,14 +78,12 @@ class TrackTrajectory(Task):
         return pos, vel
 
     def _derivatives(self, t: Array, order: int) -> list[Array]:
-        """Return position, m, and its derivatives up to an order. (...) to (..., 3) each"""
         evaluate: Callable[[Array], list[Array]] = functools.partial(self.trajectory.derivatives, order=order)
         for _ in range(t.ndim):
             evaluate = jax.vmap(evaluate)
         return [x[..., :3] for x in evaluate(t)]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, differences to target position and velocity, and vectors to samples, m and m/s."""
         t, s = self.time(data), data.states
         times = t[..., None] + (self.spacing * np.arange(1 + self.n_samples)).astype(t.dtype)
         pos, vel = self.motion(times)  # at the current time and at the samples
@@ -112,7 +109,6 @@ class TrackTrajectory(Task):
         return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the trajectory, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:

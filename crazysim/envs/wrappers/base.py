@@ -27,7 +27,6 @@ class Wrapper(Hooks, Env):
         self.name = next(x for x in (name, *numbered_names) if x not in used_names)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Reject subclasses that override ``reset``, ``restart`` or ``step``, because a step is compiled as a whole."""
         super().__init_subclass__(**kwargs)
         overridden = {"reset", "restart", "step"} & set(vars(cls))
         if overridden:

@@ -24,13 +24,6 @@ class CameraImages(Wrapper):
     """
 
     def __init__(self, env: Env, camera: ImageSensor, names: Mapping[str, str] | None = None):
-        """Add images to the observations of an environment.
-
-        Args:
-            env: The environment.
-            camera: The camera or lidar. It is not added to the simulation.
-            names: Names of the observations by output; None for ``"camera.depth"`` and so on, with the camera's name.
-        """
         super().__init__(env)
         self._sim: Any = env.sim
         sim = self._sim

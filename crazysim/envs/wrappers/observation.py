@@ -46,7 +46,6 @@ class Observe(Wrapper):
         return self._observe(state)
 
     def _observe(self, state: EnvState) -> EnvState:
-        """Return the state with the observations of ``fn``, after checking that they are a dict."""
         obs = self.fn(state.obs, state.data)
         expect(
             isinstance(obs, Mapping) and obs,

@@ -44,8 +44,6 @@ class EpisodeStatistics(Wrapper):
         return self._store(state, EpisodeSums(sums.reward + state.reward, sums.length + 1))
 
     def _store(self, state: EnvState, sums: EpisodeSums) -> EnvState:
-        """Return the state with the sums in ``info`` where the episode ended, and in the memory elsewhere."""
-
         def zero_outside(mask: Array, x: Array) -> Array:
             return jnp.where(mask, x, jnp.zeros((), x.dtype))
 

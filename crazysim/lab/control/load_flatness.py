@@ -94,14 +94,8 @@ def load_flat_state(
 
 
 def _norm_and_direction(vector: list[Array]) -> tuple[Array, list[Array]]:
-    """Return the norm of a vector, (..., 1), and the unit vector along it with its time derivatives, (..., 3) each.
-
-    The equations ``norm norm = vector . vector`` and ``norm direction = vector`` are differentiated by Leibniz' rule
-    and solved for the highest derivatives.
-
-    Args:
-        vector: The vector and its time derivatives. (..., 3) each
-    """
+    # The equations ``norm norm = vector . vector`` and ``norm direction = vector`` are differentiated by Leibniz' rule
+    # and solved for the highest derivatives.
     norms: list[Array] = [jnp.linalg.norm(vector[0], axis=-1, keepdims=True)]
     directions = [vector[0] / norms[0]]
     for n in range(1, len(vector)):

@@ -139,7 +139,6 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
 
 
 def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
-    """Return position, m, and velocity, m/s, of the joint relative to the centre of mass, world frame. (..., 3) each"""
     attach = jnp.broadcast_to(attach, ang_vel.shape)
     return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
 
@@ -147,10 +146,7 @@ def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, 
 def _reference(
     pos: Array, vel: Array, force: Array, force_rate: Array, setpoint: Setpoint, p: LoadLQRParams
 ) -> Reference:
-    """Return the reference of a drone with the thrust vector ``force``, N, and its derivative ``force_rate``, N/s.
-
-    The torque compensates the pull at the joint of a load with the acceleration of the setpoint.
-    """
+    # The torque compensates the pull at the joint of a load with the acceleration of the setpoint.
     total_mass = p.mass + p.load_mass
     attitude = attitude_of_thrust(
         force / total_mass, force_rate / total_mass, setpoint.snap, setpoint.yaw, setpoint.yaw_rate, setpoint.yaw_acc

@@ -119,22 +119,6 @@ class MPPI:
         cost: CostFn = tracking_cost,
         seed: int = 0,
     ):
-        """Build the rollouts.
-
-        Args:
-            sim: Simulation that is controlled; the rollouts use its present settings, plugins and objects.
-            horizon: Number of control steps of a rollout.
-            samples: Number of rollouts for each world.
-            substeps: Physics steps of a control step.
-            knots: Number of commands in a plan, 2 to ``MAX_KNOTS``.
-            freq: Rate of physics steps in rollouts, Hz; None for the rate of the simulation. A control step lasts
-                ``substeps / freq`` s, and ``command`` must be called once in that time.
-            noise: Standard deviation of the samples around the plan, in the units of the command, (k,); None for a
-                default of the command level.
-            temperature: Temperature as a fraction of the mean excess of the costs over the lowest cost.
-            cost: Cost of a control step; the cost of a rollout is the sum over its control steps.
-            seed: Seed of the samples.
-        """
         c = sim.configuration
         if c.control not in COMMAND_LEVELS:
             raise ConfigError(
@@ -262,7 +246,6 @@ class MPPI:
         return jnp.repeat(x, self.samples, axis=0)
 
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
-        """Return the data of the rollouts: the data of the simulation, once for every sample, at step 0."""
         template = self._sim.data
         require(
             data.plugins.keys() == template.plugins.keys(),
@@ -297,7 +280,6 @@ class MPPI:
         return data.core.steps % self.substeps == 0
 
     def _cost_stage(self, data: SimData) -> SimData:
-        """Add the cost of the control step that has just ended; the step counter has been incremented already."""
         record = data.plugins[RECORD_NAME]
         t = data.core.steps.astype(record.cost.dtype) / data.core.freq
         command = self._command_at(data, data.core.steps - self.substeps)
@@ -306,14 +288,12 @@ class MPPI:
         return data.replace(plugins=data.plugins | {RECORD_NAME: record})
 
     def _command_at(self, data: SimData, step: Array) -> Array:
-        """Return the command of one drone's plan at a step. (k,)"""
         knots = data.plugins[RECORD_NAME].knots
         knot_position = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
         index = jnp.clip(jnp.floor(knot_position).astype(jnp.int32), 0, self.knots - 2)
         return knots[index] + (knot_position - index) * (knots[index + 1] - knots[index])
 
     def _shift_plan(self, plan: Array) -> Array:
-        """Return the plan shifted by one control step, with its last command repeated."""
         knot_position = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
         index = np.minimum(np.floor(knot_position).astype(int), self.knots - 2)
         fraction = np.minimum(knot_position - index, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
@@ -321,7 +301,6 @@ class MPPI:
 
 
 def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the hover command, smallest and largest commands, and standard deviation of samples. (k,) each"""
     airframe, level = sim.airframe, sim.control
     mass = float(airframe.value("rigid_body.mass", ()))
     min_thrust = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))

@@ -76,7 +76,6 @@ class CasadiStep:
     """Length of the step, s."""
 
     def __call__(self, *args: Any) -> Any:
-        """Return the next state, for numbers or CasADi symbols."""
         return self.function(*args)
 
 
@@ -158,11 +157,6 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
 
 
 def _step_expressions(program: Program, initial_value: Callable[[Slot], Any]) -> dict[Slot, Any]:
-    """Return the expressions of the values that a step writes.
-
-    Raises:
-        ConfigError: If the step cannot be exported; the message names the stage.
-    """
     for segment in program.segments:
         if isinstance(segment, UnfusedStage):
             raise _export_error(segment.name, segment.error.reason)
@@ -187,12 +181,10 @@ def _export_error(stage: str, reason: str) -> ConfigError:
 
 
 def _stage_default_feedforward(data: SimData) -> SimData:
-    """Return the data with the default feedforward of the staged setpoint."""
     return stage_command(data, staged_leaves(data)[0])
 
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
-    """Return the indices of the leaves requested as parameters."""
     names = [x.name for x in program.leaves]
     is_list = isinstance(parameters, (list, tuple)) and all(isinstance(x, str) for x in parameters)
     expect(is_list and len(set(parameters)) == len(parameters), "parameters as a list of distinct names", parameters)
@@ -214,7 +206,6 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
 
 
 def _drone_numbers(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
-    """Return the elements of a leaf for one drone, as float64. (size,)"""
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
     index = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())
     return x[index].astype(np.float64).reshape(-1)

@@ -83,7 +83,6 @@ class FittedModel(PyTree):
 
 
 def _to_crazyflow_columns(log: Log) -> dict[str, NDArray]:
-    """Return the columns of a log by Crazyflow's names."""
     cmd = log.attitude_command
     if cmd is None:
         raise ConfigError(

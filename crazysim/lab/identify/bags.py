@@ -112,7 +112,6 @@ def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None =
 
 
 def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
-    """Return the topic and the field of a column."""
     matches = [topic for topic in topics if column.startswith(f"{topic}/")]
     if not matches:
         topic_list = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
@@ -125,8 +124,6 @@ def _split_column(name: str, column: str, topics: dict[str, str]) -> tuple[str, 
 
 
 def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """Return the topic and the field of each column, chosen by message type."""
-
     def find_topic(kinds: Sequence[str]) -> tuple[str, str] | None:
         for kind in kinds:
             matches = sorted(topic for topic, topic_kind in topics.items() if topic_kind == kind)
@@ -166,7 +163,6 @@ def _default_columns(name: str, topics: dict[str, str]) -> dict[str, tuple[str, 
 
 
 def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
-    """Return the messages of a topic as a stream."""
     field_readers = {column: _field_reader(field) for column, field in fields.items()}
     times, rows = [], []
     for connection, stamp, packed_message in bag.messages([c for c in bag.connections if c.topic == topic]):
@@ -195,7 +191,6 @@ def _read_stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, s
 
 
 def _field_reader(field: str) -> Callable[[Any], Any]:
-    """Return the function that reads a field, such as ``pose/position/x`` or ``data[0]``."""
     parts = re.findall(r"[^/\[\]]+", field)
 
     def read_field(message: Any) -> Any:
@@ -207,7 +202,6 @@ def _field_reader(field: str) -> Callable[[Any], Any]:
 
 
 def _with_world_velocity(stream: Stream) -> Stream:
-    """Return the stream with its velocity, if it has one, rotated from the body frame to the world frame."""
     c = stream.columns
     if "vx" not in c:
         return stream

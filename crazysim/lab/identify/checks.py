@@ -160,7 +160,6 @@ class Law(NamedTuple):
 
 
 def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> list[Law]:
-    """Check the laws that the columns must obey."""
     upward = float(np.median(rotate(data["quat"], Z_AXIS)[:, 2]))
     fault = f"a thrust that points up in most samples, got {upward:.2f} as the median of its z component"
     laws = [Law("" if upward > 0 else fault, True)]
@@ -176,7 +175,6 @@ def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
 
 
 def _rate_pairs(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
-    """Yield a pair of changes for each measured rate, and the number of samples per window."""
     if "vel" not in derived_keys:
         width, (change, expected) = _window_changes(t, 0.2, data["pos"], integrate(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
@@ -188,12 +186,9 @@ def _rate_pairs(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str
 
 
 def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
-    """Return measured changes of the acceleration, and changes expected from attitude, rotor speeds and gravity.
-
-    The thrust is proportional to the sum of the squared rotor speeds, scaled so that the median of its vertical
-    component is the weight. Without rotor speeds, its vertical component is the weight, unless the tilt is large.
-    Constant accelerations, such as from drag in cruise, cancel in the difference between consecutive windows.
-    """
+    # The thrust is proportional to the sum of the squared rotor speeds, scaled so that the median of its vertical
+    # component is the weight. Without rotor speeds, its vertical component is the weight, unless the tilt is large.
+    # Constant accelerations, such as from drag in cruise, cancel in the difference between consecutive windows.
     axis = rotate(data["quat"], Z_AXIS)
     if data["rotor_vel"].shape[1]:
         squares = np.sum(data["rotor_vel"] ** 2, axis=1)
@@ -215,7 +210,6 @@ def _thrust_pair(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
 
 
 def _window_changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
-    """Return the number of samples per window, and the changes of series over all windows, zero across a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)
     has_no_gap = t[width:] - t[:-width] < 1.5 * width * dt
@@ -223,7 +217,6 @@ def _window_changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int,
 
 
 def _diverged_windows(pair: Pair, size: int) -> NDArray:
-    """Return True for the windows of pieces, ``size`` windows each, whose error exceeds ten times the motion. (n,)"""
     motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
     typical_motion, is_diverged = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
     for k in range(0, len(motion), size):
@@ -237,8 +230,6 @@ def _diverged_windows(pair: Pair, size: int) -> NDArray:
 def _propose_remedies(
     data: Mapping[str, NDArray], derived_keys: tuple[str, ...]
 ) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
-    """Yield the remedy for each common mistake as text, and the columns after it."""
-
     def scale_columns(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
 

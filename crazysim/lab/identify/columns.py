@@ -70,7 +70,6 @@ class Columns:
     """Factor from the commands of the rotors to shares of the battery's voltage."""
 
     def __post_init__(self) -> None:
-        """Check the numbers of names, and the factors."""
         for key, counts in NAME_COUNTS.items():
             names = getattr(self, key)
             if isinstance(names, str) or len(names) not in counts:
@@ -144,7 +143,6 @@ def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str],
 
 
 def _as_numbers(name: str, key: str, values: NDArray) -> NDArray:
-    """Return one column as numbers."""
     x = np.asarray(values)
     if x.dtype.kind not in "fiub" or x.ndim != 1:
         got = f"{x.ravel()[0]!s:.40} in its first row" if x.ndim == 1 and x.size else f"shape {x.shape} of {x.dtype}"

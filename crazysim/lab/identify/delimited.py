@@ -97,7 +97,6 @@ def parse_number(text: str) -> float:
 
 
 def _parse_column(cells: Sequence[str]) -> NDArray:
-    """Return a column as numbers, NaN for cells without a number; as text unless most cells have finite numbers."""
     try:
         return np.array(cells, np.float64)
     except ValueError:

@@ -227,7 +227,6 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
 
 
 def _fit_forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArray, NDArray]:
-    """Return the parameters of the force, see ``FORCE_TERMS``, and their deviations."""
     mass, gravity = float(params.mass[0]), np.asarray(params.gravity_vec, np.float64)
 
     def terms(log: Log) -> tuple[NDArray, NDArray]:
@@ -247,7 +246,6 @@ def _fit_forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[N
 def _fit_torques(
     logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, rotation_factors: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return the parameters of the torque, see ``TORQUE_TERMS``, and their deviations."""
     mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
     root = np.sqrt(rotation_factors[:3])
     inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
@@ -272,20 +270,12 @@ def _fit_torques(
 
 
 def _to_body_frame(log: Log, vector: NDArray) -> NDArray:
-    """Return vectors of the world frame in the body frame. (n, 3)"""
     return np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(vector)), np.float64)
 
 
 def _fit_regression(
     logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], is_nonpositive: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
-
-    Args:
-        logs: Logs.
-        terms: Function that returns the rate of momentum per coefficient in a log, (n, 3, k), and the momentum, (n, 3).
-        is_nonpositive: True for coefficients that are at most zero. (k,)
-    """
     regressors, momentum_changes, pieces = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
@@ -326,13 +316,11 @@ def _fit_regression(
 
 
 def _smooth_columns(x: NDArray, size: int = 9) -> NDArray:
-    """Return columns after averaging over ``size`` samples with the weights of a Hann window."""
     kernel = np.hanning(size + 2)[1:-1]
     return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
 
 def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return smoothed accelerations without gravity, angular accelerations and velocities, body frame, and thrusts."""
     interior = slice(10, -10)
     acc = np.gradient(_smooth_columns(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
     ang_acc = np.gradient(_smooth_columns(log.ang_vel), log.t, axis=0)
@@ -342,7 +330,6 @@ def _create_regressors(log: Log, params: first_principles.Params) -> tuple[NDArr
 
 
 def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
-    """Check that the logs have equal sample times, and rotor speeds that fit the airframe in number and unit."""
     require(logs, "expected at least one log, got none")
     params = first_principles.Params.create(airframe)
     hover = np.broadcast_to(np.asarray(first_principles.hover_rotor_vel(params)).ravel(), airframe.n_rotors)
@@ -367,7 +354,6 @@ def _check_logs(logs: Sequence[Log], airframe: Airframe) -> None:
 
 
 def _check_rotor_order(logs: Sequence[Log], airframe: Airframe) -> None:
-    """Check that no other order of the rotors explains the angular accelerations much better."""
     params = first_principles.Params.create(airframe)
     pieces = [_create_regressors(log, params) for log in logs]
     _, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
@@ -398,7 +384,6 @@ def _check_rotor_order(logs: Sequence[Log], airframe: Airframe) -> None:
 
 
 def _airframe_changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str, NDArray]:
-    """Return the numbers of the identified airframe that differ from its base."""
     thrust, *moments, torque, rotor = [values[name] for name in FACTOR_NAMES]
     root = np.sqrt(moments)
     inertia = base.inertia * np.outer(root, root)
@@ -424,7 +409,6 @@ def _airframe_changes(base: Airframe, mass: float, values: dict[str, float]) -> 
 
 
 def _nest_tables(base: str, name: str, changes: dict[str, NDArray]) -> dict:
-    """Return the tables of an airframe with a base and changes."""
     tables: dict = {"name": f"{name}_identified", "base": base}
     for path, value in changes.items():
         table, _, key = path.rpartition(".")

@@ -84,13 +84,11 @@ def join_motion_capture(
 
 
 def _number_columns(table: Mapping[str, NDArray], n: int, excluded: Sequence[str]) -> dict[str, NDArray]:
-    """Return the columns with n numbers, other than ``excluded``."""
     columns = {key: np.asarray(x) for key, x in table.items() if key not in excluded}
     return {key: x.astype(np.float64) for key, x in columns.items() if x.shape == (n,) and x.dtype.kind in "fiub"}
 
 
 def _find_lag(a: NDArray, b: NDArray) -> tuple[float, float]:
-    """Return the number of samples by which b is shifted to agree best with a, and the correlation there, -1 to 1."""
     n = len(a) + len(b)
 
     def cross_correlate(x: NDArray, y: NDArray) -> NDArray:

@@ -85,8 +85,6 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
 
 
 def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
-    """Return the rotor speeds that lag behind commands held between samples, rpm. (n, n_rotors)"""
-
     def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         cmd, duration = x
         speed_error = cmd - speed
@@ -142,7 +140,6 @@ class _RateFit(NamedTuple):
 
 
 def _fit_logs(logs: Sequence[Log], n_taps: int) -> list[list[_RateFit]]:
-    """Return the fits of the rotors of each log with commands and measured speeds."""
     fits = []
     for log in logs:
         if log.modelled or log.command is None or not log.rotor_vel.shape[1]:
@@ -156,12 +153,9 @@ def _fit_logs(logs: Sequence[Log], n_taps: int) -> list[list[_RateFit]]:
 
 
 def _fit_rate(command: NDArray, speed: NDArray, dt: float, n_taps: int) -> _RateFit:
-    """Return the lag of one rotor, from a grid of rates and delays in samples that is refined about its best point.
-
-    The speed is a sum of ``n_taps`` lagged commands that are a sample later each, and of their squares. Two of them
-    are exact for any delay between samples of a command that is held; a single one would have to be a straight line
-    between samples.
-    """
+    # The speed is a sum of ``n_taps`` lagged commands that are a sample later each, and of their squares. Two of them
+    # are exact for any delay between samples of a command that is held; a single one would have to be a straight line
+    # between samples.
     terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
     n_delays, n = round(MAX_DELAY / dt), len(speed)
     inner = np.arange(round(0.5 / dt), n - n_delays)

@@ -75,7 +75,6 @@ def fit_residual(
     scale = weight * jnp.repeat(jnp.array([FORCE_SCALE, TORQUE_SCALE * float(params.L[0])]), 3)
 
     def make_residual(weights: dict[str, Array]) -> Residual:
-        """Return the residual from weights of order one."""
         linear = model.residual.linear + scale[:, None] * weights["linear"] / input_std
         if not n_hidden:
             return Residual(linear, is_bound=True)

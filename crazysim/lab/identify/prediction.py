@@ -203,7 +203,6 @@ def predict(
 
 @functools.partial(jax.jit, static_argnames=("dt", "constant_rates"))
 def _predict_all(model: Predictor, batch: Windows, dt: float, constant_rates: bool = False) -> tuple[Array, Array]:
-    """Return predicted positions and attitudes of all windows; models of the same kind share the compiled program."""
     return jax.vmap(lambda window: predict(model, window, dt, constant_rates)[:2])(batch)
 
 

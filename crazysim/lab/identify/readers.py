@@ -191,7 +191,6 @@ def _are_uint32(x: NDArray) -> bool:
 
 
 def _read_events(content: bytes, n_events: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
-    """Return name, variables and layout of each event, and the offset of the first record, bytes."""
     events, offset = {}, 5
 
     def read_string(offset: int) -> tuple[str, int]:

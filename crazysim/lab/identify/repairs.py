@@ -84,7 +84,6 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
 
 
 def _longest_increasing_sequence(t: NDArray) -> NDArray:
-    """Return True for the samples of the longest increasing sequence, found by patience sorting. (n,)"""
     end_times: list[float] = []
     last_indices: list[int] = []
     predecessors = np.full(len(t), -1)

@@ -259,7 +259,6 @@ class _Rotors(NamedTuple):
 
 
 def _fit_speeds(log: Log) -> NDArray:
-    """Return the rotor speeds fitted by finite impulse responses to commands and their squares. (n, n_rotors)"""
     n, count = len(log.t), round(RESPONSE_DURATION / log.dt)
     index = np.clip(np.arange(n)[:, None] - np.arange(-1, count)[None], 0, n - 1)
     speeds = []
@@ -270,22 +269,18 @@ def _fit_speeds(log: Log) -> NDArray:
 
 
 def _centred_change(x: NDArray) -> NDArray:
-    """Return the change over the two intervals around each sample, zero at the ends."""
     change = np.zeros_like(x)
     change[1:-1] = x[2:] - x[:-2]
     return change
 
 
 def _two_interval_integral(x: NDArray, dt: float) -> NDArray:
-    """Return the integral over the two intervals around each sample, zero at the ends; exact up to degree 5."""
     total = np.zeros_like(x)
     total[2:-2] = (114 * x[2:-2] + 34 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) * (dt / 90)
     return total
 
 
 def _band_pass(x: NDArray, dt: float, fast_width: float, slow_width: float) -> NDArray:
-    """Return the band-passed signal. (n, k)"""
-
     def smooth_columns(width: float) -> NDArray:
         size = 2 * max(1, round(width / dt / 2)) + 1
         kernel = np.hanning(size + 2)[1:-1]
@@ -308,11 +303,8 @@ class _Block(NamedTuple):
 def _solve_logs(
     logs: Sequence[_LogTerms], fast_width: float, *, has_corners: bool = False
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return medians over all blocks, (5,), delays of the logs, (n_logs,), and influences of pieces. (n_pieces, 5)
-
-    The influences are those on the medians, and on the mean of the delays. With ``has_corners``, rotor speeds are
-    straight lines between samples for yaw, with ``YAW_DELAY_STD``: as if all their curvature were corners at samples.
-    """
+    # The influences are those on the medians, and on the mean of the delays. With ``has_corners``, rotor speeds are
+    # straight lines between samples for yaw, with ``YAW_DELAY_STD``: as if all their curvature were corners at samples.
     blocks = [_solve_blocks(log, fast_width, has_corners) for log in logs]
     all_blocks = list(itertools.chain.from_iterable(blocks))
     require(all_blocks, f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs.")
@@ -337,7 +329,6 @@ def _solve_logs(
 
 
 def _solve_blocks(log_terms: _LogTerms, fast_width: float, has_corners: bool) -> list[_Block]:
-    """Return the solution of each block of a log that has a second or more outside of gaps."""
     dt, n, margin = log_terms.dt, len(log_terms.ang_vel_change), round(YAW_SLOW_WIDTH / log_terms.dt / 2)
     is_kept = np.ones(n, bool)
     for gap in (0, *log_terms.gaps, n):
@@ -372,13 +363,9 @@ def _solve_blocks(log_terms: _LogTerms, fast_width: float, has_corners: bool) ->
 def _solve_samples(
     log_terms: _LogTerms, axis: int, delay: float, samples: NDArray, fast_width: float, n_taps: int = 6
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the coefficients of the regressors, their variances, and the influences of ``samples``, (n, k).
-
-    Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
-    the drag torque and the reaction of the rotors; about each axis also the angular velocity, as the last regressor.
-    All are integrated over the two intervals around each sample.
-    """
-
+    # Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
+    # the drag torque and the reaction of the rotors; about each axis also the angular velocity, as the last regressor.
+    # All are integrated over the two intervals around each sample.
     def terms(rotors: _Rotors) -> NDArray:
         if axis == 2:
             columns = rotors.impulse[:, 2], rotors.reaction

@@ -62,7 +62,6 @@ def read_table(
 def _read_source(
     source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
 ) -> tuple[str, Mapping[str, NDArray]]:
-    """Return the name of a log and its columns, with the time in s and the attitude as the source has it."""
     if isinstance(source, Mapping):
         return "log", _convert_time("log", source, columns)
     path = Path(source)
@@ -103,7 +102,6 @@ def _read_source(
 
 
 def _convert_time(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
-    """Return the table with its time in s."""
     names = columns or KNOWN_COLUMNS["crazysim"]
     if names.time not in table:
         return table

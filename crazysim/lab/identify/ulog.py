@@ -121,25 +121,13 @@ class Topic(dict[str, NDArray]):
         self.location = location
 
     def __missing__(self, name: str) -> NDArray:
-        """Raise the error of a missing field."""
         raise ConfigError(
             f"{self.location}: expected a field {name}, got {', '.join(self)[:200]}. Take a log of PX4 1.9 or newer."
         )
 
 
 def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str, Topic]:
-    """Return the first instances of topics, their fields by name, such as ``q[0]`` or ``esc[2].esc_rpm``.
-
-    Where a file is damaged, the messages up to the next synchronisation message are left out.
-
-    Args:
-        path: File.
-        topics: Names of the topics; topics without messages are left out.
-        repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        DamagedFileError: If the file is not a ULog, or a topic has no format.
-    """
+    # Where a file is damaged, the messages up to the next synchronisation message are left out.
     content = path.read_bytes()
     require(
         len(content) >= HEADER_SIZE and content.startswith(MAGIC),
@@ -193,10 +181,7 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
 def _read_layout(
     file: str, formats: Mapping[str, str], name: str, prefix: str = "", depth: int = 0
 ) -> list[tuple[str, str]]:
-    """Return names and types of the fields of a format, with nested formats unrolled.
-
-    Padding at the end, which PX4 does not log, is left out.
-    """
+    # Padding at the end, which PX4 does not log, is left out.
     quoted, remedy = repr(name[:60]), "Copy the file again."
     if name not in formats or depth > MAX_DEPTH:
         got = f"over {MAX_DEPTH} within each other" if name in formats else "none"

@@ -16,7 +16,6 @@ def rotate(quat: NDArray, vec: NDArray) -> NDArray:
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
-    """Return cross products; ``np.cross`` takes five times as long for a few vectors. (..., 3)"""
     return a.take(_NEXT_AXIS, -1) * b.take(_SECOND_NEXT_AXIS, -1) - a.take(_SECOND_NEXT_AXIS, -1) * b.take(
         _NEXT_AXIS, -1
     )

@@ -60,20 +60,6 @@ class Browser(Viewer[Live]):
         follow: bool = False,
         plot: str = "states.pos",
     ):
-        """Choose what to show; ``live.show`` starts the server.
-
-        Args:
-            port: Port; 0 for any free one.
-            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
-            worlds: Indices of the worlds, shown side by side; None for all, up to ``MAX_WORLDS``.
-            spacing: Distance between the origins of shown worlds, m; None for the largest horizontal extent of the
-                drones of a world in the first picture, plus a margin.
-            trail: Duration of the motion that trails show, s; 0 for none.
-            contacts: True to mark drones that touch something; contacts are then computed for every picture.
-            wind: True to draw the wind at every drone.
-            follow: True to keep the followed body in the middle at first.
-            plot: Quantity that is plotted at first.
-        """
         for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
             require(np.isfinite(value) and value >= 0, f"expected a {name} of 0 or more, got {value!r}")
         self._access = Access(host, port)
@@ -151,7 +137,6 @@ class Browser(Viewer[Live]):
         self._panel.update(picture, time.perf_counter())
 
     def close(self) -> None:
-        """Stop the server, which disconnects all browsers."""
         if self._server is not None:
             server, self._server = self._server, None
             with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops

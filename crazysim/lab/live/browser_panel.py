@@ -46,16 +46,6 @@ class BrowserPanel:
     """Quantity that is plotted; empty for none."""
 
     def __init__(self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str):
-        """Add the panel's elements to a server.
-
-        Args:
-            server: Server of viser.
-            live: Loop; the panel shows its buttons and sliders.
-            scene: Scene; the panel shows and hides its layers.
-            bodies: Bodies that can be followed.
-            follow: Initial value of ``follow``.
-            plot: Initial value of ``plot``.
-        """
         self._gui = gui = server.gui
         self._scene, self._live = scene, live
         names = list(dict.fromkeys(["", *live.quantities, *list_quantities(live.sim)]))
@@ -179,7 +169,6 @@ class BrowserPanel:
             self._add_key(gui, live, name, key, hotkey)
 
     def _add_body_choice(self, gui: Any, live: Live, world_input: Any, bodies: SceneBodies) -> None:
-        """Add the choice of the followed body, which may be a vehicle, a load or an object."""
         bodies_by_name = {body.name: body for body in bodies.items}
         self._body_input = choice = gui.add_dropdown("body", ("", *bodies_by_name))
 
@@ -191,7 +180,6 @@ class BrowserPanel:
                 live.post(lambda live: live.follow(world, body.kind, body.index))
 
     def _add_key(self, gui: Any, live: Live, name: str, key: str, hotkey: str) -> None:
-        """Add a hotkey that holds a key of the loop for a moment."""
         command = gui.add_command(f"Fly: {name}", hotkey=hotkey)
         command.on_trigger(lambda _: live.keyboard.hold(key, KEY_HOLD_TIME))
 
@@ -217,12 +205,10 @@ class BrowserPanel:
 
 
 def _post_on_click(button: Any, live: Live, callback: Callable[[Live], object]) -> None:
-    """Make a button post a function to the loop."""
     button.on_click(lambda _: live.post(callback))
 
 
 def _nearest_speed(speed: Speed) -> str:
-    """Return the choice that is nearest to a speed."""
     if speed == "max":
         return "max"
     return min(SPEEDS[:-1], key=lambda choice: abs(np.log(float(choice) / speed)))

@@ -38,16 +38,6 @@ class BrowserScene:
         spacing: float,
         trail: float,
     ):
-        """Add all nodes.
-
-        Args:
-            server: Server of viser.
-            shapes: Visible geoms of the scene.
-            bodies: Bodies that can be picked.
-            picture: First picture.
-            spacing: Distance between the origins of neighbouring worlds, m.
-            trail: Duration of the motion that trails show, s; 0 for no trails.
-        """
         self._scene, self._bodies = server.scene, bodies
         scene = server.scene
         n_worlds, n_drones = picture.drone_pos.shape[:2]
@@ -146,16 +136,8 @@ class BrowserScene:
         return shown_index, None, point - self.offsets[shown_index]
 
     def _ray_distances(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
-        """Return the distance between a ray and the origin of each body in n shown worlds, m. (n, n_mocap)
-
-        The distance is infinite if the ray does not enter the box around the body. Boxes of small and distant bodies
-        are enlarged, so that these bodies are easy to click.
-
-        Args:
-            picture: Picture that the user has seen.
-            origin: Start of the ray, frame of the grid of worlds, m. (3,)
-            direction: Unit vector. (3,)
-        """
+        # The distance is infinite if the ray does not enter the box around the body. Boxes of small and distant bodies
+        # are enlarged, so that these bodies are easy to click.
         start = origin - self._to_grid(picture.pos)
         distance = np.linalg.norm(start, axis=-1, keepdims=True)
         low, high = self._bodies.low, self._bodies.high
@@ -173,7 +155,6 @@ class BrowserScene:
         return np.where(is_hit, ray_distance, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
-        """Add bodies that have the same geoms, as one batch for each colour."""
         shapes_by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
         for shape in shapes:
             shapes_by_color[tuple(np.round(shape.rgba, 3))].append(shape)
@@ -190,7 +171,6 @@ class BrowserScene:
             self._batches.append((handle, bodies))
 
     def _add_spheres(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
-        """Add a sphere at each point of all worlds, and return their node, or None if there are no points."""
         if not pos.size:
             return None
         import trimesh
@@ -216,12 +196,6 @@ class BrowserScene:
         self._wind.points = ends
 
     def _show_lights(self, drone_pos: NDArray, colors: NDArray) -> None:
-        """Show the LEDs of all drones; colours are sent only when they change.
-
-        Args:
-            drone_pos: Positions of the n shown drones, frame of the grid, m. (n, 3)
-            colors: Colours, 0 to 1; zero for off. (n, 3)
-        """
         if not np.array_equal(colors, self._led_colors):
             self._led_colors = colors
             self._lights.batched_colors = to_rgb_bytes(colors)
@@ -246,7 +220,6 @@ class BrowserScene:
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _to_grid(self, pos: NDArray) -> NDArray:
-        """Return positions in the frame of the grid, from positions in the frame of each world, m."""
         return pos + self.offsets[:, None]
 
 
@@ -264,7 +237,6 @@ def to_rgb_bytes(colors: NDArray) -> NDArray:
 
 
 def _group_equal_bodies(shapes_by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
-    """Return lists of the mocap ids of bodies with equal geoms."""
     groups: dict[tuple, list[int]] = defaultdict(list)
     for body, shapes in shapes_by_body.items():
         key = tuple(

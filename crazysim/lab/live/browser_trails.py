@@ -20,14 +20,6 @@ class Trails:
     """The recent positions of all bodies, as one set of a fixed number of line segments."""
 
     def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
-        """Create trails of length zero.
-
-        Args:
-            scene: Scene of viser.
-            pos: Positions of all bodies, m. (n, 3)
-            colors: Colours of the trails, 0 to 1. (n, 3)
-            seconds: Duration of the motion that the trails show, s.
-        """
         self._length = max(round(seconds / TRAIL_PERIOD), 1)
         self._samples: deque[NDArray] = deque(maxlen=self._length)
         self._last_time = -np.inf
@@ -54,7 +46,6 @@ class Trails:
             self._handle.points = self._make_segments(pos)
 
     def _make_segments(self, pos: NDArray) -> NDArray:
-        """Return the segments through the samples and ``pos``, oldest first, padded at the start. (length * n, 2, 3)"""
         path = [*self._samples, pos]
         path = [path[0]] * (self._length + 1 - len(path)) + path
         points = np.stack(path[-self._length - 1 :])

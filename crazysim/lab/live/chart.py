@@ -20,11 +20,6 @@ class Chart:
     """Plot of one quantity over time, with a line for each of its numbers."""
 
     def __init__(self, name: str):
-        """Create an empty chart.
-
-        Args:
-            name: Title.
-        """
         self._name, self._selected_drone = name, None
         self._times: list[float] = []
         self._values: list[np.ndarray] = []

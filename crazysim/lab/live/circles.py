@@ -21,17 +21,10 @@ class Circles:
     """Process that makes the drones rise and fly circles that pass above their initial positions."""
 
     def __init__(self, live: Live, piloted: bool):
-        """Create circles that pass above the drones' present positions.
-
-        Args:
-            live: Loop of the simulation.
-            piloted: True to leave the first drone of the first world to a pilot once it has risen.
-        """
         self._initial_pos = np.asarray(live.sim.data.states.pos, float).copy()
         self._is_piloted = piloted
 
     def __call__(self, live: Live) -> None:
-        """Write the setpoints of this control step."""
         command = circle_commands(self._initial_pos, live.time)
         if self._is_piloted:
             if live.time > CLIMB_DURATION:

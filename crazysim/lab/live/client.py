@@ -54,17 +54,6 @@ class DroneClient(_Client):
     """Control of one drone. No other client can command that drone until this client disconnects."""
 
     def __init__(self, drone: int, host: str = "127.0.0.1", port: int = DRONE_PORT, timeout: float = 5.0):
-        """Connect and request the drone.
-
-        Args:
-            drone: ID of the drone, 1 to 99.
-            host: Address of the server.
-            port: Port for commands to single drones.
-            timeout: Longest time to wait for an answer, s.
-
-        Raises:
-            ConfigError: If there is no server, or the drone is not free.
-        """
         require(1 <= drone <= 99, f"expected the ID of a drone from 1 to 99, got {drone!r}")
         super().__init__(host, port, timeout)
         try:
@@ -106,16 +95,6 @@ class StreamClient(_Client):
     """Client of the server's stream port, which accepts shows and commands to any drone."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = 5.0):
-        """Connect.
-
-        Args:
-            host: Address of the server.
-            port: Port of the stream.
-            timeout: Longest time to wait for an answer, s.
-
-        Raises:
-            ConfigError: If there is no server.
-        """
         super().__init__(host, port, timeout)
 
     def command(self, drone: int, command: str, argument: str = "") -> None:

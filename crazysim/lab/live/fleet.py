@@ -56,15 +56,6 @@ class Fleet:
         teleport: bool = True,
         name: str = "fleet",
     ):
-        """Add the plugin that moves the drones to a simulation; every drone hovers at its position.
-
-        Args:
-            sim: Simulation of one world with state commands.
-            ids: Index of the drone of each ID that is in use; None if no ID is in use yet.
-            max_pieces: Largest number of pieces of a trajectory.
-            teleport: True to move a drone to the start of its first trajectory, if no command has moved it before.
-            name: Name of the plugin that follows the trajectories.
-        """
         require(
             sim.n_worlds == 1,
             f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories in several worlds.",
@@ -159,7 +150,6 @@ class Fleet:
                 self._apply_to_drone(command, drone)
 
     def _apply_to_drone(self, command: Command, drone: int) -> None:
-        """Carry out a command to one drone."""
         if isinstance(command, Upload):
             self._receive_trajectory(drone, command.trajectory)
             return
@@ -178,7 +168,6 @@ class Fleet:
             self._assign_trajectory(drone, _vertical_trajectory(setpoint, 0.0))
 
     def _find_drones(self, drone_id: int | None) -> list[int]:
-        """Return the indices of the drones with an ID; a new ID is assigned to the next free drone."""
         if drone_id is None:
             return list(range(self.sim.n_drones))
         if drone_id not in self.ids:
@@ -221,7 +210,6 @@ class Fleet:
         self._assign_trajectory(drone, trajectory)
 
     def _assign_trajectory(self, drone: int, trajectory: Trajectory) -> None:
-        """Make a drone follow a trajectory from now on."""
         data = self.follow.uploaded(self.sim.data, drone, trajectory)
         record, now = self.follow.read(data), self._current_time()
         start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
@@ -231,18 +219,15 @@ class Fleet:
 
 
 def _hover_trajectory(point: NDArray) -> Trajectory:
-    """Return the trajectory that stays at a position, m, and yaw, rad. (4,)"""
     return hover(point[:3], float(point[3]))
 
 
 def _vertical_trajectory(point: NDArray, height: float) -> Trajectory:
-    """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
     seconds = max(abs(height - float(point[2])) / VERTICAL_SPEED, MIN_VERTICAL_DURATION)
     return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
 
 
 def _remove_padding(trajectory: Trajectory) -> Trajectory:
-    """Return one trajectory of a stacked record without the zero-length pieces that pad its end."""
     ends = np.asarray(trajectory.ends, float)
     n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
     host_trajectory = jax.tree.map(np.asarray, trajectory)
@@ -256,7 +241,6 @@ class RemoteCommands:
         self._fleet, self._queue = fleet, queue
 
     def __call__(self, live: Live) -> None:
-        """Carry out the commands that have arrived since the last call, and show the lights of a show."""
         self._fleet.apply(self._queue.commands())
         live.lights[0] = self._fleet.colors()
 

@@ -87,7 +87,6 @@ class MessageBuffer:
         self._reset_scan()
 
     def _reset_scan(self) -> None:
-        """Restart the search for the end of the message at the front."""
         self._scan_position = self._depth = 0
         self._in_string = False
 
@@ -108,7 +107,6 @@ class MessageBuffer:
             yield message
 
     def _take_message(self) -> Message | Request | ShowFile | None:
-        """Return the message at the front of the buffer and remove it; None if it is incomplete."""
         if not self._scan_position and self._buffer[:1] and self._buffer[0] in SPACE_BYTES:
             del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE_BYTES))]
         buffer = self._buffer
@@ -135,7 +133,6 @@ class MessageBuffer:
         return None
 
     def _may_start_message(self, front: bytes) -> bool:
-        """Return True if these bytes may be the start of a message."""
         if any(start.startswith(front[: len(start)]) for start in MESSAGE_STARTS) and len(front) <= MAX_TEXT:
             command_text = front[len(b"CMDSTART_") :]
             return not front.startswith(b"CMDSTART_") or bool(
@@ -147,7 +144,6 @@ class MessageBuffer:
         return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest[10:]))
 
     def _read_message(self, head: re.Match[bytes]) -> Message | None:
-        """Return the text message at the front of the buffer; None if it is incomplete."""
         buffer = self._buffer
         brace = buffer.find(b"{", head.end() - 1, MAX_TEXT)
         end = buffer.find(b"_EOF", head.end() - 1, MAX_TEXT)
@@ -162,7 +158,6 @@ class MessageBuffer:
         return message
 
     def _read_json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
-        """Return the message at the front of the buffer, with the JSON that begins at ``brace``."""
         buffer = self._buffer
         end = self._find_json_end(brace)
         if end is None:
@@ -179,7 +174,6 @@ class MessageBuffer:
         return message
 
     def _find_json_end(self, brace: int) -> int | None:
-        """Return the end of a JSON object; each byte is examined only once, however the bytes arrive."""
         self._scan_position = max(self._scan_position, brace)
         while (token := TOKEN_PATTERN.search(self._buffer, self._scan_position)) is not None:
             kind = token[0]
@@ -200,13 +194,11 @@ class MessageBuffer:
         return None
 
     def _mark_json_end(self) -> int:
-        """Return the end of the JSON object; the next search finds it again if the message is still incomplete."""
         end = self._scan_position
         self._scan_position, self._depth = end - 1, 1
         return end
 
     def _read_show(self) -> ShowFile | None:
-        """Return the show at the front of the buffer: a zip archive, which ends with its directory, and then SKYC."""
         buffer = self._buffer
         while (zip_end := buffer.find(ZIP_END, self._scan_position)) >= 0:
             if zip_end + ZIP_END_SIZE > len(buffer):

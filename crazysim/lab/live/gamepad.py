@@ -27,15 +27,6 @@ class Gamepad:
     """
 
     def __init__(self, number: int | None = None, glfw: Any = None):
-        """Open a gamepad.
-
-        Args:
-            number: GLFW's number of the joystick, 0 to 15; None for the first joystick that is a gamepad.
-            glfw: Module to use in place of the package ``glfw``; None for that package.
-
-        Raises:
-            ConfigError: If no gamepad is connected.
-        """
         self._glfw = _import_glfw() if glfw is None else glfw
         numbers = range(N_JOYSTICKS) if number is None else [number]
         gamepads = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
@@ -64,7 +55,6 @@ class Gamepad:
         self._callbacks[index] = callback
 
     def __call__(self, live: Live) -> NDArray:
-        """Return forward, left, up and turn left, -1 to 1, and post the functions of newly pressed buttons. (4,)"""
         glfw = self._glfw
         state = glfw.get_gamepad_state(self._number)
         if not state:

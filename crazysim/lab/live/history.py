@@ -26,11 +26,6 @@ class History:
     """The first snapshot since a reset, and the latest snapshots."""
 
     def __init__(self, length: int):
-        """Create an empty history.
-
-        Args:
-            length: Largest number of snapshots to keep in addition to the first.
-        """
         self._first: Snapshot | None = None
         self._latest: deque[Snapshot] = deque(maxlen=length)
 

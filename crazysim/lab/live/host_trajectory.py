@@ -62,10 +62,7 @@ class HostTrajectory(NamedTuple):
 
 @lru_cache
 def _derivative_terms(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Return factors and exponents of the terms of a polynomial's derivatives, and the orders of these derivatives.
-
-    Factors and exponents have shape (n + 1, size), orders (n + 1,).
-    """
+    # Factors and exponents have shape (n + 1, size), orders (n + 1,).
     orders, powers = np.arange(n + 1), np.arange(size)
     factors = np.array([[math.perm(k, j) for k in range(size)] for j in range(n + 1)], float)
     return factors, np.maximum(powers - orders[:, None], 0), orders

@@ -114,13 +114,6 @@ class TrainedPolicy:
     def __init__(
         self, policy: Callable[[dict[str, NDArray]], ArrayLike], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)
     ):
-        """Check that the observations can be computed from a drone's state.
-
-        Args:
-            policy: Function of the observations that returns an action from -1 to 1.
-            meta: Description of the policy's inputs and outputs (``crazysim.train.export.describe``).
-            goal: Position to fly to, m. (3,)
-        """
         self.policy, self.interface = policy, Interface.read(meta)
         self.goal: NDArray = read_numbers("goal", goal, shapes=((3,),), remedy="Use [x, y, z], m")
         if getattr(policy, "interface", None) is not None:
@@ -149,7 +142,6 @@ class TrainedPolicy:
         self._memory: Any = self.policy.initial_memory() if has_memory else None  # type: ignore[attr-defined]
 
     def __call__(self, state: DroneState) -> NDArray:
-        """Return the command for a state. (k,)"""
         observations = self._compute_observations(state)
         obs = {name: observations[name].astype(np.float32) for name in self._names}
         if self._memory is None:

@@ -65,16 +65,6 @@ class Live(Interaction, Closeable):
         snapshot_s: float = 1.0,
         n_snapshots: int = 60,
     ):
-        """Create a loop; ``run`` starts it.
-
-        Args:
-            sim: Simulation, which continues from its present state.
-            control_freq: Rate of control steps, Hz; a divisor of ``sim.freq``.
-            speed: Simulated seconds per second, or ``"max"`` for as fast as possible.
-            fps: Pictures per second, at any speed.
-            snapshot_s: Simulated time between snapshots for ``go_to``, s.
-            n_snapshots: Largest number of snapshots to keep in addition to the first.
-        """
         control_freq = positive_integer("control_freq", control_freq)
         require(
             sim.freq % control_freq == 0,
@@ -284,7 +274,6 @@ class Live(Interaction, Closeable):
         return ", ".join(parts)
 
     def _run_once(self) -> float:
-        """Run the tasks that are due, or sleep; return the time spent in a pause, s."""
         viewers = self._viewers
         self._run_posted()
         if self._is_stopped:
@@ -337,7 +326,6 @@ class Live(Interaction, Closeable):
             log.warning("refused at %.2f s: %s", self.time, error)
 
     def _between_steps(self, callback: Callable[[Live], object]) -> None:
-        """Call a function now, or after the control step that is under way."""
         if self._in_step:
             self.post(callback)
         else:
@@ -374,7 +362,6 @@ class Live(Interaction, Closeable):
         self._pace.restart()
 
     def _warm_up(self) -> None:
-        """Compile the functions of a control step before the clock starts."""
         self._commands.stage()
         compile_step(self.sim, self.n_substeps)
         for process in self._processes:

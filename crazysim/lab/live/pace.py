@@ -79,7 +79,6 @@ class LiveReport:
         return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
 
     def __str__(self) -> str:
-        """Return the report as text."""
         lines = [f"{self.simulated_s:.2f} s in {self.wall_s:.2f} s: {self.factor:.2f} times real time"]
         if self.max_lateness > 0:
             lines.append(
@@ -113,13 +112,6 @@ class Pace:
     """Time that was given up because the simulation could not catch up, s."""
 
     def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
-        """Create a pace whose first control step is due now.
-
-        Args:
-            dt: Simulated time between control steps, s.
-            speed: Simulated seconds per second, or ``"max"``.
-            clock: Function that returns the time, s.
-        """
         self._dt, self._clock = dt, clock
         self._speed: Speed = check_speed(speed)
         self._counts = np.zeros(N_BINS, np.int64)

@@ -66,15 +66,6 @@ class PictureSource:
     """Source of the pictures of one viewer."""
 
     def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
-        """Create a source. Its functions are compiled when the first picture is taken.
-
-        Args:
-            sim: Simulation.
-            bodies: Bodies that can be followed.
-            worlds: Indices of the worlds to show.
-            contacts: True to compute which drones touch something.
-            wind: True to compute the wind at every drone, if the simulation has wind.
-        """
         self._sim, self._worlds = sim, np.asarray(worlds)
         self._bodies = {(body.kind, body.index): body for body in bodies.items}
         self._contacts, self._wind = contacts, wind
@@ -132,12 +123,10 @@ class PictureSource:
 
 
 def _find_winds(data: SimData) -> list[Wind | WindField]:
-    """Return the records of all wind plugins."""
     return [record for record in data.plugins.values() if isinstance(record, (Wind, WindField))]
 
 
 def _air_velocity(data: SimData) -> jax.Array:
-    """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
     return sum((record.velocity_at(data.states.pos) for record in _find_winds(data)), jnp.zeros_like(data.states.pos))
 
 
@@ -174,7 +163,6 @@ def read_quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
 
 
 def _numeric_leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
-    """Return the path, scope and value of every numeric leaf."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(data)
     leaf_scopes = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
     return [

@@ -62,16 +62,6 @@ class Pilot:
         low: ArrayLike = (-np.inf, -np.inf, 0.1),
         high: ArrayLike = (np.inf, np.inf, 10.0),
     ):
-        """Choose sticks and limits.
-
-        Args:
-            sticks: Functions that return deflections: ``keyboard_sticks``, a ``Gamepad``. Their sum is clipped to -1
-                to 1.
-            speed: Speed at full deflection, m/s.
-            yaw_rate: Yaw rate at full deflection, rad/s.
-            low: Lower limits of the setpoint's position, world frame, m. (3,)
-            high: Upper limits, m. (3,)
-        """
         for name, value in (("speed", speed), ("yaw_rate", yaw_rate)):
             require(np.isfinite(value) and value > 0, f"expected a positive {name}, got {value!r}")
         self._low, self._high = (np.broadcast_to(np.asarray(x, float), 3) for x in (low, high))
@@ -79,7 +69,6 @@ class Pilot:
         self._sticks, self._speed, self._yaw_rate = tuple(sticks), float(speed), float(yaw_rate)
 
     def __call__(self, live: Live) -> None:
-        """Move the setpoint of the selected drone by one control step."""
         require_state_control(live)
         sticks = np.clip(sum(source(live) for source in self._sticks), -1.0, 1.0)
         if live.selected is None or not np.any(sticks):

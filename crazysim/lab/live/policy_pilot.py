@@ -46,19 +46,6 @@ class PolicyPilot:
     """
 
     def __init__(self, env: Env, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
-        """Start an episode in the simulation of the environment.
-
-        Args:
-            env: Environment of the policy; its wrappers may only add images.
-            policy: Trained policy, or any function from observations to actions.
-            points: Goals that every drone flies to one after another, world frame, m; None for the goal of the task.
-                (n, 3)
-            seed: Random seed of the episode.
-
-        Raises:
-            ConfigError: If ``points`` are given for a task without goals that can be set, or one of them lies outside
-                of the task's arena.
-        """
         check_policy(policy, env)
         self.env = env
         self._points = None if points is None else np.asarray(points, float)
@@ -102,7 +89,6 @@ class PolicyPilot:
         self._command_fn(live.sim.data, memory)
 
     def __call__(self, live: Live) -> None:
-        """Write the command of this control step."""
         if self._points is not None:
             self._pass_points(live)
         live.command[:], self._memory = self._command_fn(live.sim.data, self._memory)
@@ -172,7 +158,6 @@ class PolicyPilot:
         self.go_to(live, parse_point(text))
 
     def _check_goal(self, pos: NDArray, prefix: str = "") -> None:
-        """Check that a point can be a goal."""
         task = self.env.task
         require(
             type(task).set_goal is not Task.set_goal,
@@ -185,7 +170,6 @@ class PolicyPilot:
             raise ConfigError(f"{prefix}expected x y z, m,{arena_text}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
 
     def _pass_points(self, live: Live) -> None:
-        """Set the next listed goal for drones that are close to their present goal."""
         points: Any = self._points
         distance = np.linalg.norm(self.goals - np.asarray(live.sim.data.states.pos), axis=-1)
         is_near = self._follows_points & (distance < ARRIVAL_DISTANCE) & (self.n_passed < len(points))
@@ -234,7 +218,6 @@ def read_points(path: str | Path) -> NDArray:
 
 
 def _compute_command(env: Env, policy: Callable[[Obs], Array], data: SimData, memory: Any) -> tuple[Array, Any]:
-    """Return the command of the policy's action for every drone, (n_worlds, n_drones, k), and the policy's memory."""
     measure = env.base.measure_states
     measured_data = data if measure is None else vectorize_over_worlds(measure, env.task.batched)(data)
     obs = vectorize_over_worlds(env.task.observe, env.task.batched)(measured_data)

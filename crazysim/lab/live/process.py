@@ -23,15 +23,9 @@ class RateLimit:
     """Limit to one log message per period."""
 
     def __init__(self, period: float = MIN_LOG_INTERVAL):
-        """Create a limit that permits the first message.
-
-        Args:
-            period: Time from one message to the next, s.
-        """
         self._period, self._last_time = period, -math.inf
 
     def __call__(self) -> bool:
-        """Return True if a message may be logged now."""
         now = time.monotonic()
         if now - self._last_time < self._period:
             return False

@@ -58,20 +58,6 @@ class Radio(Closeable):
         crazyflie: Any = None,
         timeout: float = 10.0,
     ):
-        """Connect and start logging.
-
-        Args:
-            uri: URI of cflib, such as ``radio://0/80/2M/E7E7E7E701``.
-            arm: True to connect, arm the drone and let commands be sent.
-            airframe: Airframe; the largest thrust of its rotors corresponds to full thrust in a packet.
-            period_ms: Time between two states, ms, a multiple of 10.
-            max_height: Largest height of a state command, m; a higher command is an error.
-            crazyflie: ``cflib.crazyflie.Crazyflie``, or an object with its interface; None for a new one.
-            timeout: Longest time until the first state arrives, s.
-
-        Raises:
-            ConfigError: If ``arm`` is True, and cflib is not installed or the drone does not answer.
-        """
         read_number("timeout", timeout, TIMEOUT_RANGE)
         self.name, self.armed, self.max_height = uri, bool(arm), max_height
         loaded_airframe = load_airframe(airframe)
@@ -88,7 +74,6 @@ class Radio(Closeable):
             log.info("%s is not armed: nothing is sent, and the drone is not connected", uri)
 
     def _connect(self, uri: str, period_ms: int, crazyflie: Any, timeout: float) -> None:
-        """Connect, start logging and arm."""
         with optional_import("real Crazyflies need", "cflib", "radio", ConfigError):
             import cflib.crtp
             from cflib.crazyflie import Crazyflie
@@ -171,7 +156,6 @@ class Radio(Closeable):
             self._cf.commander.send_stop_setpoint()
 
     def close(self) -> None:
-        """Stop the motors and disconnect."""
         if self._sync_crazyflie is not None:
             self.stop()
             for config in self._log_configs:
@@ -185,7 +169,6 @@ class Radio(Closeable):
         )
 
     def _set_flight_mode(self, level: Control) -> None:
-        """Set whether the firmware reads angles or rates."""
         if self._flight_mode != level:
             value = "1" if level == Control.attitude else "0"
             for axis in ("Roll", "Pitch", "Yaw"):

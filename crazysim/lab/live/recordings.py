@@ -21,12 +21,6 @@ class Recordings:
     """Number of recordings that ended because they could not be written."""
 
     def __init__(self, sim: Sim, control_freq: int):
-        """Create a recorder without an open file.
-
-        Args:
-            sim: Simulation.
-            control_freq: Rate of control steps, Hz.
-        """
         self.last_path, self.failures = None, 0
         self._sim, self._control_freq = sim, control_freq
         self._recorder: Recorder | None = None

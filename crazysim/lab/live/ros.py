@@ -80,19 +80,6 @@ class RosBridge:
         freq: float = 100.0,
         frame: str = "world",
     ):
-        """Create publishers and subscriptions.
-
-        Args:
-            swarm: Swarm.
-            node: Node, ``rclpy.node.Node`` or an object with its ``create_publisher`` and ``create_subscription``.
-            messages: Object with the classes of ``MESSAGE_MODULES`` as attributes; None to import them from ROS.
-            objects: Names of movable objects of the scene, such as ``"cf1:0"``, whose poses are published too.
-            freq: Messages per second of simulated time, Hz.
-            frame: Name of the world frame.
-
-        Raises:
-            ConfigError: If ROS is missing, an object does not exist, or the rate is not positive.
-        """
         require(0 < freq < math.inf, f"expected a positive rate of messages, got {freq} Hz")
         self.swarm, self.node, self.frame = swarm, node, frame
         self.messages = m = import_message_classes() if messages is None else messages
@@ -127,7 +114,6 @@ class RosBridge:
                 )
 
     def __call__(self, live: Live) -> None:
-        """Publish messages that are due; for a bridge that is added to a live loop as a process."""
         del live
         self.update()
 
@@ -187,8 +173,6 @@ class RosBridge:
     # Commands -------------------------------------------------------------------------------------------------------
 
     def _guard_callback(self, drone: int, handler: Callable[[int, Any], None]) -> Callable[[Any], None]:
-        """Return the callback of a subscription, which reports refused commands."""
-
         def callback(message: Any) -> None:
             with self.swarm.lock:
                 try:
@@ -220,18 +204,15 @@ class RosBridge:
 
 
 def _write_fields(part: Any, values: NDArray) -> None:
-    """Write numbers into the fields x, y, z and w of a part of a message."""
     for name, value in zip("xyzw", values.tolist(), strict=False):
         setattr(part, name, value)
 
 
 def _read_fields(part: Any, names: str = "xyz") -> NDArray:
-    """Return fields of a part of a message."""
     return np.array([getattr(part, name) for name in names], float)
 
 
 def _normalized_rpy(quat: NDArray) -> NDArray:
-    """Return roll, pitch and yaw, rad, of a quaternion, xyzw, after it is normalized. (3,)"""
     norm = float(np.linalg.norm(quat))
     if not 1e-3 < norm < math.inf:
         raise ConfigError(f"expected a unit quaternion, xyzw, got {quat.tolist()}")

@@ -49,12 +49,6 @@ class SceneBodies:
     """Upper corner of that box, body frame, m. (n_mocap, 3)"""
 
     def __init__(self, sim: Sim, shapes: Sequence[VisualGeom] = ()):
-        """Find the bodies of a compiled scene.
-
-        Args:
-            sim: Simulation.
-            shapes: Visible geoms, for the sizes of the bodies.
-        """
         kinds_and_numbers = _list_kinds_and_numbers(sim)
         parts = {part: base for plugin in sim.plugins.values() for part, base in _find_parts(plugin.moved_kinds or ())}
         counts = Counter(kind for kind, _ in kinds_and_numbers)
@@ -109,12 +103,10 @@ class SceneBodies:
 
 
 def _list_drones(sim: Sim) -> list[tuple[str, int]]:
-    """Return name and mocap id of every drone."""
     return list(zip(sim.drone_names, np.asarray(sim.data.core.drone_mocap_ids).tolist(), strict=True))
 
 
 def _list_kinds_and_numbers(sim: Sim) -> list[tuple[str, int]]:
-    """Return kind and number of every mocap body, by mocap id; a body without a number in its name gets 0."""
     model = sim.mj_model
     kinds_and_numbers: list[tuple[str, int]] = [("", 0)] * model.nmocap
     for body in np.flatnonzero(model.body_mocapid >= 0):
@@ -125,7 +117,6 @@ def _list_kinds_and_numbers(sim: Sim) -> list[tuple[str, int]]:
 
 
 def _find_parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the kinds of a plugin that are parts, each with the kind of its body: ``cars_wheel`` with ``cars``."""
     parts = []
     for kind in kinds:
         bases = [base for base in kinds if kind.startswith(f"{base}_")]
@@ -134,7 +125,6 @@ def _find_parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _bounding_boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
-    """Return the bounding boxes of mocap bodies in their frames, m; zero without geoms. (n, 3), (n, 3)"""
     low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
     for shape in shapes:
         if shape.mocap >= 0 and shape.kind != "plane":
@@ -147,7 +137,6 @@ def _bounding_boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDAr
 
 
 def _corners(shape: VisualGeom) -> NDArray:
-    """Return the vertices of a mesh, or the corners of the box around another geom, in its frame, m. (k, 3)"""
     if shape.kind == "mesh":
         return shape.vertices
     r, h, _ = shape.size

@@ -80,19 +80,6 @@ class CommandServer(CommandQueue):
         stream_port: int = STREAM_PORT,
         timeout: float = MESSAGE_TIMEOUT,
     ):
-        """Listen.
-
-        Args:
-            drones: IDs that clients may request.
-            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network. The
-                protocol has no passwords.
-            drone_port: Port for commands to single drones; 0 for any free one.
-            stream_port: Port for the stream to all drones; 0 for any free one.
-            timeout: Time in which a message that has begun must be complete, s.
-
-        Raises:
-            ConfigError: If it cannot listen there.
-        """
         super().__init__()
         self.drones, self.timeout = frozenset(drones), read_number("timeout", timeout, TIMEOUT_RANGE)
         self._claimed_drones: set[int] = set()
@@ -162,7 +149,6 @@ class CommandServer(CommandQueue):
     def _answer_message(
         self, peer: socket.socket, peer_name: str, message: Message | ShowFile, drone: int | None
     ) -> None:
-        """Queue the command of a message and answer it."""
         try:
             if drone is not None and isinstance(message, Message) and message.drone not in (None, drone):
                 raise ConfigError(f"expected commands to drone {drone}, got one to drone {message.drone}")
@@ -183,16 +169,6 @@ class StreamListener(CommandQueue):
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = MESSAGE_TIMEOUT):
-        """Connect.
-
-        Args:
-            host: Address of the server.
-            port: Port of the stream.
-            timeout: Time within which the connection, and each message that has begun, must be complete, s.
-
-        Raises:
-            ConfigError: If there is no server.
-        """
         super().__init__()
         self._stop_event = threading.Event()
         self._peer = connect(host, port, timeout)
@@ -258,7 +234,6 @@ class _Listener(socketserver.ThreadingTCPServer):
 
 @contextlib.contextmanager
 def _log_errors(peer_name: str) -> Iterator[None]:
-    """Log the reason why a connection ends instead of raising an error."""
     try:
         yield
         log.info("%s disconnected", peer_name)
@@ -271,12 +246,6 @@ def _log_errors(peer_name: str) -> Iterator[None]:
 def _read_messages(
     peer: socket.socket, stop_event: threading.Event, timeout: float
 ) -> Iterator[Message | Request | ShowFile]:
-    """Yield the messages of a connection until it ends, or ``stop_event`` is set.
-
-    Raises:
-        FramingError: If the other side sends bytes that are not a message.
-        TimeoutError: If the other side does not finish a message in time.
-    """
     buffer, deadline = MessageBuffer(), None
     peer.settimeout(POLL_INTERVAL)
     while not stop_event.is_set():

@@ -18,7 +18,6 @@ class StagedCommands:
     """The command of every drone, at the simulation's command level; nothing is staged before ``array`` is accessed."""
 
     def __init__(self, sim: Sim):
-        """Start from the commands of the simulation; a drone without a state command hovers at its position."""
         self._sim = sim
         self._array: NDArray | None = None
         self._staged_copy: NDArray | None = None
@@ -60,7 +59,6 @@ def compile_step(sim: Sim, n_steps: int) -> None:
 
 
 def _initial_commands(sim: Sim) -> NDArray:
-    """Return the staged commands; drones without a state command hover at their positions."""
     command = np.array(staged_leaves(sim.data)[0], float)
     if sim.control == Control.state:
         is_unset = (command == DEFAULT_STATE_COMMAND).all(-1)

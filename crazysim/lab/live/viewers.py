@@ -29,12 +29,6 @@ class Viewers(Generic[L]):
     """Time of the next picture in the sequence of ``period``, s, by ``time.perf_counter``."""
 
     def __init__(self, fps: float, on_last_closed: Callable[[], object]):
-        """Create a set without viewers.
-
-        Args:
-            fps: Pictures per second.
-            on_last_closed: Function that is called when ``update`` has removed the last viewer.
-        """
         self.period = 1.0 / fps
         self.n_pictures = self.failures = 0
         self.next_picture_time = 0.0
@@ -42,7 +36,6 @@ class Viewers(Generic[L]):
         self._on_last_closed = on_last_closed
 
     def __bool__(self) -> bool:
-        """Return True if a viewer is open."""
         return bool(self._open_viewers)
 
     def open(self, live: L, viewer: Viewer[L]) -> None:

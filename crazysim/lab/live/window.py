@@ -77,7 +77,6 @@ class Window(Viewer[Live]):
     """Quantity of the selected drone that is plotted over time, such as ``"states.pos"``; empty for none."""
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation."""
         check_image_size(self.width, self.height)
         require(np.isfinite(self.trail) and self.trail >= 0, f"expected a trail of 0 s or more, got {self.trail!r}")
         self._process: subprocess.Popen[bytes] | None = None
@@ -134,7 +133,6 @@ class Window(Viewer[Live]):
             process.wait()
 
     def _send_pictures(self, process: subprocess.Popen[bytes]) -> None:
-        """Write the latest picture to the process whenever it has read the previous one."""
         while True:
             with self._picture_changed:
                 self._picture_changed.wait_for(lambda: self._next_picture is not None or self._process is not process)
@@ -147,7 +145,6 @@ class Window(Viewer[Live]):
                 return  # the window was closed
 
     def _read_actions(self, live: Live, process: subprocess.Popen[bytes], ready_event: threading.Event) -> None:
-        """Pass the actions of the user in the window to the loop."""
         for line in process.stdout:
             kind, *values = json.loads(line)
             if kind == "ready":

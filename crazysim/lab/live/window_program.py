@@ -92,17 +92,6 @@ class Program:
     """The window and its model, trails and lights."""
 
     def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
-        """Open the window.
-
-        Args:
-            model: Compiled scene.
-            bodies: Bodies that can be followed.
-            settings: Fields of ``crazysim.lab.live.Window``.
-            out: Stream to which the actions of the user are written.
-
-        Raises:
-            RenderError: If the window cannot be opened.
-        """
         self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
         self._out = out
         self._trail_mocap_ids, self._leds = bodies.trail_mocap_ids, Leds(model)
@@ -154,7 +143,6 @@ class Program:
             self._report_click(picture, self.window.pick(n, lambda k: self._compose_tile(picture, k)))
 
     def _compose_tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
-        """Return the state of the k-th shown world, and its overlays."""
         data, overlays, settings = self._data, self._overlays, self._settings
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
         update_poses(self._model, data)
@@ -190,7 +178,6 @@ class Program:
         return data, overlays
 
     def _is_double_click(self) -> bool:
-        """Return True if the left button has just been pressed for the second time."""
         is_down, was_down = self.window.is_pressed("left"), self._was_down
         self._was_down = is_down
         if not is_down or was_down:
@@ -204,7 +191,6 @@ class Program:
         return is_double
 
     def _report_click(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
-        """Write which body or point was clicked; ``hit`` is a tile, a geom id and a point, world frame, m."""
         if hit is None:
             return
         k, geom, point = hit
@@ -225,7 +211,6 @@ class Program:
 
 
 def _ascii(text: str) -> str:
-    """Return text that MuJoCo's font can show."""
     return text.encode("ascii", "replace").decode()
 
 

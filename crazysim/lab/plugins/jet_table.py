@@ -139,7 +139,6 @@ def load_jet_table(
 
 
 def _table_shape(n_rows: int, shape: tuple[int, int, int] | None) -> tuple[int, int, int]:
-    """Return the nodes along x, y and z of a table with ``n_rows`` rows."""
     side = round(n_rows ** (1 / 3))
     if shape is None:
         shape = (side, side, side) if side**3 == n_rows else (LAB_VOXELS, LAB_VOXELS, n_rows // LAB_VOXELS**2)

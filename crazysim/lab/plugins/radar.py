@@ -86,7 +86,6 @@ class Radar(Plugin):
         return self.read(data).margin_at(data.states.pos) > 0
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the depth within each lobe, m, negative outside, and the time within it, s."""
         return {"margin": self.margin_at(data.states.pos), "exposure": self.exposure}
 
     def draw(self, sim: Simulation, world: int) -> None:

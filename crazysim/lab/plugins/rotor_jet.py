@@ -108,7 +108,6 @@ class RotorJet(LoadForce, requires=needs_rotors):
         return [StagePlacement(Stage(apply_jets, scope, batched=not self.all_drones, unfused_reason=UNFUSED_REASON))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the force of the jet on the load, world frame, N."""
         return {"force": self.force}
 
     def pressure_on(self, data: SimData, drone: int | None, pos: Array, normal: Array, vel: Array) -> Array:

@@ -31,16 +31,6 @@ class Archive:
     """A zip archive of JSON files."""
 
     def __init__(self, content: bytes, location: str):
-        """Open an archive.
-
-        Args:
-            content: Contents of the file.
-            location: Name of the file, for messages.
-
-        Raises:
-            ConfigError: If the archive has too many files.
-            DamagedFileError: If the file is not a zip archive.
-        """
         self.location = location
         self._parsed: dict[str, Any] = {}
         limit = min(MAX_TOTAL_BYTES, max(MIN_TOTAL_BYTES, MAX_RATIO * len(content)))

@@ -213,7 +213,6 @@ def encode_lights(lights: Lights) -> bytes:
 
 
 def _encode_color(code: int, color: np.ndarray, duration: int) -> bytes:
-    """Return the shortest command that sets, or fades to, a colour."""
     red, green, blue = (int(x) for x in color)
     if (red, green, blue) == BLACK:
         head = [code + 2]

@@ -68,7 +68,6 @@ class Show:
     """Metadata, such as ``title``."""
 
     def __post_init__(self) -> None:
-        """Fill in defaults and check the sizes."""
         n = len(self.names)
         if not n or len(set(self.names)) != n:
             raise ConfigError(
@@ -117,10 +116,5 @@ class Show:
         return dataclasses.replace(self, **changes)
 
     def _end_points(self, time: float) -> NDArray:
-        """Return the position, m, and yaw, rad, of every drone at an end of its trajectory. (n_drones, 4)
-
-        Args:
-            time: Zero or less for the start of the trajectories; any other time for their ends.
-        """
         coefficients = np.asarray(self.trajectories.coefficients, float)
         return coefficients[:, 0, :, 0] if time <= 0 else coefficients[:, -1].sum(-1)

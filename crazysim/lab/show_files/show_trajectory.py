@@ -88,7 +88,6 @@ def _is_point(point: object) -> TypeGuard[list[Any]]:
 
 
 def _make_trajectory(ends: NDArray, curves: list, yaw_control: object, location: str) -> Trajectory:
-    """Return the trajectory of Bezier curves."""
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
     for k, curve in enumerate(curves):
@@ -100,10 +99,7 @@ def _make_trajectory(ends: NDArray, curves: list, yaw_control: object, location:
 
 
 def _with_yaw(ends: NDArray, coefficients: NDArray, yaw_control: object, location: str) -> tuple[NDArray, NDArray]:
-    """Return the pieces with the yaw replaced by setpoints that are connected linearly.
-
-    The times of the setpoints count from the start of the show, unlike those of the points.
-    """
+    # The times of the setpoints count from the start of the show, unlike those of the points.
     value = checks.require_object(yaw_control, location)
     checks.require_version_one(value, location)
     setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, location)

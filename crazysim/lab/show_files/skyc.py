@@ -110,7 +110,6 @@ def _check_piece_count(n_pieces: int, location: str) -> None:
 
 
 def _parse_drone(archive: Archive, value: object, location: str, index: int) -> dict[str, Any]:
-    """Return the entry of one drone in the show; its lights are not decoded yet."""
     value, location = archive.resolve(value, location)
     settings, location = archive.resolve(
         checks.require_object(value, location).get("settings"), f"{location}, settings"
@@ -177,7 +176,6 @@ def _parse_cues(archive: Archive, value: object, location: str) -> tuple[Cue, ..
 def _decode_lights(
     archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded_programs: dict[str, Lights]
 ) -> Lights:
-    """Return the lights of one drone; equal programs are decoded once."""
     if drone["lights"] is None:
         return Lights.constant()
     value, location = archive.resolve(drone["lights"], f"{drone['location']}, lights")
@@ -290,7 +288,6 @@ def save_show(show: Show, path: str | Path) -> None:
 
 
 def _format_lights(lights: Lights) -> dict[str, Any]:
-    """Return the contents of a ``lights.json``."""
     value: dict[str, Any] = {"version": 1, "data": base64.b64encode(encode_lights(lights)).decode()}
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if np.array_equal(starts, ends):

@@ -112,12 +112,10 @@ def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:
 
 
 def _start_points(trajectories: Trajectory) -> NDArray:
-    """Return position, m, and yaw, rad, where each trajectory begins. (n_drones, 4)"""
     return np.asarray(trajectories.coefficients, float)[:, 0, :, 0]
 
 
 def _recording_rate(freq: int, seconds: float, n_drones: int) -> int:
-    """Return the rate of the recording, Hz."""
     for rate in RECORDING_RATES:
         if freq % rate == 0 and seconds * rate * n_drones <= MAX_RECORDED_POSES:
             return rate
@@ -128,7 +126,6 @@ def _recording_rate(freq: int, seconds: float, n_drones: int) -> int:
 
 
 def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
-    """Return a compiled function that advances data by ``CHUNK_SAMPLES`` samples, and also returns their poses."""
     step = sim.step_fn.with_zeros_of(sim.data)
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
@@ -139,7 +136,6 @@ def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData,
 
 
 def _get_poses(data: SimData) -> tuple[Array, Array]:
-    """Return positions and attitudes of the drones."""
     return data.states.pos, data.states.quat
 
 

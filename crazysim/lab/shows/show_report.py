@@ -44,12 +44,6 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
 
 
 def _refine_approach(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the minima of sampled curves and their times, from parabolas through three samples. (k,) each
-
-    Args:
-        squares: Curves. (k, n)
-        times: Times of the samples, s. (n,)
-    """
     rows, n = np.arange(len(squares)), squares.shape[1]
     k = squares.argmin(axis=1)
     if n < 3:
@@ -105,7 +99,6 @@ def report(flight: ShowFlight) -> dict[str, Any]:
 
 
 def _closest_pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
-    """Return an entry of ``closest`` for every pair of drones, sorted by distance; see ``report``."""
     distance, closest_times = sampled_approaches(flight.times, pos)
     first, second = np.triu_indices(len(distance), 1)
     names = flight.show.names

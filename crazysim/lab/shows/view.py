@@ -174,7 +174,6 @@ def darken(sim: Sim) -> None:
 
 
 def _led_materials(sim: Sim) -> tuple[str, ...]:
-    """Return the materials of the LEDs that the airframe has."""
     return tuple(
         x for x in LED_MATERIALS if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0
     )
@@ -188,11 +187,6 @@ class ShowLights:
     """Process that sets the LEDs of drones to the colours of a show: ``live.add(ShowLights(show))``."""
 
     def __init__(self, show: Show):
-        """Create the process of a show, whose k-th drone is the k-th drone of the simulation.
-
-        Args:
-            show: Show, which begins when the simulated time is zero.
-        """
         self._lights, self._n_drones = show.lights, show.n_drones
 
     def compile(self, live: Live) -> None:
@@ -200,7 +194,6 @@ class ShowLights:
         self._lights.colors([live.time])
 
     def __call__(self, live: Live) -> None:
-        """Set the colours at the present time, equal in all worlds."""
         live.lights[:, : self._n_drones] = self._lights.colors([live.time])[0]
 
 

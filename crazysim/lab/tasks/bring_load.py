@@ -61,7 +61,6 @@ class BringLoad(OutcomeTask):
         return jnp.any(self.read(data).failure)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance of the load from its goal, m. (...)"""
         return rotation.safe_norm(self.read(data).goal - load_pos(data))[..., 0]
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:

@@ -59,7 +59,6 @@ class Chase(TouchDown):
         self.add_states(sim, [touch])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return cars that drive, and drones in flight around them."""
         n, car = data.core.n_drones, data.plugins[CARS]
         x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
         speed, steer = (
@@ -72,7 +71,6 @@ class Chase(TouchDown):
         return flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.2)), scale_symmetric(x["vel"], 0.3))
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's roof, world frame. (..., 3) each"""
         car: Cars = data.plugins[CARS]
         roof_pos = jnp.asarray(roof_centre(), car.pos.dtype)
         arm = rotation.rotate(car.quat, jnp.broadcast_to(roof_pos, car.pos.shape))

@@ -88,7 +88,6 @@ class Deliver(BringLoad):
         self.add_states(sim)
 
     def after_substep(self, data: SimData) -> SimData:
-        """Move a load that was not taken along with its trailer; record pick-up, delivery and crash."""
         load = data.plugins["load"]
         taken = self.read(data).taken | load.attached
         ring, vel = (pick_entry(x, data.core.drone_id) for x in ring_motion(data.plugins[CARS]))
@@ -98,7 +97,6 @@ class Deliver(BringLoad):
         return self.write(self.update_outcome(data, crashed), taken=taken)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return cars that drive, loads on their trailers, drones in flight above the loads, and goals."""
         car, load = data.plugins[CARS], data.plugins["load"]
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, goal=3)
         speed, steer = (
@@ -130,7 +128,6 @@ class Deliver(BringLoad):
         return self.write(data, goal=goal)
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the distance of the hook from the ring plus the task error, m. (...)"""
         load = data.plugins["load"]
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
 

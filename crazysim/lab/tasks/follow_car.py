@@ -77,7 +77,6 @@ class FollowCar(Task):
         self.add_states(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return cars that drive, and drones in flight behind them."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, ang_freq=2, phase=2)
         low, high = np.array(ANG_FREQ_RANGES).T
         steer = scale_to(x["steer"], *STEER_RANGE)
@@ -112,7 +111,6 @@ class FollowCar(Task):
         return jnp.concatenate([drive.car_speed + oscillation[..., :1], oscillation[..., 1:]], axis=-1)
 
     def before_step(self, data: SimData) -> SimData:
-        """Return the data with the commands of the cars for this environment step."""
         car = data.plugins[CARS]
         command = self.command(data, data.core.steps / data.core.freq)
         return data.replace(plugins=data.plugins | {CARS: car.replace(command=command)})
@@ -125,7 +123,6 @@ class FollowCar(Task):
         return car.pos + arm + np.array([0.0, 0.0, FOLLOW_HEIGHT], car.pos.dtype), car.vel + turning_vel
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return attitude, velocities and height of the drone."""
         return motion_of(data)
 
     def privileged(self, data: SimData) -> dict[str, Array]:
@@ -154,14 +151,12 @@ class FollowCar(Task):
         return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the distance from the point behind and above the car, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:
         return self.target_motion(data)[0]
 
     def subjects(self, data: SimData) -> Array:
-        """Return the positions of the cars, m. (n_drones, 3)"""
         return data.plugins[CARS].pos
 
     def policy_camera(self) -> TargetCamera:

@@ -24,7 +24,6 @@ class LandOnMarker(Land):
     height = 0.02
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return attitude, velocities and height of the drone."""
         return motion_of(data)
 
     def privileged(self, data: SimData) -> dict[str, Array]:

@@ -96,7 +96,6 @@ class Transport(BringLoad):
         self.add_states(sim, [StagePlacement(judge, before="increment_steps")], gates=gates)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        """Return drones in flight with swinging loads in front of the gates, and goals behind the gates."""
         n_drones = data.core.n_drones
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
         centre = jnp.asarray(corridor_centres(n_drones), data.states.pos.dtype)

@@ -85,7 +85,6 @@ class Section:
 
 
 def _install_advice(packages: Mapping[str, str]) -> str:
-    """Return advice to install the packages that are not importable; an empty string if all are importable."""
     missing = [name for package, name in packages.items() if importlib.util.find_spec(package) is None]
     return f"run `pip install {shlex.join(missing)}`" if missing else ""
 

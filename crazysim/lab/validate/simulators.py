@@ -47,9 +47,7 @@ class Simulator(Protocol):
     module: ClassVar[str] = ""
     """Module that must be importable; empty for none."""
 
-    def __init__(self, start: States) -> None:
-        """Put the drones at their starts, with rotors that turn as in hover."""
-        ...
+    def __init__(self, start: States) -> None: ...
 
     def fly_period(self, commands: NDArray) -> States:
         """Return the states after one period under attitude commands: roll, pitch, yaw, rad, and thrust, N. (n, 4)"""
@@ -85,7 +83,6 @@ class AttitudeController:
     """Crazysim's default controller for another simulator: it turns attitude commands into thrusts of the rotors."""
 
     def __init__(self, n: int) -> None:
-        """Create the controllers of ``n`` drones at rest."""
         self._sim = Sim(n, drone=AIRFRAME, control="attitude")
         self._data, self.dt = self._sim.data, 1 / self._sim.freq
         params = self._data.params
@@ -296,14 +293,12 @@ def rotorpy_params(airframe: Airframe) -> dict[str, Any]:
 
 
 def _intrinsic_angles(rpy: NDArray) -> NDArray:
-    """Return angles x, y, z with ``Rx Ry Rz = Rz(yaw) Ry(pitch) Rx(roll)``, rad. (n, 3)"""
     m = np.asarray(rotation.matrix(rotation.from_rpy(jnp.asarray(rpy))), np.float64)
     x, z = np.arctan2(-m[:, 1, 2], m[:, 2, 2]), np.arctan2(-m[:, 0, 1], m[:, 0, 0])
     return np.stack([x, np.arcsin(np.clip(m[:, 0, 2], -1, 1)), z], axis=-1)
 
 
 def _mjcf(airframe: Airframe, lag: float, timestep: float) -> str:
-    """Return MuJoCo's model of an airframe; ``lag`` is the time constant of the thrusts, s."""
     inertia = " ".join(f"{x:.9g}" for x in airframe.value("rigid_body.inertia", (3,)))
     hubs, signs = airframe.value("rotors.position", (4, 3)), airframe.value("rotors.yaw_torque_sign", (4,))
     max_thrust, torque_per_thrust = _thrust_max(airframe), _torque_per_thrust(airframe)
@@ -324,7 +319,6 @@ def _thrust_max(airframe: Airframe) -> float:
 
 
 def _torque_per_thrust(airframe: Airframe) -> float:
-    """Return the drag torque divided by the thrust of a rotor at its largest speed, m."""
     max_speed = airframe.rotor_vel_limits[1].max()
     thrust, torque = (
         np.asarray(airframe.value(f"rotors.{name}_curve", (3,)), np.float64) for name in ("thrust", "torque")
@@ -334,12 +328,10 @@ def _torque_per_thrust(airframe: Airframe) -> float:
 
 
 def _hover_speed(sim: Sim) -> NDArray:
-    """Return the rotor speeds of hover, rpm. (4,)"""
     return np.asarray(hover_rotor_states(sim.data.params))
 
 
 def _world_rows(states: States) -> States:
-    """Return states with an axis for the only drone of each world. (n, 1, k) each"""
     return {name: x[:, None] for name, x in states.items()}
 
 

@@ -77,7 +77,6 @@ class LPV(PathController):
     """Gains kl1, kl2 as polynomials of p, highest power first; in place of ``position_gain`` and ``speed_gain``."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         for name in ("position_gain", "speed_gain"):
             if getattr(self, name) != getattr(PathController, name):

@@ -122,7 +122,6 @@ def lateral_gains(
 def _gain_rows(
     model: Callable[..., CarState], car: CarParams, speeds: Array, period: Array, Q: Array, R: Array
 ) -> Array:
-    """Return ``lateral_gains`` at several speeds. (n, 5)"""
     return jax.vmap(lambda speed: lateral_gains(model, car, speed, period, Q, R))(speeds)
 
 

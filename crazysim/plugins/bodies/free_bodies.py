@@ -148,7 +148,6 @@ class FreeBodies(Population):
         }
 
     def scheme(self, integrator: Integrator) -> Callable[..., FreeBodies]:
-        """Return the simulation's scheme; an Euler scheme integrates rotations by ``free_rotation``."""
         scheme = super().scheme(integrator)
 
         def integrate_motion(body: FreeBodies, rates_fn: RatesFn, dt: float) -> FreeBodies:
@@ -171,7 +170,6 @@ class FreeBodies(Population):
         return data.objects.with_poses({self.name: (self.pos, self.quat)})  # type: ignore[union-attr]
 
     def _add_to_scene(self, sim: Simulation, shapes: Sequence[Shape]) -> None:
-        """Add the bodies to the scene, if they are not there yet."""
         rgba = (0.25, 0.5, 0.75, 1.0) if self.rgba is None else self.rgba
         colors = np.broadcast_to(as_rgba(rgba, len(shapes)), (len(shapes), 4))
         geoms = [body_geom_xml(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]

@@ -57,7 +57,6 @@ class ContactLog(Plugin):
         return self.replace(**flags, first_step=first_step, object_names=names, is_bound=True)
 
     def carry_over(self, record: ContactLog, old_record: ContactLog) -> ContactLog:
-        """Return the record with the log of objects that are in the scene already."""
         old_names = old_record.object_names
         columns = [k for k, name in enumerate(record.object_names) if name in old_names]
         old_columns = [old_names.index(record.object_names[k]) for k in columns]
@@ -99,7 +98,6 @@ class ContactLog(Plugin):
 
 
 def _merge_objects(log: Any, report: ContactReport) -> Array:
-    """Return the log's objects, updated by a report of all or some of them. (..., n_objects)"""
     if report.objects is None or report.object_names == log.object_names:
         return _logical_or(log.objects, report.objects)
     columns = np.array([log.object_names.index(name) for name in report.object_names])

@@ -191,7 +191,6 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
 def _height_above_field(
     data: SimData, geom: CollisionGeom, points: Array, to_geom: Callable, to_world: Callable
 ) -> tuple[Array, Array]:
-    """Return the distance of points to the plane of the terrain's triangle below, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, HeightField):
         return terrain.gap_at(points)
@@ -200,7 +199,6 @@ def _height_above_field(
 
 
 def _extent_along(shape: Shape, direction: Array) -> Array:
-    """Return the extent of a ball or box from its centre along a direction in its frame, m. (...)"""
     if shape.kind == "sphere":
         return jnp.full(direction.shape[:-1], shape.size[0], direction.dtype)
     return jnp.sum(jnp.abs(direction) * jnp.asarray(shape.size, direction.dtype), axis=-1)
@@ -214,12 +212,9 @@ def _nearest_plate_point(
     plate_centre: Array,
     velocity_at: Callable | None,
 ) -> ContactPoints:
-    """Return the point of a plate that is nearest to a geom.
-
-    The gradient of the gap with respect to the drone's position is the normal. The gradient with respect to the drone's
-    attitude is the cross product of the lever and the normal, which determines the torque of a normal force. The
-    position of the point along the normal affects friction only; it is on the plate's face.
-    """
+    # The gradient of the gap with respect to the drone's position is the normal. The gradient with respect to the
+    # drone's attitude is the cross product of the lever and the normal, which determines the torque of a normal force.
+    # The position of the point along the normal affects friction only; it is on the plate's face.
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
     def pose(displacement: Array, rotvec: Array) -> tuple[Array, Array]:
@@ -241,27 +236,15 @@ def _nearest_plate_point(
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Return ``distance``, m, (...), and its gradients with respect to position and rotation matrix.
-
-    JAX traces it only once for both plates and all geoms of one shape, such as the wheels of cars.
-
-    Args:
-        shape: Shape of the plate.
-        other: Shape of the geom.
-        pos: Position of the plate, frame of the geom, m. (..., 3)
-        rot: Rotation matrix from the plate to the geom. (..., 3, 3)
-    """
+    # JAX traces it only once for both plates and all geoms of one shape, such as the wheels of cars.
     gap, pull_back = jax.vjp(lambda pos, rot: distance(shape, other, pos, rot), pos, rot)
     return gap, pull_back(jnp.ones_like(gap))
 
 
 def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
-    """Return three functions for a geom that move with its carrier.
-
-    The first transforms points or directions from the world frame to the geom's frame, the second directions back to
-    the world frame. The third returns the velocity of the surface at points in the world frame; None for a fixed
-    surface.
-    """
+    # The first transforms points or directions from the world frame to the geom's frame, the second directions back to
+    # the world frame. The third returns the velocity of the surface at points in the world frame; None for a fixed
+    # surface.
     geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype
     pos = jnp.asarray(geom.pos, dtype)

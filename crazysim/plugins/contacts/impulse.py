@@ -61,7 +61,6 @@ def velocity_after_contact(
     surface_speed = jnp.sum(n * s, axis=-1)
 
     def point_speeds(u: Array) -> tuple[Array, Array]:
-        """Return the speed of each point out of its surface, and its slip speed, m/s."""
         vel = u[..., None, :3] - s
         vel = vel if p is None else vel + rotation.cross(u[..., None, 3:], p)
         normal_speed = jnp.sum(vel * n, axis=-1)
@@ -125,12 +124,10 @@ def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:
 
 
 def _force_and_torque(force: Array, p: Array | None) -> Array:
-    """Return forces at points followed by their torques; forces alone for a point mass. (..., n, 6) or (..., n, 3)"""
     return force if p is None else jnp.concatenate([force, rotation.cross(p, force)], axis=-1)
 
 
 def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array:
-    """Return the sum of ``weight * B^T B``; ``B`` maps velocities of the body to its point ``p``. (..., k, k)"""
     translation = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=dtype)
     if p is None:
         return translation

@@ -95,7 +95,6 @@ def resolve_drone_contacts(
     is_touching = is_touching if body.exists is None else is_touching & body.exists[:, None]
 
     def response(change: Array) -> Array:
-        """Return the change of the relative velocity at the lever for a change of the load's velocity, m/s."""
         ang_vel_change = rotation.matvec(p.J_inv, rotation.cross(lever, change))
         return change + mass * (change / p.mass + rotation.cross(ang_vel_change, lever))
 
@@ -191,7 +190,6 @@ def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material
 def _pair_velocity_changes(
     data: SimData, first: Collider, second: Collider, material: Material, is_same_kind: bool
 ) -> _VelocityChanges:
-    """Return the changes by contacts between two groups of bodies, or within one group (``is_same_kind``)."""
     a, b = first.body(data), second.body(data)
     second_quat = b.quat[None]
     offset = rotation.rotate_inverse(second_quat, a.pos[:, None] - b.pos[None])

@@ -143,19 +143,15 @@ def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array
 
 
 def _n_points(contacts: PairContacts) -> int:
-    """Return the number of points of each pair."""
     return contacts.points.gap.shape[0] // len(contacts.first)
 
 
 def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
-    """Return the distances of points to a shape, and the outward normals, in the frame of the shape."""
     gap, pull_back = jax.vjp(lambda p: point_distance(shape, p), point)
     return gap, pull_back(jnp.ones_like(gap))[0]
 
 
 def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: Array, shape_rot: Array) -> Manifold:
-    """Return the contact at the point of a box that is nearest to a shape, from the gradient of the gap."""
-
     def gap_at(displacement: Array, rotvec: Array) -> Array:
         turned_rot = rot + jnp.stack([rotation.cross(rotvec, rot[:, k]) for k in range(3)], axis=-1)
         columns = [matvec(shape_rot.T, turned_rot[:, k]) for k in range(3)]
@@ -170,5 +166,4 @@ def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, shape_pos: 
 
 
 def _flatten_manifolds(points: Manifold) -> Manifold:
-    """Return manifolds of several pairs as one."""
     return Manifold(points.gap.reshape(-1), points.normal.reshape(-1, 3), points.point.reshape(-1, 3))

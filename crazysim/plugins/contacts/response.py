@@ -88,14 +88,6 @@ class ContactResponse(Plugin):
     def _load_stages(
         self, plugin: CollidingPlugin, obstacles: list[Surface], boxes: DroneBoxes, n_drones: int
     ) -> list[StagePlacement]:
-        """Return the stages for contacts of a plugin's loads with obstacles, with drones and with each other.
-
-        Args:
-            plugin: Plugin with the loads.
-            obstacles: Surfaces of objects.
-            boxes: Collision boxes of the drones; empty for obstacles only.
-            n_drones: Number of drones in a world.
-        """
         colliders = plugin.colliders()
         can_touch_each_other = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
 

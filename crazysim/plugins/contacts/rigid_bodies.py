@@ -45,7 +45,6 @@ class BodyContacts:
     """Contacts of the free bodies of a simulation."""
 
     def __init__(self, sim: Simulation, plugin: Any):
-        """Collect the solids that are in the scene now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
         self.boxes = drone_box_extents(sim)
@@ -104,7 +103,6 @@ class BodyContacts:
         return data
 
     def _bodies(self, data: SimData, record: Any) -> Bodies:
-        """Return the bodies: free bodies, drones, then carriers, which impulses do not move."""
         dtype = record.pos.dtype
         rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
                  _rotate_diagonal(record.quat, 1 / record.inertia))]  # fmt: skip
@@ -117,7 +115,6 @@ class BodyContacts:
         return Bodies(*(jnp.concatenate(column) for column in zip(*rows, strict=True)))
 
     def _solids(self, data: SimData, record: Any) -> Solids:
-        """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
         n_free = record.pos.shape[0]
         dtype = record.pos.dtype
         body, is_ball = list(range(n_free)), [x.kind == "sphere" for x in self.shapes]
@@ -142,14 +139,12 @@ class BodyContacts:
         return Solids(np.array(body), np.array(is_ball), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
 
     def _pairs(self, solids: Solids, n_free: int) -> np.ndarray:
-        """Return the pairs of solids with at least one free body. (n_pairs, 2)"""
         pairs = [pair for pair in combinations(range(len(solids.body)), 2) if solids.body[pair[0]] < n_free]
         return np.array(pairs, np.int64).reshape(-1, 2)
 
     def _contacts_on_carrier(
         self, data: SimData, solids: Solids, free_solids: list[int], carrier: Carrier, carrier_index: int
     ) -> list[PairContacts]:
-        """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
         contacts = []
         for geom in carrier.geoms:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
@@ -219,7 +214,6 @@ def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
 
 
 def _carrier_motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
-    """Return position, attitude and velocity, world frame, and angular velocity, body frame, of a carrier."""
     dtype = data.states.pos.dtype
     zero = jnp.zeros(3, dtype)
     if carrier.population is not None:
@@ -232,7 +226,6 @@ def _carrier_motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Arra
 
 
 def _geom_pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """Return position and rotation matrix of a geom, world frame."""
     pos, quat, _, _ = _carrier_motion(data, carrier)
     rot = rotation.matrix(quat)
     geom_pos = pos + matvec(rot, jnp.asarray(geom.pos, dtype))
@@ -240,6 +233,5 @@ def _geom_pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.
 
 
 def _rotate_diagonal(quat: Array, diagonal: Array) -> Array:
-    """Return the matrices ``R diag(d) R^T`` of attitudes R, (n, 4), and diagonals d, (n, 3). (n, 3, 3)"""
     rot = rotation.matrix(quat)
     return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

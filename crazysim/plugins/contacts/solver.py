@@ -122,15 +122,11 @@ def solve_contacts(
     arm = contacts.point - bodies.pos[a][pair]
 
     def contact_velocity(vel: Array, ang_vel: Array) -> Array:
-        """Return the velocities of the first bodies relative to the second at the contacts, m/s. (k, 3)"""
         relative_vel = vel[a] - vel[b] - rotation.cross(ang_vel[b], offset)
         return relative_vel[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
 
     def velocity_change(impulse: Array) -> tuple[Array, Array]:
-        """Return the changes of the bodies' velocities and angular velocities. (n, 3) each
-
-        The impulses act on the first bodies, and their opposites on the second bodies.
-        """
+        # The impulses act on the first bodies, and their opposites on the second bodies.
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         second_torque = torque + rotation.cross(offset, force)
         force, torque = (
@@ -234,21 +230,9 @@ def _shared_response(
     normal_weight: Array,
     slip_weight: Array,
 ) -> Array:
-    """Return for each body how many times more its contacts respond to all impulses than to their own. (n,)
-
-    The ratio is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter.
-    ``M`` is the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` contains the
-    inverse responses.
-
-    Args:
-        bodies: The bodies.
-        sum_matrix: 1 where a pair contains the body, and else 0. (n, n_pairs)
-        contacts: The contacts.
-        normal: Normals. (k, 3)
-        lever_matrix: Torque of impulses about the body. (k, 3, 3)
-        normal_weight: Inverse responses to impulses along the normals, kg; zero where nothing acts. (k,)
-        slip_weight: Inverse responses to impulses across the normals, kg. (k,)
-    """
+    # The ratio is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter.
+    # ``M`` is the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` contains the
+    # inverse responses.
     eye = jnp.eye(3, dtype=normal.dtype)
     weight = (
         slip_weight[:, None, None] * eye
@@ -268,21 +252,12 @@ def _shared_response(
 
 
 def _energy_factor(impulse: Array, initial_vel: Array, vel_change: Array) -> Array:
-    """Return the factor, at most one, by which impulses are scaled so that they add no kinetic energy. ()
-
-    The energy that the impulses add, in the frame of immovable bodies, is the sum of the products of each impulse with
-    the mean of the contact's velocities before and after it.
-
-    Args:
-        impulse: Impulses on the first bodies, N s. (k, 3)
-        initial_vel: Velocities of the contacts before the impulses, m/s. (k, 3)
-        vel_change: Changes of these velocities by the impulses, m/s. (k, 3)
-    """
+    # The energy that the impulses add, in the frame of immovable bodies, is the sum of the products of each impulse
+    # with the mean of the contact's velocities before and after it.
     linear, quadratic = jnp.sum(impulse * initial_vel), jnp.sum(impulse * vel_change)
     adds_energy = linear + 0.5 * quadratic > 0
     return jnp.where(adds_energy, jnp.maximum(-2 * linear, 0.0) / jnp.where(adds_energy, quadratic, 1.0), 1.0)
 
 
 def _sum_for_bodies(sum_matrix: Array, values: Array) -> Array:
-    """Return the sums of the pairs' values for every body, without a matrix product, which a GPU may round. (n, m)"""
     return jnp.sum(sum_matrix[:, :, None] * values[None], axis=1)

@@ -63,7 +63,6 @@ class Terrain(HeightField):
         return self.write(data.replace(states=states), self.replace(height_below=ground))
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return heights, full lengths along x and y, and the middle, m."""
         source = self.heights
         is_image = isinstance(source, (str, Path))
         size, pos = np.asarray(self.size, np.float64), np.asarray(self.pos, np.float64)
@@ -117,7 +116,6 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
-    """Add the height field to the scene, or change it if it exists already."""
     spec, min_height = scene.spec, float(heights.min())
     height_range = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
     fractions = ((heights - min_height) / height_range).astype(np.float32)

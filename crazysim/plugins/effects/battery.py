@@ -94,7 +94,6 @@ class Battery(Plugin, replaces=("battery voltage",), requires=needs_rotors):
         return data.replace(controls=controls.replace(rotor_vel=rotor_vel))
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the voltage, V, and the state of charge."""
         return {"voltage": self.voltage, "charge": self.charge}
 
     def discharge(self, data: SimData) -> SimData:

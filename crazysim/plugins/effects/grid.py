@@ -168,7 +168,6 @@ def load_wind_grid(path: str | Path) -> Grid:
 
 
 def _find_nodes(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct coordinates along an axis, in order, and the index of each point's coordinate among them."""
     ascending = np.sort(coordinates)
     extent = max(ascending[-1] - ascending[0], 1e-9)
     axis = ascending[np.concatenate([[True], np.diff(ascending) > 1e-6 * extent])]

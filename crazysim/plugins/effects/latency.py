@@ -74,7 +74,6 @@ class Latency(Plugin):
         return self.write(data, self.replace(queue=queue, arrived=arrived))
 
     def _delayed_controller(self, controller: Stage) -> Stage:
-        """Return a controller that uses the command that has arrived, and does not change the staged command."""
         scope: Any = controller.scope
 
         def run_on_delayed_command(data: SimData) -> SimData:
@@ -83,7 +82,6 @@ class Latency(Plugin):
         return Stage(run_on_delayed_command, scope, controller.when, controller.batched, controller.__name__)
 
     def _with_queue(self, sim: Simulation, data: SimData) -> Latency:
-        """Return the plugin with the staged command of ``data`` in all rows of the queue."""
         delay, max_delay = np.asarray(self.delay), self.max_delay
         max_delay = int(np.max(delay)) if max_delay is None else max_delay
         steps = check_parameter(sim, "delay", delay, (1,), range_between(0, max_delay), jnp.int32)
@@ -93,7 +91,6 @@ class Latency(Plugin):
 
 
 def _controller_stage(sim: Simulation) -> str:
-    """Return the name of the stage that uses the commands of the simulation's command level."""
     mode = sim.data.controls.mode.value
     for name in (f"{mode}_controller", f"commit_{mode}"):
         if name in sim.step_pipeline:
@@ -104,11 +101,9 @@ def _controller_stage(sim: Simulation) -> str:
 
 
 def _staged_command(data: SimData) -> Array:
-    """Return the staged command of the simulation's command level, with the feedforward of a setpoint. (..., k)"""
     return jnp.concatenate(staged_leaves(data), axis=-1)
 
 
 def _with_command(data: SimData, command: Array) -> SimData:
-    """Return the data with another command of the simulation's command level."""
     n = staged_leaves(data)[0].shape[-1]
     return stage_command(data, command[..., :n], command[..., n:])

@@ -44,7 +44,6 @@ INVERSES = {"params.J": "params.J_inv", "params.J_inv": "params.J"}
 
 
 def _needs_rotors(sim: Simulation, plugin: Plugin) -> None:
-    """Check that the model has rotors, if a setting acts on their numbers."""
     if any(getattr(plugin, name) is not None for name in (*FACTOR_NAMES, "wind")):
         require_rotors(sim, "Randomize with settings other than paths, charge and delay")
 
@@ -107,7 +106,6 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation."""
         super().__post_init__()
         is_list = isinstance(self.optional, (list, tuple)) and all(name in RANGE_SETTINGS for name in self.optional)
         names = ", ".join(RANGE_SETTINGS)
@@ -148,7 +146,6 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
 
     @classmethod
     def _preset(cls, ranges: dict[str, Any], changes: dict[str, Any]) -> Randomize:
-        """Return a plugin with the ranges of a preset, and with changes; ranges without a change are optional."""
         settings: dict[str, Any] = {"optional": tuple([name for name in ranges if name not in changes])}
         return cls(**(settings | ranges | changes))
 
@@ -250,11 +247,9 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
 
     @property
     def _max_delay(self) -> int:
-        """Longest delay, steps."""
         return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
 
     def _latency_code(self, sim: Simulation) -> str:
-        """Return the code, for messages, of a ``Latency`` that allows one random delay per drone."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
     def with_drawn_numbers(self, data: SimData) -> SimData:
@@ -315,7 +310,6 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
 
 
 def _full_path(sim: Simulation, path: Any) -> str:
-    """Return a path of the data, in which ``controls.controller`` is the controller of the command level."""
     return str(path).replace("controls.controller.", f"controls.{sim.data.controls.mode.value}.controller.", 1)
 
 
@@ -328,7 +322,6 @@ def _around_one(name: str, value: Any) -> Any:
 
 
 def _numbers(node: Any, prefix: str) -> dict[str, tuple[Mapping[str, Any], Array]]:
-    """Return declaration and value of every array of drones in a record, by its path."""
     found = {}
     for name, metadata, x in _children(node):
         if isinstance(x, (PyTree, dict)) and not isinstance(x, Members):
@@ -345,7 +338,6 @@ def _children(node: PyTree | dict[str, Any]) -> list[tuple[str, Mapping[str, Any
 
 
 def _scale(node: Any, path: str, factor: Array, operation: Callable[[Array, Array], Array]) -> Any:
-    """Return a record with the number at a path, if it has one, times a factor with any leading axes, or divided."""
     name, _, rest = path.partition(".")
     for child_name, metadata, x in _children(node) if isinstance(node, (PyTree, dict)) else ():
         if child_name == name and x is not None:

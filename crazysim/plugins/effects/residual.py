@@ -50,7 +50,6 @@ class Residual(Plugin, requires=needs_rotors):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The drag, if the coefficients are the airframe's, which were fitted with its linear drag."""
         return ("drag",) if self.linear is None else ()
 
     def bind(self, sim: Simulation) -> Residual:
@@ -135,11 +134,6 @@ def residual_wrench(inputs: Array, residual: Residual) -> tuple[Array, Array]:
 
 
 def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
-    """Return the coefficients of the airframes.
-
-    Raises:
-        ConfigError: If an airframe has none, or the networks of the airframes differ in size.
-    """
     unfitted_airframe = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
     if unfitted_airframe is not None:
         raise ConfigError(

@@ -89,7 +89,6 @@ class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
         )
 
     def _setting_or_drag_value(self, sim: Simulation, name: str, drag_value: Callable[[np.ndarray], float]) -> Array:
-        """Return a coefficient from the setting, or else from the airframes' linear drag in hover."""
         value = getattr(self, name)
         if value is None:
             drag = airframe_numbers(
@@ -105,7 +104,6 @@ class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
         return check_parameter(sim, name, value, allowed=range_between(0.0))
 
     def _hub_positions(self, sim: Simulation) -> Array:
-        """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""
         height = self.hub_height
         if height is None:
             height = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_height", ()))

@@ -94,7 +94,6 @@ class Complementary(Estimator):
         height_period = freq // default_rates(freq, {"rate of the height": HEIGHT_FREQ})["rate of the height"]
 
         def update_attitude(data: SimData) -> SimData:
-            """Update the attitude and the inertial velocity of one drone."""
             record, dt = self.read(data), period / data.core.freq
             gyro, accel = self.inertial(data)
             quat, integral = update_mahony(record.quat, record.integral, gyro, accel, dt, record.kp, record.ki)
@@ -102,7 +101,6 @@ class Complementary(Estimator):
             return self.write(data, record.replace(quat=quat, integral=integral, inertial_climb=climb))
 
         def update_height(data: SimData) -> SimData:
-            """Update the height of one drone."""
             record, dt = self.read(data), height_period / data.core.freq
             height, over_surface = self._height(data, record, dt)
             climb = (height - record.height) / dt
@@ -118,7 +116,6 @@ class Complementary(Estimator):
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated attitude, position and velocity of one drone, the last two with zero x and y."""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.pos[..., :2])
         pos, vel = (jnp.concatenate([zero, z], axis=-1) for z in (record.height, record.climb))
@@ -129,7 +126,6 @@ class Complementary(Estimator):
         return self.write(data, self.replace(quat=s.quat, height=s.pos[2:], climb=climb, inertial_climb=climb))
 
     def _height(self, data: SimData, record: Complementary, dt: float) -> tuple[Array, Array]:
-        """Return the new height of one drone, m, and the new ``over_surface``. (1,) each"""
         height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
         new_height = height
         sensors = self.aiding_sensors(data)

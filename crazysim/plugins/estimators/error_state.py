@@ -197,7 +197,6 @@ def predict_biased(
     )
 
     def transform_errors(p: Array) -> Array:
-        """Return the linearised step times a matrix."""
         rotated_att = error_rot @ p[6:9]
         pos_rows = p[:3] + vel_to_pos @ p[3:6] + att_to_pos @ p[6:9]
         vel_rows = error_rot @ p[3:6] + gravity_to_vel @ rotated_att + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
@@ -312,36 +311,26 @@ def turn_attitude(quat: Array, angle: Array, resting_quat: Array | None = None) 
 
 
 def _limit_covariances(covariances: Array) -> Array:
-    """Return covariances limited to their upper bound; NaN becomes the bound."""
     return jnp.where(covariances <= MAX_COVARIANCE, covariances, MAX_COVARIANCE)
 
 
 def _limit_variances(variances: Array, n: int) -> Array:
-    """Return the variances of ``n`` errors limited to their bounds; NaN becomes the upper bound."""
     return jnp.where(variances <= MAX_COVARIANCE, jnp.maximum(variances, MIN_VARIANCE[n]), MAX_COVARIANCE)
 
 
 def _is_variance(n: int) -> np.ndarray:
-    """Return True for the variances of the upper triangle of a covariance of ``n`` errors. (n (n + 1) / 2)"""
     return np.equal(*_upper_triangle(n))
 
 
 def _n_errors(upper: Array) -> int:
-    """Return the number of errors of a covariance, from its upper triangle."""
     return math.isqrt(2 * upper.shape[-1])
 
 
 @functools.cache
 def _upper_triangle(n: int) -> tuple[np.ndarray, ...]:
-    """Return rows and columns of the upper triangle of a matrix (n, n), row by row."""
     return tuple([x.astype(np.uint32) for x in np.triu_indices(n)])
 
 
 def _error_rotation(half_angle: Array) -> Array:
-    """Return the matrix by which an attitude error changes as the attitude turns, to second order. (3, 3)
-
-    Args:
-        half_angle: Half the rotation vector, body frame, rad. (3,)
-    """
     cross = rotation.cross_matrix(half_angle)
     return jnp.eye(3, dtype=half_angle.dtype) - cross + 0.5 * (cross @ cross)

@@ -97,7 +97,6 @@ class ErrorStateFilter(Estimator):
             return data.plugins[name].samples.taken_step[0] != self.read(data).used_steps[k]  # type: ignore[attr-defined]
 
         def fuse_measurement(data: SimData) -> SimData:
-            """Use a new measurement of one sensor."""
             record, sensor = self.read(data), data.plugins[name]
             used_steps = record.used_steps.at[k].set(sensor.samples.taken_step[0])  # type: ignore[attr-defined]
             estimate = record.update_estimate(sensor, data)
@@ -106,7 +105,6 @@ class ErrorStateFilter(Estimator):
         return Stage(fuse_measurement, "drone", is_new)
 
     def _restart(self, data: SimData) -> SimData:
-        """Restart the filter of one drone with a level attitude at the origin."""
         pos, quat = jnp.zeros_like(self.estimate.pos), jnp.zeros_like(self.estimate.quat).at[3].set(1.0)
         estimate = self.restarted_estimate(data, pos, quat)
         return self.write(data, self.replace(estimate=estimate, failures=self.failures + 1))

@@ -95,7 +95,6 @@ class ESKF(ErrorStateFilter):
         return tuple(UPDATE_FNS)
 
     def can_fuse(self, sensor: Sensor) -> bool:
-        """Return True if the filter has an update for the sensor, or can derive one from its ``ideal``."""
         links = [link for chain in sensor.chains.values() for link in chain]
         has_variance = all(type(x).variance is not Link.variance and not isinstance(x, Turned) for x in links)
         return super().can_fuse(sensor) or (sensor.measures_motion and bool(links) and has_variance)
@@ -157,7 +156,6 @@ class ESKF(ErrorStateFilter):
     def _initial_estimate(
         self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]
     ) -> Estimate:
-        """Return the estimate of one drone before any measurement, with the mean biases of its ``IMU``."""
         imu = self.imu(data)
         bias_stds = [
             x
@@ -169,7 +167,6 @@ class ESKF(ErrorStateFilter):
 
     def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
-            """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
             record, imu, dt = self.read(data), self.imu(data), period / data.core.freq
             half_rate = 0.5 * self.inertial(data)[0]
             accel, gyro = record.accel / period, (record.gyro - half_rate) / period
@@ -188,10 +185,7 @@ class ESKF(ErrorStateFilter):
 
     def _path_start_stage(self, name: str, period: int) -> Stage:
         def start_path(data: SimData) -> SimData:
-            """Start a path at a new measurement of one sensor.
-
-            The path leads back to the last prediction; the next prediction extends it.
-            """
+            # The path leads back to the last prediction; the next prediction extends it.
             record, (gyro, accel) = self.read(data), self.inertial(data)
             since_prediction = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
             empty_row = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
@@ -208,7 +202,6 @@ class ESKF(ErrorStateFilter):
         return Stage(start_path, "drone", lambda data: data.plugins[name].is_sampled(data))  # type: ignore[attr-defined]
 
     def _path_rows(self, name: str, data: SimData) -> tuple[int, int]:
-        """Return the first row of the paths of one sensor, and the row after the last."""
         counts = {sensor.name: _n_rows_in_transit(sensor) for sensor in self.aiding_sensors(data)}
         first = sum([*counts.values()][: [*counts].index(name)])
         return first, first + counts[name]
@@ -246,23 +239,19 @@ class ESKF(ErrorStateFilter):
 
 
 def _n_rows_in_transit(sensor: Any) -> int:
-    """Return the number of measurements of a sensor in ``data.plugins`` that can be in transit."""
     arrival_steps = sensor.samples.arrival_steps
     return 0 if arrival_steps is None else arrival_steps.shape[-1]
 
 
 def _bias_walk(triad: Triad, dt: float) -> Array:
-    """Return the variance of the change of a bias in an interval, approximating its wander as a random walk. (3,)"""
     return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
 
 
 def _finalize(estimate: Estimate) -> Estimate:
-    """Return the estimate with its attitude error, however small, moved into the attitude."""
     return error_state.finalize(estimate, min_angle=0.0)
 
 
 def _combined_std(*deviations: Array | float, min_std: float = MIN_STD) -> Array:
-    """Return the standard deviation of a sum of independent errors, at least ``min_std``. (...)"""
     return _std(sum(x * x for x in deviations), min_std)
 
 
@@ -307,7 +296,6 @@ def update_by_ideal(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate)
 
 
 def _has_slope(sensor: Sensor, data: SimData) -> bool:
-    """Whether the measurement of a sensor without errors has a derivative by a state that ``update_by_ideal`` uses."""
     states = {name: getattr(data.states, name) for name in MEASURED_STATES}
 
     ideal = vmap_worlds(vmap_drones(lambda drone: sensor.bound(drone).ideal(drone)))
@@ -394,5 +382,4 @@ Derivatives in closed form need half of its operations."""
 
 
 def _update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    """Return the estimate after the latest measurement of a sensor."""
     return UPDATE_FNS.get(type(sensor), update_by_ideal)(sensor, imu, data, estimate)

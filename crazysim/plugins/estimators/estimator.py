@@ -41,7 +41,6 @@ class Estimator(Plugin):
     name: str = "estimator"
 
     def __post_init__(self) -> None:
-        """Check that ``sensors`` is a list of sensors."""
         super().__post_init__()
         is_list = isinstance(self.sensors, (list, tuple)) and all(isinstance(x, Sensor) for x in self.sensors)
         example = f"{type(self).__name__}([IMU(), MotionCapture()])"
@@ -115,7 +114,6 @@ class Estimator(Plugin):
         return data if drawn is data else data.replace(plugins=data.plugins | {self.name: drawn.plugins[self.name]})
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated state of one drone; in a world's first step, the true state."""
         s, estimate = data.states, self.estimated_states(data)
         is_first_step = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
         states = {name: jnp.where(is_first_step, getattr(s, name), value) for name, value in estimate.items()}
@@ -134,7 +132,6 @@ class Estimator(Plugin):
         return super().with_arrays(sim, sensors=tuple([sensor.name for sensor in self.sensors]), **values)
 
     def check_simulation(self, sim: Simulation) -> None:
-        """Check the sensors: one ``IMU``, and others of kinds that the filter can use."""
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
             classes = [type(sensor).__name__ for sensor in self.sensors]
@@ -150,8 +147,6 @@ class Estimator(Plugin):
         super().check_simulation(sim)
 
     def _estimate_controller(self, controller: Stage) -> Stage:
-        """Return a controller that reads the estimate in place of the state."""
-
         def run_on_estimate(data: SimData) -> SimData:
             return controller.fn(with_measured_states([self], data)).replace(states=data.states)
 

@@ -106,7 +106,6 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
     accel_to_vel, accel_to_pos, vel_cross = -t * half_rot, -0.5 * t**2 * rot @ half_rot, cross_matrix(vel)
 
     def transform_errors(p: Array) -> Array:
-        """Return the derivatives of the errors at the end times a matrix."""
         att = inverse_rot @ (p[6:9] + gyro_to_att @ p[12:])
         vel_error = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
         pos_rows = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
@@ -117,6 +116,5 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
 
 
 def _half_rotation(quat: Array) -> Array:
-    """Return half of a rotation by less than a turn. (4,)"""
     identity = jnp.asarray(IDENTITY_QUAT, quat.dtype)
     return rotation.safe_normalize(quat + identity * jnp.where(quat[3] < 0, -1.0, 1.0), identity)

@@ -107,7 +107,6 @@ class Kalman(ErrorStateFilter):
 
     def _prediction_fn(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
-            """Predict the state of one drone from the mean of its inertial measurements."""
             record = self.read(data)
             accel, gyro = record.accel / period, record.gyro / period
             dt = period / data.core.freq
@@ -118,7 +117,6 @@ class Kalman(ErrorStateFilter):
         return predict
 
     def _add_noise(self, data: SimData) -> SimData:
-        """Add the process noise of as many loops of the firmware as a step lasts."""
         dt, n_loops, accel = 1 / FIRMWARE_RATE, FIRMWARE_RATE / data.core.freq, self.accel_noise
         deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * self.gyro_noise])
         return self.write(data, self.replace(estimate=error_state.add_noise(self.estimate, n_loops * deviations**2)))
@@ -128,15 +126,12 @@ class Kalman(ErrorStateFilter):
         return UPDATE_FNS[type(sensor)](sensor, self.imu(data), data, self.estimate, rot, std)
 
     def _is_updated(self, data: SimData) -> Array:
-        """Return True where measurements of this step have changed the attitude of one drone. ()"""
         return jnp.any(self.read(data).estimate.att_error != 0)
 
     def _finalize(self, data: SimData) -> SimData:
-        """Move the attitude error of one drone into its attitude."""
         return self.write(data, self.replace(estimate=error_state.finalize(self.estimate)))
 
     def _store_attitude(self, data: SimData) -> SimData:
-        """Store the attitude of one drone at the end of the step."""
         return self.write(data, self.replace(previous_quat=self.estimate.quat))
 
     def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:

@@ -254,5 +254,4 @@ def update_sweep(
 
 
 def _std_per_axis(deviation: Array | float) -> Sequence[Array | float]:
-    """Return the standard deviation of each of three axes."""
     return [deviation] * 3 if jnp.ndim(deviation) == 0 else [deviation[k] for k in range(3)]  # type: ignore[index]

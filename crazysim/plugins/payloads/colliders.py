@@ -61,7 +61,6 @@ class CollidingPlugin(Plugin, abstract=True):
 
     @property
     def moved_kinds(self) -> tuple[str, ...]:
-        """Names of the loads and their links in the scene."""
         return (*self.solid_kinds, f"{self.name}_link")
 
     def colliders(self) -> tuple[Collider, ...]:

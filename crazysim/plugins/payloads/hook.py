@@ -97,7 +97,6 @@ class Hook(HangingLoad):
         return Hook(mass, dof, **settings)
 
     def bind(self, sim: Simulation) -> Hook:
-        """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         load = bind_load(self, sim, False, rest_height(self.size) + self.ring, self.ring)
         if self.load_at is None:
             grip = device_array(load.attached, bool)
@@ -245,7 +244,6 @@ class Hook(HangingLoad):
         return LoadBody(load.pos - self.ring * up, rotation_from_z(up), load.vel, load.mass + held_mass)
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
-        """Return the data with other velocities of loads and of hooks that hold them. (..., 3)"""
         load = self.read(data)
         return self.write(data, load.replace(vel=vel, tip_vel=jnp.where(load.attached[..., None], vel, load.tip_vel)))
 
@@ -269,10 +267,8 @@ class Hook(HangingLoad):
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
     def _rod_directions(self, data: SimData) -> Array:
-        """Return the unit vectors along the rods, world frame. (..., 3)"""
         return link_geometry(data.states, self.tip_pos, self.tip_vel, self.attach).direction
 
     def _link_params(self) -> LinkParams:
-        """Return the parameters of one rod, with the masses of the hook and of a load on it at the tip."""
         mass = self.hook_mass + jnp.where(self.attached, self.mass, jnp.zeros_like(self.mass))
         return LinkParams(self.attach, self.length, mass, self.damping, is_hinge=self.dof == 1)

@@ -202,7 +202,6 @@ def couple_bodies(
 
 
 def _add_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
-    """Return a derivative with the angular acceleration ``factor @ torque`` added; with ``dt`` also to ``ang_vel``."""
     if factor is None:
         result = deriv.replace(ang_acc=deriv.ang_acc + torque)
         return result if dt is None else result.replace(ang_vel=deriv.ang_vel + dt * torque)
@@ -226,7 +225,6 @@ def acceleration_at(
 
 
 def _swing_velocities(state: SimState, geometry: LinkGeometry) -> tuple[Array, Array]:
-    """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
     ang_vel = matvec(geometry.rot, state.ang_vel)
     return ang_vel, add_cross(geometry.vel, geometry.offset, ang_vel)
 
@@ -253,7 +251,6 @@ def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> A
 
 
 def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
-    """Return the deceleration of the tip by the damped joint divided by its speed of swing, 1/s. (1,)"""
     rate = drag_rate(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
     return rate if link.is_attached is None else jnp.where(link.is_attached, rate, 0.0)
 
@@ -261,7 +258,6 @@ def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
 def _radial_term(
     geometry: LinkGeometry, radial_speed: Array, radial_acc: Array, link: LinkParams, dt: float | None, freq: int
 ) -> Array:
-    """Return the term of the equation's right-hand side that ends relative motion along the link, m/s^2. (1,)"""
     if dt is None:
         if not link.is_cable:
             return 2 * correction_rate(freq) * radial_speed
@@ -288,7 +284,6 @@ def _hinge_pull(
     state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, rel_acc: Array, J_inv: Array, link: LinkParams,
     dt: float | None, freq: int,
 ) -> tuple[UnitPull, Array]:  # fmt: skip
-    """Return the pull that keeps the tip in the body's x-z plane, and the relative acceleration that it prevents."""
     y = geometry.rot[..., 1]
     ang_vel, swing = _swing_velocities(state, geometry)
     offset = to_body_frame(geometry.rot, geometry.offset)
@@ -304,7 +299,6 @@ def _tip_pos_rate(
     state: SimState, deriv: SimStateDeriv, geometry: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array,
     attach_acc: Array, dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
-    """Return the rate of the tip's position, including the correction of errors in length, m/s. (3,)"""
     is_attached, stretch = link.is_attached, geometry.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)

@@ -231,7 +231,6 @@ def add_to_scene(
 
 
 def _rod_xml(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:
-    """Return MJCF of a rod that touches nothing."""
     ends, color = f"{_join_numbers(start)} {_join_numbers(end)}", _join_numbers(rgba)
     return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{color}"/>'
 

@@ -117,7 +117,6 @@ class SharedLoad(PointLoad):
         return load.replace(pos=pos, vel=vel, attach=load.attach if np.any(np.asarray(load.attach)) else None)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stage that stops the load at the floor, and with ``rk4`` the stage of the cables' impulses."""
         placements = [
             StagePlacement(self.stage(self.stop_at_floor, "world"), "measurements", name=f"{self.name}_floor")
         ]
@@ -207,7 +206,6 @@ class SharedLoad(PointLoad):
 
 
 def _tension_matrix(pull: UnitPull, load_mass: Array, drone_mass: Array) -> Array:
-    """Return the accelerations along the links per unit tension of each link and mass of the load, 1. (n, n)"""
     q = pull.direction
     ratio = jnp.broadcast_to(load_mass / drone_mass, (q.shape[0], 1))
     if pull.lever is not None and pull.ang_acc is not None:
@@ -218,18 +216,9 @@ def _tension_matrix(pull: UnitPull, load_mass: Array, drone_mass: Array) -> Arra
 
 
 def _solve_tensions(matrix: Array, rhs: Array, is_active: Array, one_sided: bool) -> Array:
-    """Return the tensions per mass of the load, m/s^2; cables that would push are slack. (n,)
-
-    Cables: tensions t >= 0 with ``matrix t >= rhs``, and for each cable equality in one of the two, a linear
-    complementarity problem. It has one solution, found by principal pivoting (Murty 1974; the first pivots exchange all
-    cables at once, as Judice and Pires 1994 do).
-
-    Args:
-        matrix: Accelerations along the links per unit tension of each link, symmetric, positive definite. (n, n)
-        rhs: Relative accelerations that the tensions prevent, m/s^2. (n,)
-        is_active: True for links that can pull. (n,)
-        one_sided: True for cables.
-    """
+    # Cables: tensions t >= 0 with ``matrix t >= rhs``, and for each cable equality in one of the two, a linear
+    # complementarity problem. It has one solution, found by principal pivoting (Murty 1974; the first pivots exchange
+    # all cables at once, as Judice and Pires 1994 do).
     n = rhs.shape[0]
 
     def solve(matrix: Array, rhs: Array, is_taut: Array) -> Array:

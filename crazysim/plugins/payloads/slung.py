@@ -68,7 +68,6 @@ class SlungLoad(PointLoad, HangingLoad):
         return bind_load(self, sim, self.cable, rest_height(self.size))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stage that stops loads at the floor, and for cables with ``rk4`` the stage of their impulses."""
         placements = [StagePlacement(self.stage(self.stop_at_floor), "measurements", name=f"{self.name}_floor")]
         method = find_integrator(sim)
         if self.cable and method is rk4:

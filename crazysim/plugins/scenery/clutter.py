@@ -99,12 +99,10 @@ class Clutter(Scenery):
         return jnp.stack(pos, axis=-1), jnp.stack(quat, axis=-1)
 
     def _middles(self) -> np.ndarray:
-        """Return the middles of the cells, m. (n, 3)"""
         index = np.indices(self.n_cells.tolist()).reshape(3, -1).T
         return np.asarray(self.center, np.float64) + self.cell * (index - (self.n_cells - 1) / 2)
 
     def _kinds(self) -> list[tuple[str, dict[str, Any], Shape]]:
-        """Return source, settings of the primitive and shape of each kind of obstacles."""
         kinds: list[tuple[str, dict[str, Any], Shape]] = []
         low, high = np.asarray(self.sizes, np.float64).tolist()
         for size in np.linspace(low, high, N_SIZES).tolist():
@@ -121,14 +119,12 @@ class Clutter(Scenery):
 
 
 def _bounding_radius(shape: Shape) -> float:
-    """Return the radius of the ball around the origin that contains a shape, m."""
     if shape.kind == "mesh":
         return float(np.linalg.norm(shape.array("vertices"), axis=-1).max())
     return float(np.linalg.norm(shape.size))
 
 
 def _mesh_xml(corners: np.ndarray) -> str:
-    """Return the MJCF of a convex mesh that drones can touch."""
     numbers = " ".join(f"{x:.9g}" for x in corners.reshape(-1))
     geom = '<geom type="mesh" mesh="mesh" contype="0" conaffinity="2" rgba="0.55 0.5 0.35 1"/>'
     return (

@@ -175,7 +175,6 @@ class StandingObstacles(Scenery):
         return jnp.min(jnp.where(obstacles.is_standing & (distance < self.cell), distance, self.cell), axis=(0, 1))
 
     def _middle(self, column: Any, row: Any) -> tuple[Any, Any]:
-        """Return x and y of the middles of cells, before the shifts of their columns, m. (...) each"""
         x, y = (
             middle + self.cell * (index - (n - 1) / 2)
             for middle, index, n in zip(np.asarray(self.center).tolist(), (column, row), self.n_cells, strict=True)
@@ -183,15 +182,12 @@ class StandingObstacles(Scenery):
         return x, y
 
     def _shift(self, data: SimData, column: Any) -> Array:
-        """Return the shifts of columns of cells along y, m. (...)"""
         return (self.read(data).uniform(3 * math.prod(self.n_cells) + column) - 0.5) * self.cell
 
     def _size_index(self, cell: Any) -> Any:
-        """Return the index of the size of the obstacles in cells, from 0 to 7. (...)"""
         return (cell.astype(np.uint32) * GOLDEN_STRIDE) >> (32 - SIZE_BITS)
 
     def _size(self, size_index: Any) -> Any:
-        """Return the size with an index, m. (...)"""
         low, high = self.sizes
         return low + (high - low) / (2**SIZE_BITS - 1) * size_index
 
@@ -259,5 +255,4 @@ class Pillars(StandingObstacles):
 
 
 def _cell_index(position: Array, n: int) -> Array:
-    """Return the index of the cell of a position in units of cells, from -2 to n + 1. (...)"""
     return jnp.floor(jnp.clip(position, -2.0, n + 1.0)).astype(jnp.int32)

@@ -70,5 +70,4 @@ class Gates(Scenery):
         return jnp.stack([x.astype(half_yaw.dtype) for x in pos], axis=-1), jnp.stack(quat, axis=-1)
 
     def _undisplaced_positions(self) -> np.ndarray:
-        """Return the middles of the gates before they are displaced, m. (count, 3)"""
         return np.asarray(self.start, np.float64) + self.spacing * np.arange(self.count)[:, None] * [1.0, 0.0, 0.0]

@@ -96,13 +96,11 @@ class Rooms(Scenery):
     def _wall_model(
         self, length: float
     ) -> tuple[str, dict[str, float], list[tuple[Shape, tuple[float, float, float]]]]:
-        """Return the primitive of a wall of a length along y, the settings of the primitive, and the wall's shape."""
         options = {"length": length, "height": self.height, "thickness": self.thickness}
         shape = Shape("box", (self.thickness / 2, length / 2, self.height / 2))
         return "wall", options, [(shape, (0.0, 0.0, self.height / 2))]
 
     def _outer_walls(self) -> list[tuple[float, np.ndarray]]:
-        """Return length and middle of the two outer walls along y, then of the two outer walls along x, m."""
         (x, y), size = np.asarray(self.center, np.float64), self.room * np.array(self._room_counts())
         along_y = [(float(size[1]) + self.thickness, np.array([x + side * size[0] / 2, y, 0.0])) for side in (-1, 1)]
         return along_y + [
@@ -110,7 +108,6 @@ class Rooms(Scenery):
         ]
 
     def _piece_positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the middles of all panels and of all posts, first in walls along y, then along x, m. (n, 3) each"""
         n_x, n_y = self._room_counts()
         corner = np.asarray(self.center, np.float64) - self.room * np.array([n_x, n_y]) / 2
         panels = self.room / 2 + self.door * (np.arange(self.n_panels) - (self.n_panels - 1) / 2)

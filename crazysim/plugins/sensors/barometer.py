@@ -54,7 +54,6 @@ class Barometer(Sensor):
     }
 
     def ideal(self, data: SimData) -> Array:
-        """Return the pressure, Pa, and the height, m. (2,)"""
         height = data.states.pos[2:]
         return jnp.concatenate([pressure_at(height + self.altitude), height])
 

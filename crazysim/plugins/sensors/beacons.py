@@ -63,7 +63,6 @@ class UWB(Sensor):
         return self.with_arrays(sim, anchors=_point_array(sim, "anchors", self.anchors, 2 if self.tdoa else 1))
 
     def ideal(self, data: SimData) -> Array:
-        """Return the distances, (n_anchors,), or their differences from the first, (n_anchors - 1,), m."""
         return self._to_measurement(self._distances(data))
 
     def measure(self, data: SimData, key: Array) -> tuple[Array, UWB]:
@@ -75,7 +74,6 @@ class UWB(Sensor):
         return self._to_measurement(distance), self
 
     def _distances(self, data: SimData) -> Array:
-        """Return the distances of one antenna from the anchors, m. (n_anchors,)"""
         s = data.states
         return rotation.safe_norm(rotation.rotate(s.quat, self.pos, s.pos) - self.anchors)[:, 0]
 
@@ -122,7 +120,6 @@ class Lighthouse(Sensor):
         return self.with_arrays(sim, stations=stations, quat=jax.jit(rotation.from_rpy)(rpy), diodes=diodes)
 
     def ideal(self, data: SimData) -> Array:
-        """Return the angles, rad, and 1 where a diode is in view, else 0. (3 n_stations n_diodes,)"""
         s = data.states
         offset = rotation.rotate(s.quat, self.diodes, s.pos) - self.stations[:, None]
         station_frame_pos = rotation.rotate_inverse(self.quat[:, None], offset)
@@ -153,7 +150,6 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
 
 
 def _point_array(sim: Simulation, name: str, value: Any, min_points: int) -> Array:
-    """Return the checked setting ``name`` as an array of vectors. (n, 3)"""
     points = np.asarray(value, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < min_points or not np.isfinite(points).all():
         raise ConfigError(f"expected {name} as at least {min_points} finite vectors (n, 3), got {points.tolist()}")

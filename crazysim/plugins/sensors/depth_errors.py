@@ -54,7 +54,6 @@ class StereoNoise:
     """True for holes behind the edges of nearer objects."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_settings(self)
 
     def apply(self, depth: Array, is_hidden: Array | None, key: Array) -> Array:
@@ -97,7 +96,6 @@ class Distortion:
     """Radial coefficient of r^6, 1."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_settings(self)
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +130,6 @@ class Distortion:
         return u, v
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of ``distort``: dx'/dx, dx'/dy (which equals dy'/dx) and dy'/dy. (...) each"""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))

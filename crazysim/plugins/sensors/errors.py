@@ -51,7 +51,6 @@ class White(Link):
     n_step = 1
 
     def __post_init__(self) -> None:
-        """Check that fields are names, not the numbers themselves."""
         for x in vars(self).values():
             expect(
                 isinstance(x, str), f"names of the sensor's fields in {type(self).__name__}", x, "Use White('noise')."

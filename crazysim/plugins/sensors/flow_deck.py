@@ -53,7 +53,6 @@ class OpticalFlow(Sensor):
     chains: ClassVar = {"flow": [White("noise"), Rounded("resolution")]}
 
     def ideal(self, data: SimData) -> Array:
-        """Return the motion of the image, pixels per interval. (2,)"""
         s = data.states
         distance, is_in_view = ground_distance(data, self.pos)
         vel = rotation.rotate_inverse(s.quat, s.vel, rotation.cross(s.ang_vel, self.pos))
@@ -90,7 +89,6 @@ class TimeOfFlight(Sensor):
     channels: ClassVar = {"distance": 1}
 
     def ideal(self, data: SimData) -> Array:
-        """Return the distance to the ground, m. (1,)"""
         distance, is_in_view = ground_distance(data, self.pos)
         distance = jnp.where(distance > 0, distance, 0.0)
         return jnp.where(is_in_view & (distance < self.max_range), distance, self.max_range)

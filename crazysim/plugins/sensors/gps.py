@@ -42,7 +42,6 @@ class GPS(Sensor):
     }
 
     def ideal(self, data: SimData) -> Array:
-        """Return position and velocity of the antenna. (6,)"""
         s = data.states
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, self.pos), s.vel)
         return jnp.concatenate([rotation.rotate(s.quat, self.pos, s.pos), vel])

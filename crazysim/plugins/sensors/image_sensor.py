@@ -274,8 +274,6 @@ class ImageSensor(Plugin):
         take_images = self.image_fn(sim)
 
         def update_record(data: SimData) -> SimData:
-            """Take and deliver images; skip both if they are due in no world."""
-
             def update(data: SimData) -> SimData:
                 return self.write(data, self.update(take_images, data, self.read(data), period))
 
@@ -287,7 +285,6 @@ class ImageSensor(Plugin):
         return [StagePlacement(stage, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the last images of one drone, row by row. (k,) each"""
         return {name: image.reshape(-1) for name, image in self.read(data).images.items()}
 
     def age(self, data: SimData) -> Array:
@@ -303,6 +300,5 @@ class ImageSensor(Plugin):
         return math.floor(float(self.latency) * data.core.freq + 0.5)
 
     def _n_rows(self, data: SimData, period: int) -> int:
-        """Return the number of rows for images in transit in the record; zero without latency."""
         latency = self._latency_steps(data)
         return -(-latency // period) + 1 if latency else 0

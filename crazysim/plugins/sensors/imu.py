@@ -168,7 +168,6 @@ class IMU(Sensor):
         return [StagePlacement(self.stage(self._store_velocities, when=condition), name=f"{self.name}_before"), *stages]
 
     def ideal(self, data: SimData) -> Array:
-        """Return the measurement without errors, for a drone that does not accelerate. (6,)"""
         s, zero = data.states, jnp.zeros_like(data.states.vel)
         force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, self.pos)
         return _to_sensor_frame(self.quat, s.ang_vel, force)
@@ -208,7 +207,6 @@ class IMU(Sensor):
         return {"ang_vel": rotation.rotate(self.quat, self.part(data, "gyro"))}
 
     def _store_velocities(self, data: SimData) -> SimData:
-        """Store the velocities of one drone before the step."""
         s = data.states
         return self.write(data, self.replace(vel=s.vel, ang_vel=s.ang_vel))
 
@@ -252,5 +250,4 @@ def vibration(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) ->
 
 
 def _to_sensor_frame(quat: Array, *vectors: Array) -> Array:
-    """Return vectors of the body frame in the sensor's frame, joined. (3 n,)"""
     return jnp.concatenate([rotation.rotate_inverse(quat, v) for v in vectors])

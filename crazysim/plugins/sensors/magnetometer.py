@@ -50,5 +50,4 @@ class Magnetometer(Sensor):
         return self.with_arrays(sim, errors=self.errors.bind(sim, "errors"), quat=mounting_quat(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
-        """Return the field in the sensor's frame, T. (3,)"""
         return rotation.rotate_inverse(rotation.multiply(data.states.quat, self.quat), self.field)

@@ -51,7 +51,6 @@ class MotionCapture(Sensor):
         return self.with_arrays(sim, quat=mounting_quat(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
-        """Return the pose and the velocity of the tracked body. (10,)"""
         s = data.states
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, self.pos), s.vel)
         return jnp.concatenate([rotation.rotate(s.quat, self.pos, s.pos), rotation.multiply(s.quat, self.quat), vel])
@@ -69,5 +68,4 @@ class MotionCapture(Sensor):
         return jnp.concatenate([pose, vel]), sensor.replace(last_pos=pose[:3], vel=vel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return position, attitude and velocity, as if the tracked body were the drone's frame."""
         return self.split(self.latest(data))

@@ -72,7 +72,6 @@ class RotorSpeeds(NoisySensor):
         return self.with_arrays(sim)
 
     def ideal(self, data: SimData) -> Array:
-        """Return the rotor speeds, rpm. (n_rotors,)"""
         return data.states.rotor_vel
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
@@ -97,7 +96,6 @@ class BatteryVoltage(NoisySensor):
         return {self.battery: Battery}
 
     def ideal(self, data: SimData) -> Array:
-        """Return the voltage under load, V. (1,)"""
         return data.plugins[self.battery].voltage
 
 
@@ -132,7 +130,6 @@ class MultiRanger(NoisySensor):
         return self.with_arrays(sim)
 
     def ideal(self, data: SimData) -> Array:
-        """Return the distances, m. (n_rays,)"""
         return data.plugins[self.range_finder].distance
 
     def measure(self, data: SimData, key: Array) -> tuple[Array, MultiRanger]:

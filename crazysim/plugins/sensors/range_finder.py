@@ -99,18 +99,15 @@ class RangeFinder(Plugin):
         period, scene = sim.data.core.freq // rate_in(self, sim.data.core.freq), sim.scene
 
         def is_due(data: SimData) -> Array:
-            """Return True for worlds that measure in this step."""
             return data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:
-            """Measure distances, with loads at their current positions."""
             movers_present = {name: plugin for name, plugin in movers_by_name.items() if plugin.name in data.plugins}
             current_data = with_moved_objects(data, movers_present)
             measured = self.bound(data)._measure(model, current_data, scope == "drone", scene.ray_kernels)
             return self.write(data, measured)
 
         def measure_if_due(data: SimData) -> SimData:
-            """Measure in a call that is skipped if no world is due."""
             return jax.lax.cond(jnp.any(is_due(data)), measure, lambda data: data, data)
 
         fn = measure_if_due if scope == "batch" and period > 1 else measure
@@ -120,7 +117,6 @@ class RangeFinder(Plugin):
         return [StagePlacement(measurement_stage, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the distances, m."""
         return {"distance": self.distance}
 
     def age(self, data: SimData) -> Array:
@@ -138,7 +134,6 @@ class RangeFinder(Plugin):
             sim.scene.renderer.overlays.line(points, RAY_COLOR, 2.0, 2.0)
 
     def _measure(self, model: CollisionModel, data: SimData, is_single_drone: bool, kernels: RayKernels) -> RangeFinder:
-        """Return the plugin with the distances of one drone, of one world, or of all worlds."""
         states = data.states
         pos, quat = (states.pos[None], states.quat[None]) if is_single_drone else (states.pos, states.quat)
         direction = rotation.rotate(quat[..., None, :], self.direction)

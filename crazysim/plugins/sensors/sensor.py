@@ -115,7 +115,6 @@ class Sensor(Plugin):
         return self.write(data, self.replace(**changes))
 
     def _draw(self, n: str, key: Array, dtype: Any) -> Iterator[tuple[str, Link, Array]]:
-        """Yield channel, link and random numbers of every link; ``n`` is the name of their number per component."""
         links = [(name, link) for name, chain in self.chains.items() for link in chain]
         counts = [round(getattr(link, n) * self.channels[name]) for name, link in links]
         noise = normal(key, (max(1, sum(counts)),), dtype)
@@ -241,13 +240,11 @@ class Sensor(Plugin):
 
     @property
     def _max_delay(self) -> float:
-        """Longest sum of delay and jitter for which the record has a queue, s."""
         if self.max_delay is not None:
             return float(self.max_delay)
         return float(np.max(np.asarray(self.delay, np.float64)) + np.max(np.asarray(self.jitter, np.float64)))
 
     def _take_measurement(self, data: SimData) -> SimData:
-        """Take a measurement of one drone, and put it into the queue; without delay, it becomes the latest one."""
         key, step = drone_key(data, self.name), data.core.steps
         value, sensor = self.measure(data, key)
         samples: Any = self.samples
@@ -273,7 +270,6 @@ class Sensor(Plugin):
         return self.write(data, sensor.replace(samples=samples))
 
     def _deliver_measurement(self, data: SimData) -> SimData:
-        """Replace the latest measurement of one drone by the newest one that has arrived."""
         samples: Any = self.samples
         step, period = data.core.steps, data.core.freq // self.rate(data.core.freq)
         value, taken_step = samples.value, samples.taken_step

@@ -67,7 +67,6 @@ class Triad(PyTree):
     """True for errors in ``data.plugins``, with arrays."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.is_bound is not True:
             check_settings(self)
 

@@ -33,7 +33,6 @@ def part_names(cars: Any) -> tuple[str, ...]:
 
 
 def _object_name(cars: Any, part: str) -> str:
-    """Return the name of the objects of a part; objects of bodies have the name of the cars alone."""
     return cars.name if part == "body" else f"{cars.name}_{part}"
 
 
@@ -77,7 +76,6 @@ def move_cars(objects: Objects, cars: Any) -> Objects:
 
 
 def _wheel_poses(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
-    """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     positions = wheel_positions(vehicle)
     shape = (car.pos.shape[0], len(positions))
     body_quat = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
@@ -92,7 +90,6 @@ def _wheel_poses(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
 
 
 def _trailer_poses(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
-    """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
     radius, half_track = number("trailer.wheel_radius"), number("trailer.track") / 2
     bar_quat, deck_quat = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
@@ -109,14 +106,12 @@ def _trailer_poses(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Ar
 
 
 def _above_plane(level_pos: Array, car: Any, height: float) -> Array:
-    """Return level positions, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
     offset, normal = level_pos - car.pos[:, :2], car.normal
     rise = -(normal[:, :1] * offset[:, :1] + normal[:, 1:2] * offset[:, 1:]) / normal[:, 2:]
     return jnp.concatenate([level_pos, car.pos[:, 2:] + rise + height], axis=-1)
 
 
 def _rolling_quat(angle: Array) -> Array:
-    """Return the rotation about y by an angle, (..., 1), as a quaternion, xyzw. (..., 4)"""
     zero = jnp.zeros_like(angle)
     return jnp.concatenate([zero, jnp.sin(angle / 2), zero, jnp.cos(angle / 2)], axis=-1)
 
@@ -135,10 +130,7 @@ def _geom_xml(
 
 
 def _body_geoms(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
-    """Return the MJCF geoms of a vehicle in the frame of its centre of mass.
-
-    A vehicle with four wheels has a plate, a hood, a cabin with a flat roof, and bumpers. Other vehicles are one box.
-    """
+    # A vehicle with four wheels has a plate, a hood, a cabin with a flat roof, and bumpers. Other vehicles are one box.
     half_length, half_width, half_height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
     front, plate = vehicle.number("axles.front"), 0.02  # half the height of the plate
     if vehicle.number("wheels.number") != 4:
@@ -167,7 +159,6 @@ def _body_geoms(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
 
 
 def _wheel_geoms(radius: float, width: float) -> str:
-    """Return the MJCF geoms of a wheel with the axis y: a tyre, a rim and spokes."""
     axis, half_length = 'zaxis="0 1 0"', 0.29 * radius
     rim = _geom_xml("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, NO_CONTACT_ATTRIBUTES, axis)
     spokes = ""
@@ -184,13 +175,11 @@ def _wheel_geoms(radius: float, width: float) -> str:
 
 
 def _drawbar_geoms(length: float, track: float) -> str:
-    """Return the MJCF geoms of a drawbar and the axle behind it, in the frame of the axle's middle."""
     bar = _geom_xml("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, NO_CONTACT_ATTRIBUTES)
     return bar + _geom_xml("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, CONTACT_ATTRIBUTES)
 
 
 def _deck_geoms(vehicle: VehicleModel) -> str:
-    """Return the MJCF geoms of a trailer's deck and rear axle, in the frame of the middle of its front axle."""
     size, centre = vehicle.value("trailer.deck") / 2, vehicle.value("trailer.deck_centre")
     axles, track = vehicle.number("trailer.axle_distance"), vehicle.number("trailer.track")
     posts = "".join(

@@ -248,7 +248,6 @@ class Cars(Population):
         return {name: rate for name, rate in rates.items() if rate is not None}
 
     def _terrain_rates(self, data: SimData) -> dict[str, Array]:
-        """Return the rates of position and normal of one car that follows terrain."""
         height, normal = ground_at(data, self.pos)
         vel, settling_rate = self.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
         climb_rate = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
@@ -280,7 +279,6 @@ class Cars(Population):
             raise ConfigError(f"expected a vehicle with a table [trailer], got {vehicle.name!r}. Use 'aiml_head'.")
 
     def _paths(self) -> Path | None:
-        """Return all paths in one record."""
         if self.path is None:
             return None
         paths = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
@@ -296,7 +294,6 @@ class Cars(Population):
 
 
 def _repeat_for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
-    """Return the record of one member repeated for all members."""
     return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
 
 

@@ -125,12 +125,10 @@ class PathController:
     """Largest magnitude of the motor reference, in the unit of the vehicle's motor reference."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make every subclass a frozen dataclass."""
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True, eq=False)(cls)
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_settings(self)
 
     def check(self, vehicle: VehicleModel, path: Path) -> None:

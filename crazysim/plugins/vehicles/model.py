@@ -116,7 +116,6 @@ class VehicleModel:
         return self.number("axles.front") + self.number("axles.rear")
 
     def __repr__(self) -> str:
-        """Return the name alone; the tables are long."""
         return f"VehicleModel({self.name!r})"
 
 
@@ -146,7 +145,6 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
 
 def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
-    """Return the vehicle model of a source; ``bases`` are the sources that led to it through their key ``base``."""
     if isinstance(source, VehicleModel):
         return source
     bases = extend_bases(bases, source)
@@ -165,7 +163,6 @@ def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
 
 
 def _check_model(vehicle: VehicleModel) -> None:
-    """Check that a vehicle model has all required numbers, and that they are in range."""
     name, numbers = vehicle.name, vehicle.numbers
     if vehicle.dynamics not in DYNAMICS_NAMES:
         raise ConfigError(

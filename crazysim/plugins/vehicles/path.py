@@ -271,7 +271,6 @@ class Path(PyTree):
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
-        """Return the index of the piece at an arc length, and the position in it as a fraction of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
         s_in_lap = s - length * lax.floor(s / length)
         position = jnp.where(_entry_at(self.closed, index), s_in_lap, clip(s, 0.0, length)) / spacing
@@ -281,13 +280,11 @@ class Path(PyTree):
 
 @jax.jit
 def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array]:
-    """Return the point of a path at a time since the start, s, and the arc length of the point, m (1,)."""
     arc, _ = path.time_reference(index, t)
     return path.point_at(index, arc[0]), arc
 
 
 def _horizontal_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, int], Floats]]:
-    """Return the pieces of a trajectory, and its derivatives along x and y as a function of times and order."""
     pieces = PieceTable.create([trajectory])
     return pieces, lambda t, order: pieces.evaluate(np.zeros(len(t), int), t, order)[:, :2]
 
@@ -301,17 +298,6 @@ def _path_of_curve(
     backwards: bool,
     speed: float | None = None,
 ) -> Path:
-    """Return a record with one path.
-
-    Args:
-        curve: Function from parameters (n,) and the order of a derivative to x and y. (n, 2)
-        parameters: Parameters, equally spaced. (n,)
-        parametric_speed: Lengths of the derivatives at the parameters. (n,)
-        progress: Arc length and its rate over time. (n_times, 2)
-        closed: True for a path that ends at its start.
-        backwards: True to drive backwards.
-        speed: Speed, m/s; None for the parametric speed.
-    """
     arc = _arc_length(parameters, parametric_speed)
     if not arc[-1] > 1e-3:
         raise ConfigError(
@@ -359,12 +345,10 @@ def _path_of_curve(
 
 
 def _arc_length(parameters: Floats, parametric_speed: Floats) -> Floats:
-    """Return the arc length at each parameter, by the trapezoidal rule. (n,)"""
     return np.concatenate([[0.0], np.cumsum((parametric_speed[1:] + parametric_speed[:-1]) / 2 * np.diff(parameters))])
 
 
 def _evaluate(coefficients: Array, u: Array) -> PathPoint:
-    """Return position, tangent and curvature of a piece, (2, 6), at a fraction of its length. ()"""
     x = [coefficients[:, k] for k in range(6)]
     pos = x[0] + u * (x[1] + u * (x[2] + u * (x[3] + u * (x[4] + u * x[5]))))
     derivative = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))
@@ -380,5 +364,4 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
 
 
 def _entry_at(x: Array, *index: Array | int) -> Array:
-    """Return an entry of an array; an index that is out of range is clipped to the first or last entry."""
     return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

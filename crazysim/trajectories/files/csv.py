@@ -64,7 +64,6 @@ def parse_table(lines: list[str], location: str) -> NDArray:
 
 
 def _fit_samples(rows: NDArray, location: str) -> Trajectory:
-    """Return the cubic trajectory through samples of time, position and, optionally, yaw."""
     if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
         checks.raise_error(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", location)
     if len(rows) < 2:

@@ -100,7 +100,6 @@ def check_rows(rows: NDArray, location: str) -> tuple[NDArray, NDArray]:
 
 
 def _crazyflie_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return ends and coefficients as ``trajectory_pieces``, after a check that the degree is at most 7."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(

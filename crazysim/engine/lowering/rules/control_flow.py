@@ -30,7 +30,6 @@ def _call(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 @rule("pure_callback", "io_callback")
 def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Refuse a callback to the host: its stage stays unfused, and the step is split around it."""
     raise LimitError("it calls a function on the host")
 
 
@@ -41,7 +40,6 @@ def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[
 
 @rule("stop_gradient")
 def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the operands unchanged, with a derivative of zero."""
     aval = eqn.invars[0].aval
     if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
         return args
@@ -51,11 +49,8 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> li
 
 @rule("call_hi_primitive")
 def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Expand a primitive that is defined in terms of other primitives (JAX 0.12 and later).
-
-    If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like any
-    call. It then reads tables where the operands are tables.
-    """
+    # If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like
+    # any call. It then reads tables where the operands are tables.
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
     called_jaxpr = jax.make_jaxpr(expand_primitive(eqn))(*avals)
     if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
@@ -66,13 +61,11 @@ def _expand(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
 def _lower_with_derivative(
     ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray], called_jaxpr: ClosedJaxpr
 ) -> list[ElementArray]:
-    """Lower a call with a custom derivative. The derivative itself is lowered only when it is requested."""
     body = ctx.make_inner()
     block = body.finish(body.lower(called_jaxpr, [_add_inputs(body, x) for x in args]))
 
     @functools.cache
     def derivative() -> Block:
-        """Return the block from operands and their tangents to the tangents of the results."""
         call_fn = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         tangent_jaxpr = jax.make_jaxpr(lambda x, dx: jax.jvp(call_fn, x, dx)[1])(avals, avals)
@@ -94,7 +87,6 @@ def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> lis
 
 @rule("cond")
 def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Compute all branches and select one in each lane."""
     index_array, *operands = args
     branches = [close_jaxpr(b) for b in eqn.params["branches"]]
     index = index_array[()]
@@ -114,7 +106,6 @@ def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 @rule("platform_index")
 def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the index of the default branch, since a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
     named = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
     if named or None not in platforms:
@@ -176,8 +167,6 @@ def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
 
 
 def _add_inputs(ctx: Lowering, template: ElementArray) -> ElementArray:
-    """Return new inputs of a block, with the shape and types of an array of elements."""
-
     def new_input(x: Any) -> Any:
         return tuple(map(new_input, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
 
@@ -187,7 +176,6 @@ def _add_inputs(ctx: Lowering, template: ElementArray) -> ElementArray:
 def _add_operation(
     ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
 ) -> list[ElementArray]:
-    """Add an operation with the results of an equation, and return the results as arrays of elements."""
     key_flags = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
     sizes = [
         int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, key_flags, strict=True)

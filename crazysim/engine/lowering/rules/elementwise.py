@@ -24,14 +24,12 @@ def _elementwise(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list
 
 @rule("pow")
 def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Raise to a power; an integer exponent is first converted to the type of the result, as in JAX."""
     dtype = eqn.outvars[0].aval.dtype
     return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
 
 
 @rule("digamma")
 def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the digamma function. Its value at zero depends on the version of JAX."""
     dtype = eqn.outvars[0].aval.dtype
     is_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
     regular = ctx.elementwise("digamma", args, dtype)
@@ -51,7 +49,6 @@ def _convert(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
 
 @rule("select_n")
 def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Select one of two cases by a bool, or one of several by an integer."""
     which, *cases = args
     dtype, which_dtype = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
     if np.dtype(which_dtype).kind == "b":
@@ -100,7 +97,6 @@ def _add_any(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
 
 @rule("lt_to", "le_to", "eq_to")
 def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Compare in an order in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]
@@ -168,7 +164,6 @@ def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) ->
 
 @rule("clz")
 def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Set all bits below the highest set bit, and count the bits that are still zero."""
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
     x, shift = bits.from_number(args[0]), 1
@@ -181,7 +176,6 @@ def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> li
 
 @rule("reduce_precision")
 def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Round the mantissa to nearest even; overflow gives infinity, underflow a signed zero."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
     if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")

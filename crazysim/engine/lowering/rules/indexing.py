@@ -37,7 +37,6 @@ def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> li
 
 
 def _take(ctx: Lowering, x: ElementArray, start: Element, size: int, axis: int) -> ElementArray:
-    """Return ``size`` elements along an axis from ``start`` on. The start is clamped so that they are in the array."""
     max_start = x.shape[axis] - size
     if is_constant(start) or max_start == 0:
         k = int(np.clip(start, 0, max_start)) if max_start else 0
@@ -81,13 +80,11 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]
 
 
 def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> ElementArray:
-    """Return True where an index, clamped to 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
 
 def _conjunction(ctx: Lowering, conditions: Iterable[ElementArray]) -> ElementArray | None:
-    """Return True where all conditions hold; None if there is no condition."""
     result = None
     for condition in conditions:
         result = condition if result is None else ctx.elementwise("and", [result, condition], bool)
@@ -156,7 +153,6 @@ def _select_windows(
     row_by_element: np.ndarray,
     limits: Sequence[int],
 ) -> list[Element]:
-    """Return the elements of a gather, selected among all windows that the indices may refer to."""
     _check_range(int(np.prod([limit + 1 for limit in limits])))
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
@@ -179,7 +175,6 @@ def _select_windows(
 
 
 def _gather_filled(eqn: JaxprEqn, x: ElementArray, indices: np.ndarray) -> ElementArray:
-    """Return the elements at known indices; elements at indices outside the array have the fill value."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (positions,) = evaluate(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
@@ -191,7 +186,6 @@ def _gather_filled(eqn: JaxprEqn, x: ElementArray, indices: np.ndarray) -> Eleme
 
 
 def _fill_value(dtype: DTypeLike) -> Any:
-    """Return the fill value of JAX: NaN, the smallest signed integer, the largest unsigned integer, or True."""
     kind = np.dtype(dtype).kind
     if kind == "f":
         return np.nan
@@ -209,11 +203,8 @@ def _is_inside(ctx: Lowering, row: ElementArray, limits: list[int]) -> ElementAr
 
 @rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
 def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
-
-    A window whose position is computed at run time is compared with every position that it may have. A window that is
-    partly outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
-    """
+    # A window whose position is computed at run time is compared with every position that it may have. A window that is
+    # partly outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
     x, indices, updates = args
     dims, is_clipped = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
     window_axes = dims.update_window_dims
@@ -253,7 +244,6 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
 
 
 def _window_positions(index: Element, limit: int, is_clipped: bool) -> Sequence[int]:
-    """Return the positions that a window may have along an axis; none if it is known to be outside."""
     if not is_constant(index):
         return range(limit + 1)
     if is_clipped:
@@ -262,7 +252,6 @@ def _window_positions(index: Element, limit: int, is_clipped: bool) -> Sequence[
 
 
 def _combine(ctx: Lowering, eqn: JaxprEqn, old: ElementArray, new: ElementArray) -> ElementArray:
-    """Return the numbers that a scatter writes over ``old``: ``new``, or a combination of both such as their sum."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new

@@ -25,7 +25,6 @@ def _matrices(x: ElementArray) -> list[ElementArray]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the lower factor; its lower triangle is NaN if the matrix is not positive definite."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
@@ -81,7 +80,6 @@ def _substitute(
 
 @rule("lu")
 def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Factorise with partial pivoting; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")

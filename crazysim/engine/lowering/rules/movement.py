@@ -64,7 +64,6 @@ def move_by_indices(eqn: JaxprEqn, args: list[ElementArray], known_operands: Seq
 
 
 def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
-    """Return for each result the indices of its elements. NumPy is used where possible, to avoid a compilation."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "split":
@@ -81,7 +80,6 @@ def _source_indices(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
 
 
 def _pad(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
-    """Return an array padded before, after and between its elements; negative padding removes elements."""
     for axis, (low, high, interior) in enumerate(config):
         n = x.shape[axis]
         length = max(low + n + max(n - 1, 0) * interior + high, 0)

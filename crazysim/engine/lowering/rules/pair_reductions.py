@@ -13,10 +13,7 @@ from crazysim.engine.lowering.jaxprs import ElementArray, Lowering, UnsupportedE
 
 @rule("reduce_over_others")
 def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Add a loop over the drones of the world; in a world of one drone, apply the function to that drone.
-
-    A drone publishes only the numbers that the function uses and that may differ between drones.
-    """
+    # A drone publishes only the numbers that the function uses and that may differ between drones.
     n_captured, n = eqn.params["n_captured"], ctx.n_members
     if not n:
         raise UnsupportedError("it needs a stage with scope 'drone'")
@@ -58,7 +55,6 @@ def _replace_elements(x: ElementArray, replacements: dict[Value, Value]) -> Elem
 
 
 def _shared_numbers(ctx: Lowering) -> set[Value]:
-    """Return the numbers so far that are the same for all drones, because they depend only on shared numbers."""
     shared = set(ctx.shared)
     for op in ctx.builder.operations:
         if op.results and not op.blocks and all([is_constant(x) or x in shared for x in op.args]):

@@ -36,7 +36,6 @@ def _check_generator(impl: Any) -> None:
 
 @rule("random_fold_in", "random_split", "random_bits", "random_seed")
 def _random(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Lower a function of JAX's generator: integer arithmetic, and a cipher on the two halves of a key."""
     name, params, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
     takes_keys = name != "random_seed"
     if takes_keys:

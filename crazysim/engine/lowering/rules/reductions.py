@@ -44,7 +44,6 @@ def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elem
 
 @rule("reduce")
 def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Reduce by a function of accumulated and new operands, starting from the initial values."""
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
     result_shape = arrays[0].shape[len(axes) :]
@@ -71,7 +70,6 @@ def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[El
 
 @rule("argmax", "argmin")
 def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the index of the first extreme element, or of the first NaN, as XLA does."""
     (axis,), index_dtype = eqn.params["axes"], eqn.params["index_dtype"]
     comparison = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
@@ -94,10 +92,7 @@ def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 @rule("top_k")
 def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
-    """Return the k largest elements in descending order, and their indices. Equal elements keep their order.
-
-    XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
-    """
+    # XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
     (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
     positions = constants(np.broadcast_to(numbers, x.shape), np.int32)
@@ -116,16 +111,6 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Eleme
 def _sort_rows(
     ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray], axis: int, n_keys: int, descending: bool = False
 ) -> list[ElementArray]:
-    """Sort by odd-even transposition, which only exchanges neighbours and is therefore stable. NaN goes last.
-
-    Args:
-        ctx: Lowering that the operations are added to.
-        eqn: Equation, for error messages.
-        args: Keys, followed by other operands, which are permuted with the keys.
-        axis: Axis to sort along.
-        n_keys: Number of operands that are keys.
-        descending: True to sort the largest first; the keys must then contain no NaN.
-    """
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > MAX_UNROLL:
@@ -145,7 +130,6 @@ def _sort_rows(
 
 
 def _precedes(ctx: Lowering, first: Sequence[ElementArray], second: Sequence[ElementArray]) -> ElementArray:
-    """Return True where ``first`` precedes ``second`` in ascending order of several keys, with NaN last."""
     precedes, is_tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
         is_less, is_equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)

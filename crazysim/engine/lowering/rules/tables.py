@@ -24,14 +24,6 @@ class TableView:
     """An array whose elements are entries of a table in memory, each at a computed base plus a constant offset."""
 
     def __init__(self, ctx: Lowering, entry: TableEntry, offsets: np.ndarray, strides: dict[int, int]):
-        """Describe where the elements are stored.
-
-        Args:
-            ctx: The lowering.
-            entry: First element, with its table and base.
-            offsets: Index of each element in the table, minus the base.
-            strides: Increment of the index along each axis that is indexed.
-        """
         self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
         self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
         self.constants_by_offset: dict[int, Element] = {}
@@ -92,7 +84,6 @@ def find_table(ctx: Lowering, x: ElementArray, axes: Sequence[int], n_indices: i
 
 
 def _table_of_constants(ctx: Lowering, x: ElementArray, axes: Sequence[int]) -> TableView | None:
-    """Return an array of constants as a table. Entries that are equal at all indices stay constants."""
     numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
     if not np.all(np.isfinite(numbers)):
         return None
@@ -107,7 +98,6 @@ def _table_of_constants(ctx: Lowering, x: ElementArray, axes: Sequence[int]) -> 
 
 
 def _strides(offsets: np.ndarray, axes: Sequence[int]) -> dict[int, int] | None:
-    """Return the constant increment of the offsets along each axis, or None if an increment is not constant."""
     strides = {}
     for axis in axes:
         steps = np.diff(offsets, axis=axis)

@@ -164,7 +164,6 @@ class Crazyflie:
         }
 
     def _run_command(self, command: Callable[[Commander], object], group: int = 0) -> None:
-        """Call a function with the commander if the drone is in a group; refused commands are reported, not raised."""
         with self._swarm.lock:
             if not self._commander.in_group(group):
                 return
@@ -232,13 +231,11 @@ class CrazyflieServer:
         self._call_all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 
     def _call_all(self, function: Callable[[Crazyflie], object]) -> None:
-        """Call a function with every drone."""
         with self._swarm.lock:
             for cf in self.crazyflies:
                 function(cf)
 
 
 def _id_from_name(name: str, default: int) -> int:
-    """Return the number at the end of a name, or the default if there is none."""
     digits = name[len(name.rstrip("0123456789")) :]
     return int(digits) if digits else default

@@ -39,14 +39,6 @@ class Crazyswarm:
     """Clock."""
 
     def __init__(self, swarm: Swarm | str | Path | Mapping[str, Any] | None = None):
-        """Connect to simulated drones.
-
-        Args:
-            swarm: Swarm to fly, or path or contents of a ``crazyflies.yaml``; None for the default.
-
-        Raises:
-            ConfigError: If the configuration is invalid.
-        """
         global _chosen_swarm
         if swarm is None:
             swarm, _chosen_swarm = _chosen_swarm, None
@@ -58,7 +50,6 @@ class Crazyswarm:
 
 
 def _create_simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, list[str]]:
-    """Return a simulation of the enabled robots in a configuration, and their names."""
     if isinstance(configuration, (str, Path)):
         try:
             import yaml

@@ -72,17 +72,6 @@ class CrtpDevice:
     """One drone of a swarm, for one client."""
 
     def __init__(self, swarm: Swarm, drone: int | str, log: dict[str, tuple[str, Reading]] | None = None):
-        """Create the device's tables and memory.
-
-        Args:
-            swarm: Swarm.
-            drone: Index or name of the drone.
-            log: Further log variables by ``group.name``, each with its C type and a function of the drone's state and
-                commander that returns its value.
-
-        Raises:
-            ConfigError: If the drone or a type does not exist.
-        """
         self.swarm = swarm
         self.drone = swarm.index(drone) if isinstance(drone, str) else drone
         self.name, self.commander = swarm.names[self.drone], swarm.commanders[self.drone]
@@ -147,7 +136,6 @@ class CrtpDevice:
         return packets
 
     def _pack_value(self, k: int, struct_format: str, state: object) -> bytes:
-        """Return the value of the k-th log variable as bytes; NaN if it cannot be computed."""
         name = self.log.variables[k].name
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
@@ -157,7 +145,6 @@ class CrtpDevice:
         return pack_number(struct_format, value)
 
     def _report(self, text: str) -> None:
-        """Report a refused command, also on the drone's console."""
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
         line = f"{text}\n".encode("ascii", "replace")
         self._console.extend(line[k : k + MAX_DATA_BYTES] for k in range(0, len(line), MAX_DATA_BYTES))
@@ -200,10 +187,8 @@ class CrtpDevice:
     # Setpoints ------------------------------------------------------------------------------------------------------
 
     def _handle_setpoint(self, channel: int, data: bytes) -> list[Packet]:
-        """Apply roll, pitch, yaw and thrust in the modes of ``flightmode``; zero thrust stops the motors.
-
-        crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with the sign of the world frame.
-        """
+        # crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with the sign of the world
+        # frame.
         roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
         if thrust == 0:
             self.commander.stop()
@@ -216,7 +201,6 @@ class CrtpDevice:
         return []
 
     def _collective_thrust(self, thrust: int) -> float:
-        """Return the collective thrust, N, of a 16-bit value; full scale is all rotors at their largest thrust."""
         airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
 
@@ -246,7 +230,6 @@ class CrtpDevice:
     # Tables ---------------------------------------------------------------------------------------------------------
 
     def _answer_table_request(self, port: int, table: Table, data: bytes) -> list[Packet]:
-        """Answer a request to a table of contents, version 2 of its protocol."""
         if data[0] == 3:
             header = struct.pack("<BHI", 3, len(table.variables), table.checksum)
             return [(port, 0, header + (bytes([MAX_LOG_BLOCKS, MAX_LOG_VARIABLES]) if port == LOGGING else b""))]
@@ -282,7 +265,6 @@ class CrtpDevice:
         return [(LOGGING, 1, bytes([command, block_id, code]))]
 
     def _define_block(self, command: int, block_id: int, data: bytes) -> int:
-        """Create a log block or append to it, and return an error code, or 0 for success."""
         if command == 6 and block_id in self.blocks:
             return errno.EEXIST
         if command == 7 and block_id not in self.blocks:
@@ -336,7 +318,6 @@ class CrtpDevice:
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
     def _set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter; a refused value is reported, and the parameter keeps its value."""
         try:
             self.swarm.set_parameter(self.drone, name, value)
         except ConfigError as error:

@@ -40,7 +40,6 @@ def remove_cflib_driver(swarm: Swarm) -> None:
 
 
 def _create_driver(swarm: Swarm) -> type:
-    """Return a cflib driver class for links to a swarm."""
     from cflib.crtp.crtpdriver import CRTPDriver
     from cflib.crtp.crtpstack import CRTPPacket
     from cflib.crtp.exceptions import WrongUriType
@@ -55,7 +54,6 @@ def _create_driver(swarm: Swarm) -> type:
             self._queue: queue.Queue[CRTPPacket] = queue.Queue()
 
         def connect(self, uri: str, *callbacks: Any) -> None:
-            """Connect to ``sim://NAME``."""
             parts = urlparse(uri)
             if parts.scheme != "sim" or parts.netloc not in swarm.names:
                 raise WrongUriType(f"expected one of {[f'sim://{name}' for name in swarm.names]}, got {uri!r}")
@@ -63,32 +61,26 @@ def _create_driver(swarm: Swarm) -> type:
             swarm.listeners.append(self._enqueue_due_packets)
 
         def send_packet(self, pk: CRTPPacket) -> None:
-            """Hand a packet to the drone, and queue its answers."""
             if self._device is not None:
                 for answer in self._device.handle(bytes([pk.header, *pk.data])):
                     self._enqueue(answer)
 
         def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
-            """Return the next packet, or None if none arrives within a time, s; a negative time waits forever."""
             try:
                 return self._queue.get(wait != 0, None if wait < 0 else wait)
             except queue.Empty:
                 return None
 
         def get_status(self) -> str:
-            """Return a description."""
             return "simulated"
 
         def get_name(self) -> str:
-            """Return the name of this kind of link."""
             return "sim"
 
         def scan_interface(self, address: Any = None) -> list[list[str]]:
-            """Return the URIs of all drones."""
             return [[f"sim://{name}", ""] for name in swarm.names]
 
         def close(self) -> None:
-            """Disconnect."""
             if self._device is not None:
                 self._device = None
                 swarm.listeners.remove(self._enqueue_due_packets)

@@ -28,16 +28,6 @@ class CrtpServer(Closeable):
     """UDP server for the drones of a swarm; a thread answers the clients."""
 
     def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):
-        """Compile a step of the swarm, since clients would time out during compilation, and then listen.
-
-        Args:
-            swarm: Swarm. The server does not advance it; use ``swarm.start()``, for example.
-            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
-            port: Port of the first drone; 0 for any free ports.
-
-        Raises:
-            ConfigError: If it cannot listen at one of the ports.
-        """
         if host not in ("127.0.0.1", "localhost"):
             log.warning("listening at %s: every machine of that network can fly the drones", host)
         swarm.compile_step()
@@ -94,7 +84,6 @@ class CrtpServer(Closeable):
                     log.exception("%s: a packet was not answered", self.swarm.names[k])
 
     def _send_due_packets(self) -> None:
-        """Send the log and console packets that are due; the swarm calls it after every control step."""
         for device, server_socket, client in zip(self.devices, self._sockets, self._clients, strict=True):
             if client is not None:
                 for packet in device.due_packets():

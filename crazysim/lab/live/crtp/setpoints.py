@@ -99,7 +99,6 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
 
 
 def _polynomial_trajectory(memory: bytes, offset: int, n_pieces: int) -> HostTrajectory:
-    """Return the trajectory of polynomials in memory."""
     end = offset + PIECE_SIZE * n_pieces
     require(
         n_pieces and end <= len(memory),
@@ -109,7 +108,6 @@ def _polynomial_trajectory(memory: bytes, offset: int, n_pieces: int) -> HostTra
 
 
 def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
-    """Return the trajectory of Bezier curves in memory; the number of pieces in its definition is ignored."""
     durations, pieces, start = read_compressed(memory[offset:], MEMORY)
     if not len(pieces):  # the firmware stays at the start
         durations, pieces = np.array([0.001]), np.pad(start[None, :, None], ((0, 0), (0, 0), (0, 7)))

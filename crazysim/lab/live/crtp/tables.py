@@ -52,7 +52,6 @@ class Table:
     """Variables with consecutive numbers, as the protocol transfers them."""
 
     def __init__(self, variables: list[Variable], types: Mapping[str, tuple[int, str]]):
-        """Create a table that numbers variables in their order."""
         self.variables, self.types = variables, types
         self.ids = {variable.name: k for k, variable in enumerate(variables)}
         for variable in variables:
@@ -90,8 +89,6 @@ def pack_number(struct_format: str, value: float) -> bytes:
 
 
 def _component_variables(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
-    """Return log variables of the components of a field of the state."""
-
     def component_reading(k: int) -> Reading:
         return lambda state, _c: scale * float(getattr(state, field)[k])
 
@@ -99,7 +96,6 @@ def _component_variables(group: str, names: str, field: str, scale: float = 1.0)
 
 
 def _angle_variables(group: str) -> dict[str, tuple[str, Reading]]:
-    """Return log variables of roll, pitch and yaw in degrees; the firmware's pitch has the opposite sign."""
     index_and_sign = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
 
     def angle_reading(k: int, sign: int) -> Reading:
@@ -109,11 +105,7 @@ def _angle_variables(group: str) -> dict[str, tuple[str, Reading]]:
 
 
 def _acceleration_reading(k: int) -> Reading:
-    """Return the reading of a component of the acceleration without gravity, world frame, in units of g.
-
-    As in ``kalmanCoreExternalizeState``.
-    """
-
+    # As in ``kalmanCoreExternalizeState``.
     def reading(state: DroneState, _: Commander) -> float:
         return float(rotate(state.quat, state.acc)[k]) / GRAVITY_MAGNITUDE - (k == 2)
 
@@ -121,7 +113,6 @@ def _acceleration_reading(k: int) -> Reading:
 
 
 def _goal_reading(row: int, k: int) -> Reading:
-    """Return the reading of the k-th number in a row of ``commander.goal()``."""
     return lambda _s, commander: float(commander.goal()[row, k])
 
 

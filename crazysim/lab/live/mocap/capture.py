@@ -43,18 +43,6 @@ class MotionCaptureSource(ThreadSource):
         convention: Convention | None = None,
         command: list[str] | None = None,
     ):
-        """Connect in the background, and start reading.
-
-        Args:
-            system: Name of the system, one of ``SYSTEMS``.
-            hostname: Address of its server.
-            convention: Convention of the system; None for z up, xyzw and metres.
-            command: Program that prints frames as ``worker.py`` does; None for that program, which needs
-                ``pip install 'crazysim[mocap]'``.
-
-        Raises:
-            ConfigError: If the system or the package does not exist.
-        """
         require(system in SYSTEMS, f"expected one of {', '.join(SYSTEMS)}, got {system!r}")
         if command is None and find_spec("motioncapture") is None:
             raise ConfigError(not_installed("motion capture needs", "motioncapture", "mocap"))

@@ -30,11 +30,6 @@ class MocapRecorder(Closeable):
     """Writer of a recording."""
 
     def __init__(self, path: str | Path):
-        """Create a file; an existing file is replaced.
-
-        Raises:
-            ConfigError: If the file cannot be written.
-        """
         self._journal = Journal(path, replace=True)
         self._ids: dict[str, int] = {}
 
@@ -97,11 +92,6 @@ class ReplaySource(MocapSource):
     """
 
     def __init__(self, path: str | Path, by: str = "poll"):
-        """Open a recording.
-
-        Raises:
-            ConfigError: If the file does not exist or is not a recording.
-        """
         require(by in ("poll", "time"), f"expected by as 'poll' or 'time', got {by!r}")
         self.name, self.by, self.path = f"replay of {Path(path).name}", by, path
         self.simulated = by == "time"
@@ -131,7 +121,6 @@ class ReplaySource(MocapSource):
         return "the recording ended" if self._next_index >= n else None
 
     def poll(self, step: int, freq: int) -> Poll:
-        """Return the frames of the next recorded poll, or the frames up to the present simulated time."""
         if self.by == "poll":
             if self._next_index < len(self._polls):
                 self._next_index += 1

@@ -74,20 +74,11 @@ class FunctionSource(MocapSource):
         convention: Convention | None = None,
         name: str = "function",
     ):
-        """Sample a function.
-
-        Args:
-            function: Function of time, s, that returns position and attitude of each body by name, in ``convention``.
-            freq: Frames per second, Hz.
-            convention: Convention of the poses; None for crazysim's.
-            name: Name in reports.
-        """
         require(0 < freq < np.inf, f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
         self.name, self.freq = name, float(freq)
         self._function, self._convention, self._next_sample = function, convention or Convention(), 0
 
     def poll(self, step: int, freq: int) -> Poll:
-        """Return the frames up to the present simulated time; after a reset, they begin again with the first."""
         now = step / freq
         last = int(np.floor(now * self.freq + 1e-9))
         if last < self._next_sample - 1:
@@ -133,12 +124,6 @@ class ThreadSource(MocapSource):
     """
 
     def __init__(self, name: str, convention: Convention | None = None):
-        """Create a source; ``start`` starts its thread.
-
-        Args:
-            name: Name in reports.
-            convention: Convention of the frames; None for crazysim's.
-        """
         self.name, self._convention = name, convention or Convention()
         self._frames: deque[Frame] = deque(maxlen=MAX_QUEUED_FRAMES)
         self._n_received = self._n_polled = 0
@@ -169,7 +154,6 @@ class ThreadSource(MocapSource):
         return self._end_reason
 
     def close(self) -> None:
-        """Stop the thread; a thread that does not end within a second is abandoned."""
         self._stop_event.set()
         if self._thread.is_alive():
             self._thread.join(1.0)
@@ -192,12 +176,6 @@ class RealTimeSource(ThreadSource):
     """Source that sends the frames of another source in real time, as a motion capture system would."""
 
     def __init__(self, source: FunctionSource, speed: float = 1.0):
-        """Send the frames of a function of time.
-
-        Args:
-            source: Source of the frames; its time is 0 when the thread starts.
-            speed: Seconds of the source's time per second of real time.
-        """
         super().__init__(f"real-time {source.name}")
         self._source, self._speed = source, speed
 

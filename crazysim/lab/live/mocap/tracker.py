@@ -42,7 +42,6 @@ class Rules:
     counts as old."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_settings(self)
 
 
@@ -79,13 +78,6 @@ class Tracker:
     """Number of accepted frames."""
 
     def __init__(self, names: Sequence[str], rules: Rules | None = None, source: str = "mocap"):
-        """Create a tracker without poses.
-
-        Args:
-            names: Names of the bodies in the stream.
-            rules: Limits; None for the defaults.
-            source: Name of the source in reports.
-        """
         require(len(set(names)) == len(names), f"expected different names, got {list(names)}. List each body once.")
         n = len(names)
         self.names, self.rules, self.source = tuple(names), rules or Rules(), source
@@ -178,7 +170,6 @@ class Tracker:
         self.reports.add(kind, name, time, text)
 
     def _watch_interval(self, now: float, interval: float) -> None:
-        """Estimate the period of the source from the first intervals; after that, report gaps."""
         if self._period is None:
             self._intervals.append(interval)
             if len(self._intervals) == N_INTERVALS:
@@ -188,14 +179,12 @@ class Tracker:
             self._report("dropped", self.source, now, f"{n} frames missing in {interval:.4f} s")
 
     def _watch_delay(self, now: float, delay: float) -> None:
-        """Report frames that took much longer than the quickest frame; the clocks may differ by any constant."""
         if delay < self._least_delay or now - self._least_delay_time > MAX_DELAY_AGE:
             self._least_delay, self._least_delay_time = delay, now
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
 
     def _find_rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
-        """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
         mapping = self._rows_by_names.get(names)
         if mapping is None:
             duplicates = sorted({name for name in names if names.count(name) > 1} & set(self._row_by_name))
@@ -215,7 +204,6 @@ class Tracker:
         return entries, rows
 
     def _update_bodies(self, frame: Frame, now: float) -> None:
-        """Store the valid poses of a frame, and the velocity of each body since its last pose."""
         entries, rows = self._find_rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
@@ -253,7 +241,6 @@ class Tracker:
     def _confirm_jumps(
         self, rows: NDArray, pos: NDArray, distance: NDArray, is_plausible: NDArray, now: float
     ) -> NDArray:
-        """Return True for bodies that jumped and have stayed at their new position for ``confirm`` frames. (n,)"""
         is_accepted = np.zeros(len(rows), bool)
         for i in np.flatnonzero(~is_plausible):
             k = rows[i]

@@ -61,7 +61,6 @@ class Twin:
     joint, the drawbar's length for a trailer."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_settings(self)
         is_sequence = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
         angles = [0.0 if x is None else x for x in self.fixed] if is_sequence else self.fixed
@@ -104,16 +103,6 @@ class Twins(Closeable):
         rules: Rules | None = None,
         record: str | None = None,
     ):
-        """Add the objects to the scene, which is compiled once, when it is next used.
-
-        Args:
-            sim: Simulation.
-            source: Source of the poses.
-            twins: Twins by prefix of the names in the stream. A name takes the twin of the longest matching prefix.
-            names: Names of the bodies in the stream; ``discover`` finds them. Other bodies are reported and ignored.
-            rules: Limits of the rules; None for the defaults.
-            record: Path of a recording to write; None for none.
-        """
         self.names, self.source = tuple(names), source
         twin_by_name = {}
         for name in self.names:
@@ -152,7 +141,6 @@ class Twins(Closeable):
         return self.tracker.reports
 
     def __call__(self, live: Live) -> None:
-        """Update the simulation of a live loop."""
         self.update(live.sim)
 
     def update(self, sim: Sim) -> None:
@@ -226,14 +214,12 @@ class Twins(Closeable):
             self._recorder.close()
 
     def _find_indices(self, names: Sequence[str]) -> list[int]:
-        """Return the indices of the bodies with these names; of all bodies if there are no names."""
         for name in names:
             if name not in self.names:
                 raise UnknownNameError(f"expected one of the bodies {list(self.names)}, got {name!r}")
         return [self.names.index(name) for name in names] if names else list(range(len(self.names)))
 
     def _compute_poses(self) -> None:
-        """Compute poses and velocities of all objects that are not frozen."""
         tracker = self.tracker
         pos, vel = tracker.pos.copy(), tracker.vel
         for k in self._order:
@@ -272,12 +258,10 @@ def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.
 
 @jax.jit
 def _write_poses(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArray, NDArray, NDArray]) -> list[Array]:
-    """Return poses and velocities of all objects with some rows replaced in every world."""
     return [x.at[..., rows, :].set(jnp.asarray(y, x.dtype)) for x, y in zip(old, new, strict=True)]
 
 
 def _order_parents_first(twins: Mapping[str, Twin]) -> list[int]:
-    """Return the indices of the parts of skeletons, parents first."""
     names, order = list(twins), list[int]()
     for name, twin in twins.items():
         chain, parent = [name], twin.parent

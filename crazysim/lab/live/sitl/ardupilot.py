@@ -37,19 +37,9 @@ class ArduPilot(FirmwareLink):
     lockstep = True
 
     def __init__(self, host: str = "127.0.0.1", *, port: int = PORT):
-        """Listen for ArduPilot.
-
-        Args:
-            host: Address to listen at.
-            port: Port.
-
-        Raises:
-            ConfigError: If the port has no valid number, or is in use.
-        """
         self._link = Datagrams(host, port)
 
     def send(self, measured: Measurements) -> None:
-        """Answer the last packet with the state, if there was a packet."""
         message = {
             "timestamp": measured.time,
             "imu": {"gyro": to_frd(measured.gyro).tolist(), "accel_body": to_frd(measured.accel).tolist()},
@@ -67,7 +57,6 @@ class ArduPilot(FirmwareLink):
 
 
 def _parse_commands(packet: bytes) -> NDArray | None:
-    """Return the motor commands of a packet, or None for another format. (4,)"""
     layout = PACKET_LAYOUTS.get(int.from_bytes(packet[:2], "little"))
     if layout is None or len(packet) != struct.calcsize(layout):
         return None

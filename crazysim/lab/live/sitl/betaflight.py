@@ -48,18 +48,6 @@ class Betaflight(FirmwareLink):
         origin: Origin = ZURICH,
         rc_freq: float = 50.0,
     ):
-        """Open the ports.
-
-        Args:
-            host: Address of the process.
-            ports: Ports of the motors, the state and the remote control.
-            gazebo: True for a firmware with ``ENABLE_GAZEBO_BRIDGE=1``, the default of its build.
-            origin: Geodetic position of the world's origin.
-            rc_freq: Packets of the remote control per second, Hz.
-
-        Raises:
-            ConfigError: If an argument is out of range, or the port of the motors is in use.
-        """
         self.gazebo, self.origin, self._rc_rate = (
             check_flag("gazebo", gazebo),
             check_origin(origin),
@@ -124,7 +112,6 @@ class Betaflight(FirmwareLink):
 
 
 def _read_pulses(channels: ArrayLike) -> NDArray[np.int64]:
-    """Return the pulses of a packet of the remote control, us. (16,)"""
     pulses = read_numbers("channels", channels, range_between(0, MAX_PULSE), ((N_CHANNELS,),))
     if np.any(pulses % 1):
         raise ConfigError(f"expected channels as whole numbers, us, got {short_repr(pulses.tolist())}. Round them.")
@@ -132,7 +119,6 @@ def _read_pulses(channels: ArrayLike) -> NDArray[np.int64]:
 
 
 def _parse_commands(packet: bytes) -> NDArray | None:
-    """Return the motor commands of a packet, or None for another format. (4,)"""
     if len(packet) != struct.calcsize("<4f"):
         return None
     commands = np.frombuffer(packet, "<f4")

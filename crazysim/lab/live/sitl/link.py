@@ -57,12 +57,6 @@ class Rate:
     """Schedule of an action at a rate in simulated time."""
 
     def __init__(self, name: str, freq: float):
-        """Create a schedule whose first action is due at once.
-
-        Args:
-            name: Name of the rate, for messages.
-            freq: Rate, Hz.
-        """
         self._period, self._next_time = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
@@ -107,11 +101,6 @@ class Datagrams(Closeable):
     """UDP socket that sends to one address, and receives the newest packet."""
 
     def __init__(self, host: str, port: int):
-        """Bind the socket to a port of this machine.
-
-        Raises:
-            ConfigError: If the port has no valid number, or is in use.
-        """
         self._socket = bind_socket(socket.SOCK_DGRAM, host, port)
         self._host = host
         self._sender: tuple[str, int] | None = None

@@ -57,17 +57,6 @@ class SoftwareInTheLoop(Closeable):
         reversed: bool = False,
         timeout: float = 10.0,
     ):
-        """Prepare the simulation.
-
-        Args:
-            sim: Simulation at the level ``rotor_vel``.
-            links: Links to the firmware, one for each drone, world by world.
-            freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for an exchange in every step.
-            motors: Meaning of a motor command from 0 to 1: fraction of a rotor's largest speed, or of its
-                largest thrust.
-            reversed: True for a firmware that is set up for rotors that turn in the opposite senses.
-            timeout: Time to wait for the motor commands of a firmware in lockstep, s.
-        """
         self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT_RANGE), motors
         self.links = _check_links(links)
         freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
@@ -149,7 +138,6 @@ class SoftwareInTheLoop(Closeable):
         return self._read_measurements()[0]
 
     def _read_measurements(self) -> tuple[list[Measurements], NDArray]:
-        """Return the measurements of every drone, and numbers that change with each new sample. (n_links, n_kinds)"""
         states, time_now = self.sim.data.states, self._n_exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_flatten_drones(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
         values, steps_taken = zip(*map(self._latest_values, SENSOR_KINDS), strict=True)
@@ -188,10 +176,7 @@ class SoftwareInTheLoop(Closeable):
         return measurements, sample_numbers
 
     def _latest_values(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
-        """Return the latest measurements of a sensor, vectors in the body frame, and the steps that took them.
-
-        Before the first measurement, they are the values of a perfect sensor. Without the sensor, both are None.
-        """
+        # Before the first measurement, they are the values of a perfect sensor. Without the sensor, both are None.
         sensor = self._sensors[kind]
         if sensor is None:
             return None, None
@@ -206,7 +191,6 @@ class SoftwareInTheLoop(Closeable):
         return _flatten_drones(value), taken
 
     def _check_commands_arrived(self, start_time: float, seconds: float) -> None:
-        """Check that every firmware has sent commands since a time (``time.monotonic``), ``seconds`` ago."""
         for link, last_time in zip(self.links, self._last_command_times, strict=True):
             if last_time <= start_time:
                 raise _silence_error(link, seconds)
@@ -216,7 +200,6 @@ class SoftwareInTheLoop(Closeable):
             link.close()
 
     def _to_rotor_speeds(self, k: int, command: NDArray) -> NDArray:
-        """Return the speeds of the rotors of a drone for the motor commands of its firmware, rpm. (4,)"""
         rotor_commands, airframe = np.zeros(4), self._airframes[k]
         rotor_commands[self._orders[k]] = command
         if self.motors == "speed":
@@ -226,7 +209,6 @@ class SoftwareInTheLoop(Closeable):
 
 
 def _check_links(links: object) -> tuple[FirmwareLink, ...]:
-    """Check links to firmware, and return them as a tuple."""
     sequence = (links,) if isinstance(links, FirmwareLink) else links
     if not isinstance(sequence, Sequence) or not all(isinstance(link, FirmwareLink) for link in sequence):
         raise ConfigError(
@@ -240,7 +222,6 @@ def _check_links(links: object) -> tuple[FirmwareLink, ...]:
 
 
 def _flatten_drones(values: Any) -> NDArray:
-    """Return values of all drones as one row for each drone, world by world. (n_links, k)"""
     values = np.asarray(values, float)
     return values.reshape(-1, values.shape[-1])
 

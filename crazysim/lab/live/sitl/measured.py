@@ -68,7 +68,6 @@ class Origin:
     """Altitude above sea level, m."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_settings(self)
 
     def geodetic_position(self, pos: NDArray) -> tuple[float, float, float]:

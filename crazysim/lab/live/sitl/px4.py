@@ -52,18 +52,6 @@ class Px4(FirmwareLink):
     def __init__(
         self, host: str = "127.0.0.1", *, port: int = PORT, origin: Origin = ZURICH, connect_timeout: float = 60.0
     ):
-        """Listen for PX4, which connects when it is started.
-
-        Args:
-            host: Address to listen at.
-            port: Port, 4560 plus the number of the instance.
-            origin: Geodetic position of the world's origin.
-            connect_timeout: Time to wait for PX4 to connect when the first measurements are sent, s, and time limit for
-                sending each message.
-
-        Raises:
-            ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
-        """
         with optional_import("links to PX4 need", "pymavlink", "mavlink", ConfigError):
             from pymavlink.dialects.v20 import common
         self._mavlink: Any = common
@@ -139,12 +127,6 @@ class Px4(FirmwareLink):
                 connection.close()
 
     def _newest_commands(self, deadline: float) -> NDArray | None:
-        """Return the newest motor commands, zero while PX4 is not armed; None if none arrived in time. (4,)
-
-        Args:
-            deadline: Time of ``time.monotonic`` until which to wait for commands. Later, only commands that have
-                already arrived are read, for at most ``MAX_DRAIN_TIME``.
-        """
         motors, now = None, time.monotonic()
         end = max(deadline, now) + MAX_DRAIN_TIME
         while now < end and self._has_data(max(deadline - now, 0.0) if motors is None else 0.0):
@@ -156,12 +138,10 @@ class Px4(FirmwareLink):
         return motors
 
     def _geodetic_integers(self, pos: NDArray) -> tuple[int, int, int]:
-        """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a position in the world, m. (3,)"""
         latitude, longitude, altitude = self.origin.geodetic_position(pos)
         return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
 
     def _wait_for_client(self) -> socket.socket:
-        """Return the connection; the first call waits until PX4 connects."""
         if self._client is None:
             self._server.settimeout(self.connect_timeout)
             try:
@@ -203,5 +183,4 @@ class Px4(FirmwareLink):
 
 
 def _closed_error() -> ConfigError:
-    """Return the error for a connection that PX4 closed, or did not read from in time."""
     return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")

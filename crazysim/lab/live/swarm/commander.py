@@ -42,12 +42,6 @@ class Commander:
     """Setpoints of one drone, calculated from commands; all times are simulated, s."""
 
     def __init__(self, control: Control = Control.state, report: Callable[[str], None] | None = None):
-        """Create the commander of a drone on the floor with motors off.
-
-        Args:
-            control: Command level of the simulation.
-            report: Function that is called with a message when a command has no effect yet; None for none.
-        """
         self.control = control
         self._report = report
         self.group = 0  # bit mask of the groups to which the drone belongs
@@ -272,7 +266,6 @@ class Commander:
         return None if command is None else frame.command_to_world(self.control, command)
 
     def _active_command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
-        """Return the active command in the frame of the estimate."""
         dt, self.now = now - self.now, now
         self.pos, self.vel, self.yaw = pos, vel, yaw
         if self._stream is not None:
@@ -307,12 +300,10 @@ class Commander:
         return self._cached_hover[1]
 
     def _has_landed(self, planned_motion: PlannedMotion) -> bool:
-        """Return True if the drone has reached the height of its landing, or stands on a surface."""
         is_standing = self.now > planned_motion.end_time + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
         return is_standing or self.pos[2] <= planned_motion.evaluate(self.now)[0, 2] + LANDED_HEIGHT
 
     def _streamed_command(self, dt: float) -> NDArray:
-        """Return the command of the streamed setpoint; velocities and yaw rates are integrated over ``dt``, s."""
         kind, x = self._stream  # type: ignore[misc]
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
@@ -341,7 +332,6 @@ class Commander:
         return x
 
     def _stream_setpoint(self, kind: str, values: NDArray) -> None:
-        """Make a streamed setpoint the active setpoint, and discard the planned motion."""
         if self._stream is None:
             self._last_goal = self.goal()
             self._reference = self._last_goal[0].copy()
@@ -366,14 +356,10 @@ class Commander:
         )
 
     def _drone_motion(self) -> NDArray:
-        """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
         return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
 
     def _motion_start(self, command: str) -> NDArray:
-        """Return the start of a motion: the active setpoint, or the drone's state while setpoints are streamed. (3, 4)
-
-        A command that has no effect because of the stream is reported.
-        """
+        # A command that has no effect because of the stream is reported.
         self._require_level(Control.state)
         if self._stream is None:
             return self.goal()
@@ -397,7 +383,6 @@ class Commander:
 
 
 def _check_numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE) -> NDArray:
-    """Return finite numbers within a limit. (n,)"""
     try:
         x = np.array(values, float)
     except (TypeError, ValueError):
@@ -414,7 +399,6 @@ def _check_duration(value: float) -> float:
 
 
 def _state_command(point: NDArray, rate: NDArray, second_derivative: NDArray) -> NDArray:
-    """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
     half_yaw = point[3] / 2
     return np.array(
         [

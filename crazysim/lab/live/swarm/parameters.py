@@ -89,15 +89,12 @@ class Parameters(Mapping[str, float]):
         self.has_initial_pose = False
 
     def __getitem__(self, name: str) -> float:
-        """Return a value."""
         return self._values[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Return the names."""
         return iter(self._values)
 
     def __len__(self) -> int:
-        """Return the number of parameters."""
         return len(self._values)
 
     @property

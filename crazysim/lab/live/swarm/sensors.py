@@ -70,5 +70,4 @@ def read_ranges(sim: Sim, drone: int) -> dict[str, float]:
 
 
 def _find_plugin(sim: Sim, kind: type[P]) -> P | None:
-    """Return the plugin of a class, or None."""
     return next((plugin for plugin in sim.plugins.values() if isinstance(plugin, kind)), None)

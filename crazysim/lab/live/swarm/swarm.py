@@ -55,13 +55,6 @@ class Swarm(Closeable):
     """Colour of the light of each drone, red, green, blue from 0 to 1. (n_drones, 3)"""
 
     def __init__(self, sim: Sim, names: Sequence[str] | None = None):
-        """Connect commanders to the drones of a simulation.
-
-        Args:
-            sim: Simulation of one world. High-level commands need ``control="state"``; attitudes and body rates need
-                those command levels.
-            names: Names of the drones; None for ``cf1``, ``cf2``, ...
-        """
         require(
             sim.n_worlds == 1, f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1)."
         )
@@ -95,7 +88,6 @@ class Swarm(Closeable):
         self._stage_commands()
 
     def __getitem__(self, name: str) -> Commander:
-        """Return the commander of a drone."""
         return self.commanders[self.index(name)]
 
     def index(self, name: str) -> int:
@@ -148,7 +140,6 @@ class Swarm(Closeable):
     # Time -----------------------------------------------------------------------------------------------------------
 
     def __call__(self, live: Live) -> None:
-        """Stage the active commands, and show the colours in viewers."""
         self._check_loop(live)
         self.update()
         live.lights[0] = self.colors
@@ -220,7 +211,6 @@ class Swarm(Closeable):
         return self
 
     def close(self) -> None:
-        """Stop the thread, if there is one."""
         self._stop_event.set()
         if self._thread is not None:
             self._thread.join()
@@ -237,19 +227,16 @@ class Swarm(Closeable):
             self._stop_event.wait(max(due_time - time.perf_counter(), 0.0))
 
     def _report_refusal(self, name: str, text: str) -> None:
-        """Report that a command to a drone has no effect."""
         self.reports.add("refused", name, self.time, text)
 
     # State and commands ---------------------------------------------------------------------------------------------
 
     def _add_motor_switch(self) -> MotorFailure | None:
-        """Return the plugin that switches motors; None if the dynamics have no rotors."""
         if self.sim.dynamics != Dynamics.first_principles:
             return None
         return self.sim.add(MotorFailure(name="motor_switch"))
 
     def _read_states(self) -> None:
-        """Read the states of all drones; if time has gone back, reset the commanders first."""
         data, states = self.sim.data, self.sim.data.states
         values = [states.pos, states.quat, states.vel, states.ang_vel]
         if self._estimator is not None:
@@ -272,13 +259,11 @@ class Swarm(Closeable):
         self._states = [DroneState(now, *x) for x in zip(pos, quat, vel, ang_vel, acc, strict=True)]
 
     def _estimate_drone(self, data: SimData) -> list[Array]:
-        """Return the estimate of one drone and the reading of its accelerometer, as fields of ``DroneState``."""
         estimator, s = self._estimator, data.states
         states = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
         return [states[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
 
     def _stage_commands(self) -> None:
-        """Stage the active command of every drone, and switch motors on or off."""
         sim = self.sim
         command = np.zeros((1, len(self.names), self._command_size))
         motors_on = np.ones(len(self.names), bool)
