@@ -323,12 +323,9 @@ def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
         strict.explain()
 
 
-@pytest.mark.long("plans the steps of six environments")
-def test_every_environment_explains_its_step(hover):
-    """With automatic resets and without, and those of other libraries."""
+@pytest.mark.long("plans the steps of four environments")
+def test_environments_of_other_libraries_explain_their_steps(hover):
     for env in (
-        hover,
-        AutoReset(hover),
         envs.DroneVectorEnv(hover),
         envs.BraxEnv(hover),
         envs.DroneSingleEnv(envs.make("hover")),
