@@ -1,8 +1,8 @@
 """Hooks of MkDocs: pages that are generated, and links from the repository's layout to the site's.
 
 The site holds the pages of ``docs/`` and, generated here, README, CONTRIBUTING, SECURITY and CHANGELOG of the
-repository, one page for each example, and one page of API reference for each public module. ``llms.py`` makes its texts
-for coding assistants.
+repository, one page for each example, and the API reference of the public names, grouped as users look for them.
+``llms.py`` makes its texts for coding assistants.
 """
 
 from __future__ import annotations
@@ -32,6 +32,39 @@ ROOT_PAGES = {
 }
 """Pages of the repository, and their places on the site."""
 
+CONTACTS = ("crazysim.ContactLog", "crazysim.ContactResponse", "crazysim.DroneCollisions")
+OWN = ("Plugin", "Param", "param", "state", "StagePlacement", "Population", "Members", "PyTree", "leaf", "static", "stage")
+REFERENCE = {
+    "Simulation": ("crazysim.Sim", "crazysim.functional", "crazysim", "crazysim.sim", "crazysim.core"),
+    "Drones and dynamics": ("crazysim.drones", "crazysim.dynamics"),
+    "Control": ("crazysim.control", "crazysim.MPPI"),
+    "Trajectories": ("crazysim.Follow", "crazysim.trajectories", "crazysim.trajectories.files"),
+    "Effects": ("crazysim.plugins.effects",),
+    "Loads, cars, bodies": ("crazysim.plugins.payloads", "crazysim.plugins.vehicles", "crazysim.plugins.bodies"),
+    "Scene and contacts": (
+        *CONTACTS, "crazysim.plugins.scenery", "crazysim.Terrain", "crazysim.SplatScene", "crazysim.geometry",
+    ),
+    "Sensors": ("crazysim.plugins.sensors", "crazysim.Radar"),
+    "Estimators": ("crazysim.plugins.estimators",),
+    "Environments": ("crazysim.envs",),
+    "Training": ("crazysim.train",),
+    "Pictures and films": ("crazysim.media",),
+    "Plugins and stages": (*(f"crazysim.{name}" for name in OWN), "crazysim.reduce_over_others", "crazysim.engine"),
+    "Live, shows, identification": (
+        "crazysim.lab.live", "crazysim.lab.live.sitl", "crazysim.lab.live.crazyflie_py", "crazysim.lab.shows",
+        "crazysim.lab.identify", "crazysim.lab.validate",
+    ),
+}  # fmt: skip
+"""Pages of the reference: packages, of which all public names are listed, and single names.
+
+A name that several packages export is on one page.
+"""
+
+PACKAGES = {entry for entries in REFERENCE.values() for entry in entries if entry.rpartition(".")[2].islower()} - {
+    f"crazysim.{name}" for name in (*OWN, "reduce_over_others", "functional")
+}
+"""Entries of the reference that are packages."""
+
 LINK = re.compile(r"\[([^\]]*)\]\((?!https?://|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 FENCE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 
@@ -39,8 +72,8 @@ FENCE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Append the generated pages of the API reference to the navigation."""
     for section in config.nav or []:
-        if "API reference" in section:
-            section["API reference"] = _reference_nav()
+        if "Reference" in section:
+            section["Reference"] = [{title: _reference_path(title)} for title in REFERENCE]
     return config
 
 
@@ -53,8 +86,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, target, content=(ROOT / source).read_text()))
     for path in sorted((ROOT / "docs" / "examples").glob("*.py")):
         files.append(File.generated(config, f"examples/{path.stem}.md", content=_example_page(path)))
-    for module in _public_modules():
-        files.append(File.generated(config, _reference_path(module), content=_reference_page(module)))
+    for title, content in _reference_pages().items():
+        files.append(File.generated(config, _reference_path(title), content=content))
     return files
 
 
@@ -98,78 +131,48 @@ def _example_page(path: Path) -> str:
     )
 
 
-_modules: list[griffe.Module] = []
+def _reference_path(title: str) -> str:
+    return f"reference/{re.sub('[^a-z]+', '_', title.lower())}.md"
 
 
-def _public_modules() -> list[griffe.Module]:
-    """Return every public module of the package."""
-    if not _modules:
-        package = griffe.load("crazysim", search_paths=[str(ROOT)], docstring_parser="google", resolve_aliases=True)
-        assert isinstance(package, griffe.Module)
-        _collect(package, _modules)
-    return _modules
+def _reference_pages() -> dict[str, str]:
+    package = griffe.load("crazysim", search_paths=[str(ROOT)], docstring_parser="google", resolve_aliases=True)
+    assert isinstance(package, griffe.Module)
+    names: dict[str, dict[str, list[str]]] = {title: {} for title in REFERENCE}
+    listed: set[str] = set()
+    requests = [(title, entry) for title, entries in REFERENCE.items() for entry in entries]
+    # Single names first, and the package `crazysim`, which exports names of all others, last.
+    for title, entry in sorted(requests, key=lambda request: (request[1] == "crazysim", request[1] in PACKAGES)):
+        exported = _member(package, entry).exports if entry in PACKAGES else [entry.rpartition(".")[2]]
+        parent = entry if entry in PACKAGES else entry.rpartition(".")[0]
+        for path in (_definition(package, f"{parent}.{name}") for name in exported or []):
+            if path not in listed:
+                listed.add(path)
+                names[title].setdefault(parent, []).append(path)
+    return {title: _reference_page(title, groups) for title, groups in names.items()}
 
 
-def _collect(module: griffe.Module, modules: list[griffe.Module]) -> None:
-    if module.name.startswith("_"):
-        return
-    modules.append(module)
-    for name in sorted(module.modules):
-        if not module.modules[name].is_alias:
-            _collect(module.modules[name], modules)
-
-
-def _reference_path(module: griffe.Module) -> str:
-    name = f"{module.path.replace('.', '/')}/index.md" if module.is_package or module.is_subpackage else None
-    return f"reference/{name or module.path.replace('.', '/') + '.md'}"
-
-
-def _reference_page(module: griffe.Module) -> str:
-    """Return the page of a module: its docstring, the names that it exports from elsewhere, and its own members."""
-    members = [name for name, member in module.members.items() if not (name.startswith("_") or _elsewhere(member))]
-    options = f"    options: {{show_root_heading: false, members: {members or 'false'}}}"
-    lines = [f"# {module.path}\n", f"::: {module.path}\n{options}\n"]
-    exported = [name for name in map(str, module.exports or []) if name in module.members and module[name].is_alias]
-    if exported:
-        lines += ["## Public names\n", "| Name | Definition |", "| --- | --- |"]
-        for name in exported:
-            path = _definition(module, name)
-            lines.append(f'| `{name}` | <autoref identifier="{path}" optional><code>{path}</code></autoref> |')
-        lines.append("")
-    inner = [m for m in module.modules.values() if m in _public_modules()]
-    if inner:
-        lines += ["## Modules\n", "| Module | Contents |", "| --- | --- |"]
-        for m in sorted(inner, key=lambda m: m.path):
-            summary = m.docstring.value.split("\n\n")[0].replace("\n", " ") if m.docstring else ""
-            link = os.path.relpath(_reference_path(m), PurePosixPath(_reference_path(module)).parent)
-            lines.append(f"| [`{m.name}`]({link}) | {summary} |")
-        lines.append("")
+def _reference_page(title: str, groups: dict[str, list[str]]) -> str:
+    """Return a page with the public names of each package to import them from."""
+    lines = [f"# {title}\n"]
+    for parent, paths in groups.items():
+        lines.append(f"## {parent}\n")
+        lines += [f"::: {path}\n    options: {{heading_level: 3, show_root_heading: true}}\n" for path in paths]
     return "\n".join(lines)
 
 
-def _elsewhere(member: griffe.Object | griffe.Alias) -> bool:
-    """Return True for a member whose documentation has a page of its own."""
-    return member.is_alias or member.is_module
+def _member(package: griffe.Module, path: str) -> Any:
+    return package if path == package.path else package[path.removeprefix(f"{package.path}.")]
 
 
-def _definition(module: griffe.Module, name: str) -> str:
-    """Return the path of the definition of a name that a module imports."""
-    alias = module.members[name]
-    assert isinstance(alias, griffe.Alias)
+def _definition(package: griffe.Module, path: str) -> str:
+    """Return the path of the definition of a public name."""
+    member = _member(package, path)
+    if member.is_module and member.name in member.members:  # a function with the name of its module
+        member = member.members[member.name]
+    if not isinstance(member, griffe.Alias):
+        return member.path
     try:
-        return alias.final_target.path
+        return member.final_target.path
     except griffe.AliasResolutionError:  # of another package
-        return alias.target_path
-
-
-def _reference_nav() -> list[dict[str, Any]]:
-    """Return the navigation of the API reference: the root, then one section for each package."""
-    root, *modules = _public_modules()
-    sections: dict[str, list[Any]] = {}
-    for module in modules:
-        package = module if module.is_package or module.is_subpackage else module.parent
-        assert package is not None
-        path = _reference_path(module)
-        sections.setdefault(package.path, []).append(path if package is module else {module.name: path})
-    nav: list[dict[str, Any]] = [{root.path: [_reference_path(root), *sections.pop(root.path)]}]
-    return nav + [{name.removeprefix(f"{root.path}."): pages} for name, pages in sections.items()]
+        return member.target_path

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FIRST_PAGES = [ROOT / "README.md", ROOT / "docs" / "quick_start.md"]
+FIRST_PAGES = [ROOT / "README.md", ROOT / "docs" / "learn" / "quick_start.md"]
 """Pages for newcomers."""
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {

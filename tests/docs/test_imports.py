@@ -27,8 +27,8 @@ STAND_IN = {"crazysim.lab.live.crazyflie_py"}
 """Module with the name of a module of Crazyswarm2, for scripts that import it."""
 OPTIONAL_NAMES = {"crazysim.envs": ["DroneVecEnv", "make_parallel"]}
 """Public names that need optional packages, which are not in ``__all__``."""
-EXEMPT = (ROOT / "docs" / "coming-from-crazyflow.md", ROOT / "docs" / "concepts" / "engine-design.md")
-"""The page that uses Crazyflow's own paths, and the one for developers of the engine."""
+EXEMPT = (ROOT / "docs" / "coming-from-crazyflow.md",)
+"""The page that uses Crazyflow's own paths."""
 SOURCES = [page for page in PAGES if page not in EXEMPT] + sorted((ROOT / "docs" / "examples").glob("*.py"))
 
 

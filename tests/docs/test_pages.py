@@ -15,8 +15,8 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
     run(page)
 
 
-SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")
-"""Pages with code for scenes."""
+SCENE_PAGES = ("docs/concepts/scene.md", "docs/coming-from-crazyflow.md")
+"""Pages with scene code written for Crazyflow."""
 CRAZYFLOW_LINES = (
     "sim = Sim(n_worlds=1, n_drones=1)",
     '<geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>',

@@ -94,8 +94,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "about x and y is 15 to 27 times the torque that the angular acceleration needs; in flights of squares it "
             "is 2 to 3 times that torque. It balances a torque of the air that grows with the velocity. The airframe "
             "does not have this torque of the air, so its prediction turns over. "
-            "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
-            "`cf21B_500_idsia` is off, too.",
+            "docs/results.md of the sources has the details.",
             (partial(flights.open_loop, idsia),), data_problem=data_problem(idsia), needs_logs=True,
             axes=("prediction over, s", "mean error"),
         ),
