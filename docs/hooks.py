@@ -33,7 +33,19 @@ ROOT_PAGES = {
 """Pages of the repository, and their places on the site."""
 
 CONTACTS = ("crazysim.ContactLog", "crazysim.ContactResponse", "crazysim.DroneCollisions")
-OWN = ("Plugin", "Param", "param", "state", "StagePlacement", "Population", "Members", "PyTree", "leaf", "static", "stage")
+OWN = (
+    "Plugin",
+    "Param",
+    "param",
+    "state",
+    "StagePlacement",
+    "Population",
+    "Members",
+    "PyTree",
+    "leaf",
+    "static",
+    "stage",
+)
 REFERENCE = {
     "Simulation": ("crazysim.Sim", "crazysim.functional", "crazysim", "crazysim.sim", "crazysim.core"),
     "Drones and dynamics": ("crazysim.drones", "crazysim.dynamics"),
