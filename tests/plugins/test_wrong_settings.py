@@ -257,7 +257,7 @@ SCENE = [
     (lambda: bodies(400), "at most 250000 contact points in a world"),
     (lambda: bodies(1, quat=(0, 0, 0, 0)), "quat"),
     (lambda: bodies(2, pos=np.zeros((3, 3))), "pos"),
-    (lambda: bodies(3, mass=[0.1, 0.2]), "mass with 1 dimensions"),
+    (lambda: bodies(3, mass=[0.1, 0.2]), "mass"),
     (lambda: bodies(1, softness=0.001), "softness"),
     (lambda: bodies(1, objects="nothing"), "nothing"),
     (lambda: sim(FreeBodies(1), FreeBodies(["Ball_0"], name="more")), "one FreeBodies"),
