@@ -319,9 +319,10 @@ def bind_leaf(
     return array if scope == "parameter" else device_array(np.broadcast_to(array, (*batch, *core)), dtype)
 
 
-def _as_tuples(value: Any, arrays: bool) -> Any:
+def as_tuples(value: Any, arrays: bool = True) -> Any:
+    """Return lists, and arrays if they are allowed, as tuples, which are hashable; other values as they are."""
     value = value.tolist() if arrays and hasattr(value, "tolist") else value
-    return tuple([_as_tuples(x, arrays) for x in value]) if type(value) in (list, tuple) else value
+    return tuple([as_tuples(x, arrays) for x in value]) if type(value) in (list, tuple) else value
 
 
 Requirement = type | Callable[[Simulation, Any], None]
@@ -417,7 +418,7 @@ class Plugin(PyTree):
             elif not metadata.get("keep", True):
                 bound.setdefault(name, None)
             elif metadata.get("static"):
-                bound[name] = value = _as_tuples(bound.get(name, value), arrays="setting" in metadata)
+                bound[name] = value = as_tuples(bound.get(name, value), arrays="setting" in metadata)
                 try:
                     hash(value)
                 except TypeError:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sweep
 
 from crazysim import Sim
 from crazysim.sim import pipeline
@@ -126,3 +127,10 @@ def test_a_rollout_in_jit_traces_once(traced_sim):
         data = rollout(data)
     assert len(traces) - before == 1
     assert n_programs(rollout) <= 1
+
+
+@pytest.mark.parametrize("name", sweep.CASES)
+def test_simulations_made_alike_have_data_of_one_structure(name):
+    one, other = sweep.CASES[name](), sweep.CASES[name]()
+    assert jax.tree.structure(one.data) == jax.tree.structure(other.data)
+    assert jax.tree.structure(one.default_data) == jax.tree.structure(other.default_data)

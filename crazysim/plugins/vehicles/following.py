@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple, dataclass_transform
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.plugin import as_tuples
 from crazysim.core.settings import check_settings, setting
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
@@ -106,8 +107,8 @@ def motor_reference(speed: Array, acc: Array, car: CarParams) -> Array:
     return force / car.drive[..., :1]
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(setting, dataclasses.field))
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(setting, dataclasses.field))
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PathController:
     """Base class of controllers that follow paths, including their speed control.
 
@@ -126,10 +127,12 @@ class PathController:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        dataclasses.dataclass(frozen=True, eq=False)(cls)
+        dataclasses.dataclass(frozen=True)(cls)
 
     def __post_init__(self) -> None:
         check_settings(self)
+        for field in dataclasses.fields(self):  # cars with equal controllers have data of one structure
+            object.__setattr__(self, field.name, as_tuples(getattr(self, field.name)))
 
     def check(self, vehicle: VehicleModel, path: Path) -> None:
         """Check that the controller suits vehicle and path."""

@@ -57,7 +57,7 @@ typedef struct { uint16_t list[4]; } motors_thrust_pwm_t;
 void powerDistribution(const control_t *, motors_thrust_uncapped_t *);
 bool powerDistributionCap(const motors_thrust_uncapped_t *, motors_thrust_pwm_t *);
 """
-EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "out_of_tree.c"
+EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "out_of_tree.c"
 CONTROLLER_PID = """
 #include "controller.h"
 static setpoint_t below;
