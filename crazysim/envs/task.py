@@ -231,10 +231,19 @@ def _initial_states(sim: Sim, record: type[PyTree], initial: Mapping[str, Any]) 
         if "scope" not in metadata or (value is None and metadata["optional"]):
             values.setdefault(name, None)
             continue
-        batch = (sim.n_worlds, 1) if metadata["scope"] == "world" else (sim.n_worlds, sim.n_drones)
-        core = np.shape(value) if any(isinstance(n, str) for n in metadata["shape"]) else metadata["shape"]
-        dtype = metadata["dtype"] or sim.data.states.pos.dtype
-        values[name] = device_array(np.broadcast_to(0 if value is None else value, (*batch, *core)), dtype)
+        batch, core = (sim.n_worlds, 1 if metadata["scope"] == "world" else sim.n_drones), metadata["shape"]
+        number = 0 if value is None else value
+        if any(isinstance(n, str) for n in core):
+            expect(
+                value is not None,
+                f"a first value of {name}, of shape {core}",
+                None,
+                f"Use add_states(sim, {name}=...).",
+            )
+            core = np.shape(number)
+        values[name] = device_array(
+            np.broadcast_to(number, (*batch, *core)), metadata["dtype"] or sim.data.states.pos.dtype
+        )
     return values
 
 

@@ -15,6 +15,7 @@ from crazysim.envs.random import episode_key, scale_symmetric, scale_to
 from crazysim.envs.task import sum_terms
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
+from crazysim.envs.tasks.race import Race
 from crazysim.envs.wrappers import Wrapper
 
 
@@ -195,6 +196,8 @@ def test_states_are_read_from_data_and_added_by_the_task_that_declares_them(two_
         Counting(n_counted=3)
     with pytest.raises(ConfigError, match="states among n_counted, start_pos, wind, got 'height'"):
         Counting().add_states(two_drones, height=0.0)
+    with pytest.raises(ConfigError, match=r"gates_visited.*\('gates',\).*add_states\(sim, gates_visited"):
+        Race().add_states(two_drones, gates=None, obstacles=None)
     with pytest.raises(ConfigError, match=r"Counting|still.*add_states"):
         DroneEnv(two_drones, Counting())
 
