@@ -649,9 +649,10 @@ class Plugin(PyTree):
         )
         return data.plugins[self.name]
 
-    def write(self, data: SimData, record: PyTree) -> SimData:
-        """Return data of any scope with another record of this plugin."""
-        return data.replace(plugins=data.plugins | {self.name: record})
+    def write(self, data: SimData, record: PyTree | None = None, **changes: Any) -> SimData:
+        """Return data of any scope with another record of this plugin, or with other values of some of its fields."""
+        record = self.read(data) if record is None else record
+        return data.replace(plugins=data.plugins | {self.name: record.replace(**changes)})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
+from jax.tree_util import DictKey, keystr, tree_leaves_with_path, tree_map_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
@@ -29,7 +29,7 @@ from crazysim.envs.random import episode_key
 from crazysim.envs.references import GUIDE
 from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import ENV_RECORD_NAME, EnvState, Obs
-from crazysim.envs.task import Task, sum_terms
+from crazysim.envs.task import TASK_RECORD_NAME, Task, sum_terms
 from crazysim.errors import ConfigError, require
 
 Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
@@ -346,6 +346,8 @@ def _check_data(title: str, batched: bool, before: SimData, after: Any) -> SimDa
         remedy = (
             "Use x[..., None] for one number of each drone."
             if shape and shape == x.shape[:-1]
+            else "Return one row for each drone, or one for all of them."
+            if path[1:2] == (DictKey(TASK_RECORD_NAME),)
             else "A number that all drones share cannot differ between them there: add its plugin with one value for "
             "each drone."
         )

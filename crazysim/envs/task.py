@@ -16,7 +16,7 @@ from crazysim.core.settings import check_settings, setting
 from crazysim.engine.pytree import PyTree, device_array, static
 from crazysim.engine.stage import Stage
 from crazysim.envs.state import Obs
-from crazysim.errors import ConfigError, expect
+from crazysim.errors import ConfigError, expect, require
 from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.sim.sim import Sim
 
@@ -34,8 +34,8 @@ class Task:
     """A task: settings, states and methods that are pure functions of one world.
 
     Subclasses define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and ``error``, and whatever else
-    they need; each becomes a frozen dataclass of its settings. A state between steps is declared with
-    ``crazysim.state``, as in a plugin: ``self.read(data).passed`` reads it, and ``self.write(data, passed=...)``
+    they need; each becomes a frozen dataclass of its settings, without a decorator. A state between steps is declared
+    with ``crazysim.state``, as in a plugin: ``self.read(data).passed`` reads it, and ``self.write(data, passed=...)``
     returns data with another value. In the data that methods receive, arrays per drone are (n_drones, ...), and arrays
     per world have no batch axes.
     """
@@ -95,7 +95,11 @@ class Task:
 
     def write(self, data: SimData, **changes: Any) -> SimData:
         """Return data of any scope with other values of some states."""
-        return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: self.read(data).replace(**changes)})
+        record = self.read(data)
+        names = [f.name for f in dataclasses.fields(record)]
+        unknown = ", ".join(changes.keys() - set(names))
+        expect(not unknown, f"states of task {self.name!r} among {', '.join(names)}", unknown, "Correct the name.")
+        return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: record.replace(**changes)})
 
     def after_substep(self, data: SimData) -> SimData:
         """Return the data of one drone after a physics step; count, measure or judge here what must not be missed."""
@@ -209,6 +213,14 @@ def _move_states_to_record(cls: type[Task]) -> None:
     fields = {name: f for name, f in vars(cls).items() if isinstance(f, dataclasses.Field)}
     states = {name: f for name, f in fields.items() if "scope" in f.metadata or f.metadata.keys() == {"static"}}
     hints = inspect.get_annotations(cls)
+    for name in states:
+        require(
+            name in hints, f"expected an annotation of state {name!r}, got none. Use {name}: jax.Array = state(...)."
+        )
+        require(
+            not hasattr(cls.__base__, name),
+            f"expected a state of another name than {name!r}, which is a method or a setting of a task. Rename it.",
+        )
     plain = {f.name: f.type for f in dataclasses.fields(cls) if f.name in vars(cls)}  # such as ``seconds = 8.0``
     cls.__annotations__ = {name: hint for name, hint in (plain | hints).items() if name not in states}
     if not states:

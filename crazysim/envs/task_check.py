@@ -171,7 +171,7 @@ def _name_missing_record(title: str, data: SimData) -> Iterator[None]:
     except KeyError as error:
         error.add_note(
             f"in {title}: data.plugins has {', '.join(map(repr, data.plugins)) or 'no records'}. Use sim.add for a "
-            f"plugin, and self.add_record(sim, ...) in install for the record of the task, {TASK_RECORD_NAME!r}."
+            f"plugin, and self.add_states(sim, ...) in install for the states of the task, {TASK_RECORD_NAME!r}."
         )
         raise
 

@@ -196,6 +196,14 @@ def test_states_are_read_from_data_and_added_by_the_task_that_declares_them(two_
         Counting(n_counted=3)
     with pytest.raises(ConfigError, match="states among n_counted, start_pos, wind, got 'height'"):
         Counting().add_states(two_drones, height=0.0)
+    with pytest.raises(ConfigError, match=r"n_counted.*got 'n_cuonted'"):
+        Counting().write(Counting().install(two := Sim(2)) or two.data, n_cuonted=0)
+    for name, hints, message in (
+        ("extra", {}, "annotation of state 'extra'"),
+        ("error", {"error": "Array"}, "'error'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            type("Bad", (Still,), {name: state(()), "__annotations__": hints})
     with pytest.raises(ConfigError, match=r"gates_visited.*\('gates',\).*add_states\(sim, gates_visited"):
         Race().add_states(two_drones, gates=None, obstacles=None)
     with pytest.raises(ConfigError, match=r"Counting|still.*add_states"):
@@ -337,7 +345,7 @@ def test_a_record_that_was_not_added_is_named(two_drones):
     reads_goal = type("Goals", (Still,), {"observe": lambda self, data: {"goal": data.plugins["task"].goal}})
     with pytest.raises(KeyError) as error:
         DroneEnv(two_drones, reads_goal())
-    assert "self.add_record(sim, ...) in install" in "".join(error.value.__notes__)
+    assert "self.add_states(sim, ...) in install" in "".join(error.value.__notes__)
 
 
 def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):
