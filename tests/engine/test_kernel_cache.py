@@ -29,10 +29,8 @@ def cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-def finished_process_id():
-    process = subprocess.Popen(["true"])
-    process.wait()
-    return process.pid
+# Linux has no process with an id above 2**22; the id of a finished one may soon be that of another, or of a thread.
+NO_PROCESS = 2**22 + 1
 
 
 def permissions(path):
@@ -119,7 +117,7 @@ def test_enable_cache_checks_its_folder_at_once(tmp_path):
 def make_remains(tmp_path):
     def make(name, age=0.0):
         path = tmp_path / name
-        if name.endswith(".tmp"):
+        if name.endswith(storage.UNFINISHED_SUFFIX):
             path.write_text("")
         else:
             path.mkdir()
@@ -131,22 +129,22 @@ def make_remains(tmp_path):
 
 
 def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
-    here, other, gone = storage.process_name(), "0" * 8, finished_process_id()
+    here, other, gone = storage.process_name(), "0" * 8, NO_PROCESS
     machine = here.split("-")[0]
     old = 1.01 * storage.ABANDONMENT_AGE
     remains = [
-        make_remains(f"key.{machine}-{gone}-140.tmp"),
+        make_remains(f"key.{machine}-{gone}-140.part"),
         make_remains(f"crazysim-{machine}-{gone}-abc"),
-        make_remains(f"key.{other}-{os.getpid()}-1.tmp", old),
+        make_remains(f"key.{other}-{os.getpid()}-1.part", old),
     ]
     needed = [
-        make_remains(f"key.{here}-140.tmp", old),
+        make_remains(f"key.{here}-140.part", old),
         make_remains(f"crazysim-{here}-abc", old),
-        make_remains(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
-        make_remains("key.4711.140.tmp", old),
+        make_remains(f"key.{other}-{gone}-1.part"),  # of another machine, which may still need it
+        make_remains("key.4711.140.part", old),
         make_remains("crazysim-mine", old),
     ]
-    for pattern in ("*.tmp", "crazysim-*"):
+    for pattern in ("*.part", "crazysim-*"):
         storage.remove_abandoned_files(tmp_path, pattern)
     assert sorted(tmp_path.iterdir()) == sorted(needed)
     assert not any(path.exists() for path in remains)
@@ -154,7 +152,7 @@ def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
 
 def test_processes_are_not_signalled_on_windows(monkeypatch):
     """On Windows, the call that tests for a process on POSIX systems would send Ctrl+C."""
-    name = f"key.{storage.process_name()}-140.tmp"
+    name = f"key.{storage.process_name()}-140.part"
     with monkeypatch.context() as faked:
         faked.setattr(storage.os, "kill", None)
         faked.setattr(storage.os, "name", "nt")
@@ -165,7 +163,7 @@ def test_processes_are_not_signalled_on_windows(monkeypatch):
 def test_the_folders_are_swept_at_the_next_start(cache, make_remains):
     (cache / "crazysim").mkdir(mode=0o700)
     machine = storage.process_name().split("-")[0]
-    remains = make_remains(f"crazysim/key.{machine}-{finished_process_id()}-1.tmp")
+    remains = make_remains(f"crazysim/key.{machine}-{NO_PROCESS}-1{storage.UNFINISHED_SUFFIX}")
     assert kernel_cache.folder() == cache / "crazysim"
     assert not remains.exists()
 
