@@ -68,7 +68,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     """Return the table ``[shape]`` of an airframe, with defaults for missing keys.
 
     The defaults follow from the rotors' positions, and the battery's size from the mass, in the proportions of the
-    built-in airframes. docs/guides/airframes.md describes the keys.
+    built-in airframes. docs/guides/airframe-keys.md describes the keys.
     """
     rotors = airframe.value("rotors.position")
     reach = float(np.max(np.linalg.norm(rotors[:, :2], axis=-1)))

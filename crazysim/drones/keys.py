@@ -15,7 +15,7 @@ from crazysim.tables import (
     Shapes,
 )
 
-GUIDE = "docs/guides/airframes.md"
+GUIDE = "docs/guides/airframe-keys.md"
 """Page that lists the keys, for messages."""
 
 _NUMBER: Shapes = ((),)

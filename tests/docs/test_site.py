@@ -36,6 +36,11 @@ def test_the_list_of_pages_follows_the_navigation():
     assert listed == [f"../{GENERATED[page]}" if page in GENERATED else page for page in pages]
 
 
+def test_guides_are_short():
+    lengths = {page.name: page.read_text().count("\n") for page in (ROOT / "docs/guides").glob("*.md")}
+    assert not {name: length for name, length in lengths.items() if length > 150}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files_and_headings(page):
     for target, anchor in LINK.findall(read_prose(page)):

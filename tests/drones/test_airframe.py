@@ -483,7 +483,7 @@ def test_law_09_an_unknown_key_is_answered_with_the_file(tmp_path):
 
 
 def test_the_page_lists_all_tables_and_keys_and_no_others():
-    page = (Path(__file__).parents[2] / "docs/guides/airframes.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/guides/airframe-keys.md").read_text(encoding="utf-8")
     section = page.split("## Keys")[1].split("## From a dict")[0]
     rows = [
         [cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if re.match(r"\| (?!-)", line)
@@ -525,7 +525,7 @@ def test_law_09_a_mistyped_path_is_answered_with_those_that_are_near():
     ):
         with pytest.raises(ConfigError, match=f"has no value '{path}'. Did you mean .*{near}"):
             airframe.value(path)
-    with pytest.raises(ConfigError, match=r"has no value 'qqq'. docs/guides/airframes.md lists"):
+    with pytest.raises(ConfigError, match=r"has no value 'qqq'. docs/guides/airframe-keys.md lists"):
         airframe.value("qqq")
     with pytest.raises(ConfigError, match=r"has no table \[wings\], only \['battery', 'controller'"):
         airframe.table("wings")
