@@ -5,7 +5,7 @@ import functools
 import pytest
 
 from crazysim.envs import AutoReset, make
-from crazysim.train import config, training
+from crazysim.train import config, runs, training
 
 
 @pytest.fixture(scope="module")
@@ -20,4 +20,13 @@ def shared_environments():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "make", make_shared)
         patch.setattr(training, "AutoReset", functools.cache(AutoReset))
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _without_plots():
+    """Leave out the plots of runs, which take longer to draw than small policies to train."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "plot_curve", lambda *_: None)
+        patch.setattr(runs, "plot_episode", lambda *_: None)
         yield

@@ -180,8 +180,8 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
 
 @pytest.mark.long("compiles a training")
 def test_the_policy_of_a_run_with_a_convolution_comes_back(tmp_path):
-    config = SMALL_CONFIG | {"iterations": 2, "memory": 3, "critic": "privileged"}
-    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS, config=config)
+    config = SMALL_CONFIG | {"iterations": 2}
+    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS | {"engine": "interpret"}, config=config)
     result = train(config, tmp_path, evaluation_worlds=8, log=lambda line: None, progress=False)
     policy, config, meta = load_policy(tmp_path)
     assert config.config["convolution"] == [2, 3]

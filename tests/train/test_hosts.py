@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from crazysim.__main__ import main
 from crazysim.train import checkpoint
 from crazysim.train.training import CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE
 
+pytestmark = pytest.mark.usefixtures("shared_environments")
 SMALL = "--worlds 64 --no-film --set seconds=0.2 --config n_steps=4 minibatches=2 epochs=1 hidden=[8]".split()
 HEARTBEAT_TIMEOUT = 20
 """Time without a heartbeat after which a host is lost, s; it is long, as other processes use the processor too."""
@@ -41,10 +43,18 @@ class Process:
         with self._path.open("wb") as file:
             self._process = subprocess.Popen(command, env=process_environment(**variables), stdout=file, stderr=file)
 
+    @property
+    def text(self):
+        return self._path.read_text()
+
+    def wait_for(self, text):
+        """Wait until the output contains a text."""
+        wait_for(lambda: text in self.text or self.has_ended)
+        assert text in self.text, self.text
+
     def end(self):
         """Wait for the end, and return the exit status and the output."""
-        status = self._process.wait(timeout=300)
-        return status, self._path.read_text()
+        return self._process.wait(timeout=300), self.text
 
     def signal(self, number):
         self._process.send_signal(number)
@@ -54,12 +64,12 @@ class Process:
         return self._process.poll() is not None
 
 
-def start(folder, arguments, others=((), ())):
+def start(folder, arguments, others=((), ()), program=("-m", "crazysim")):
     """Return the processes of two hosts that run a command, with further arguments of each host."""
     address = free_address()
     common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT_TIMEOUT}".split()
     return [
-        Process(folder, f"host{i}", sys.executable, "-m", "crazysim", *arguments, *common, "--host-id", str(i), *own)
+        Process(folder, f"host{i}", sys.executable, *program, *arguments, *common, "--host-id", str(i), *own)
         for i, own in enumerate(others)
     ]
 
@@ -83,37 +93,55 @@ def assert_same_files(actual_folder, expected_folder):
             np.testing.assert_allclose(x[key], y[key], rtol=1e-4, atol=1e-5, err_msg=key)
 
 
-@pytest.mark.long("six processes import JAX, and compile or load a training")
+HOST = """
+import sys
+from crazysim.__main__ import main
+from crazysim.commands import training
+from crazysim.train import runs
+
+runs.plot_curve = runs.plot_episode = lambda *_: None
+train = training._train
+
+def train_in_turn(options, **settings):
+    train(options, **settings)
+    print("ended", flush=True)
+    options.resume, options.iterations, options.checkpoint_every = True, 100_000, 0.01
+    try:
+        train(options, **settings)
+    except SystemExit as end:
+        print(f"stopped with {end.code}", flush=True)
+    train(options, **settings)
+
+training._train = train_in_turn
+sys.exit(main(sys.argv[1:]))
+"""
+"""A host that trains to the end, continues until a host is told to stop, and continues again."""
+
+
+@pytest.mark.long("two processes import JAX and compile a training")
 def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_path):
-    """A training runs to its end, is continued until Ctrl-C on one host, and again until a host is killed.
-
-    One process with all devices then continues it.
-    """
+    """One process with all devices trains the same policy, and continues the training after a host was killed."""
     out, one_process_folder = tmp_path / "two", tmp_path / "one"
-    ended = [process.end() for process in start(tmp_path, training_arguments(out, "--iterations", "3"))]
-    assert [status for status, _ in ended] == [0, 0], ended
-    assert "16 on each of 4 devices" in ended[0][1]
-    assert "host 1 of 2: 2 cpu" in ended[1][1]
-    assert "success" not in ended[1][1], "only host 0 reports"
-    assert main(training_arguments(one_process_folder, "--iterations", "3", "--devices", "4")) == 0
-    assert_same_files(out, one_process_folder)
-    assert len(json.loads((out / CURVE_FILE).read_text())) == 2
-
-    endless = training_arguments(out, "--resume", "--iterations", "100000", "--checkpoint-every", "0.01")
-    first, second = start(tmp_path, endless)
+    first, second = start(tmp_path, training_arguments(out, "--iterations", "3"), program=("-c", HOST))
+    first.wait_for("ended")
+    copytree(out, tmp_path / "ended")
     wait_for(lambda: iteration(out) > 3 or first.has_ended)
     second.signal(signal.SIGINT)
-    (status, text), (other_status, _) = first.end(), second.end()
-    assert (status, other_status) == (128 + signal.SIGTERM,) * 2, text
-    assert f"interrupted after iteration {iteration(out)}" in text
-
-    stopped_iteration = iteration(out)
-    first, second = start(tmp_path, endless)
+    first.wait_for(f"stopped with {128 + signal.SIGTERM}")
+    second.wait_for(f"stopped with {128 + signal.SIGTERM}")
+    stopped_iteration = int(re.search(r"interrupted after iteration (\d+)", first.text)[1])
     wait_for(lambda: iteration(out) > stopped_iteration or first.has_ended)
     second.signal(signal.SIGKILL)
-    (status, text), (other_status, _) = first.end(), second.end()
+    (status, text), (other_status, other_text) = first.end(), second.end()
     assert (status, other_status) == (-signal.SIGABRT, -signal.SIGKILL)
+    assert "16 on each of 4 devices" in text
+    assert f"continues after iteration {stopped_iteration}" in text
+    assert "host 1 of 2: 2 cpu" in other_text
+    assert "success" not in other_text, "only host 0 reports"
 
+    assert main(training_arguments(one_process_folder, "--iterations", "3", "--devices", "4")) == 0
+    assert_same_files(tmp_path / "ended", one_process_folder)
+    assert len(json.loads((tmp_path / "ended" / CURVE_FILE).read_text())) == 2
     last = iteration(out)
     assert main(training_arguments(out, "--resume", "--iterations", str(last + 1), "--devices", "4")) == 0
     assert iteration(out) == last + 1
@@ -127,16 +155,6 @@ def test_hosts_with_other_settings_stop_together(tmp_path):
         assert status == 2
         assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text, i
     assert not (tmp_path / "out" / CHECKPOINT_FILE).exists()
-
-
-def test_a_coordinator_that_does_not_answer_is_an_error_with_its_address(tmp_path):
-    address = free_address()
-    arguments = training_arguments(
-        tmp_path, "--coordinator", address, "--hosts", "2", "--host-id", "1", "--connect-timeout", "1"
-    )
-    status, text = Process(tmp_path, "alone", sys.executable, "-m", "crazysim", *arguments).end()
-    assert status == -signal.SIGABRT
-    assert f"host 1 of 2 connects with {address}" in text
 
 
 @pytest.mark.parametrize(
@@ -155,16 +173,24 @@ def test_options_of_hosts_are_checked(options, message, capsys):
 
 @pytest.mark.long("two processes import JAX")
 def test_jax_finds_the_hosts_of_a_scheduler_or_there_is_an_error(tmp_path):
-    """A step of SLURM with one task is a training of one host; without a scheduler, the options name the hosts."""
-    arguments = ["-m", "crazysim", *training_arguments(tmp_path, "--coordinator", "auto"), "--set", "secnds=1"]
-    port = free_address().rpartition(":")[2]
+    """A step of SLURM with one task is a training of one host. Without a scheduler the options name the hosts, and a
+    coordinator that does not answer is an error with its address."""
+    arguments = training_arguments(tmp_path, "--set", "secnds=1")
+    address = free_address()
     slurm = {"JOB_ID": "1", "STEP_NODELIST": "localhost", "NTASKS": "1", "PROCID": "0", "LOCALID": "0"}
-    variables = {f"SLURM_{name}": value for name, value in slurm.items()} | {"JAX_COORDINATOR_PORT": port}
-    started = Process(tmp_path, "slurm", sys.executable, *arguments, **variables)
-    alone = Process(tmp_path, "alone", sys.executable, *arguments)
+    variables = {f"SLURM_{name}": value for name, value in slurm.items()}
+    variables |= {"JAX_COORDINATOR_PORT": address.rpartition(":")[2]}
+    auto = [*arguments, "--coordinator", "auto"]
+    started = Process(tmp_path, "slurm", sys.executable, "-m", "crazysim", *auto, **variables)
+    silent = f"--coordinator {address} --hosts 2 --host-id 1 --connect-timeout 1".split()
+    program = f"from crazysim.__main__ import main; print(main({auto})); main({arguments + silent})"
+    alone = Process(tmp_path, "alone", sys.executable, "-c", program)
     (status, text), (other_status, other_text) = started.end(), alone.end()
-    assert (status, other_status) == (2, 2)
+    assert status == 2
     assert "host 0 of 1: 2 cpu" in text
     assert "did you mean seconds?" in text
     assert "expected the variables of SLURM or Open MPI" in other_text
     assert "--hosts and --host-id" in other_text
+    assert "\n2\n" in other_text
+    assert other_status == -signal.SIGABRT
+    assert f"host 1 of 2 connects with {address}" in other_text

@@ -262,7 +262,8 @@ def test_a_trained_policy_and_its_checkpoint_keep_the_interface(tmp_path):
     policy, loaded_config, _ = load_policy(tmp_path / "run")
     assert result.policy.interface == policy.interface
     assert (policy.interface.task, policy.interface.freq) == ("mine", 50)
-    assert train.evaluate(result.env, policy) == train.evaluate(loaded_config.make_env(4), result.policy)
+    policy.interface.require(Interface.read(describe(loaded_config.make_env(4))), "the environment of the run")
+    assert train.evaluate(result.env, policy) == train.evaluate(result.env, result.policy)
     path.write_text(TASK.replace('obs | {"vel"', 'without(obs) | {"velocity"') + WITHOUT)
     with pytest.raises(ConfigError, match=r"arrays of this task .*'vel'.*'velocity'"):
         train.run(f"{path}:Mine", tmp_path / "run", config=config | {"iterations": 2}, resume=True, **settings)

@@ -33,7 +33,7 @@ from crazysim.train.training import CHECKPOINT_FILE, load_policy, train
 pytestmark = pytest.mark.usefixtures("shared_environments")
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
 SMALL_CONFIG = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
-RUN_SETTINGS = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic"}}
+RUN_SETTINGS = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generic", "engine": "interpret"}}
 
 
 def train_quietly(folder, config, network=None, iterations=2, **options):
@@ -189,7 +189,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
 
     base = make("hover", 3, randomize="generic", sensors=[MotionCapture(noise=0.1)], engine="interpret")
     env = AutoReset(PrivilegedObservation(RandomizeWith(base, draw_masses, params=("mass",))))
-    state = env.reset(jax.random.key(0))
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
     for _ in range(2):
         data, privileged = state.data, np.asarray(state.obs["privileged"])
         nominal = base.sim.default_data.params.mass
@@ -197,7 +197,7 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
         expected = [flatten(state_of(data)), data.states.rotor_vel, data.params.mass / nominal]
         expected += [record.factors, record.thrust_factors]
         np.testing.assert_allclose(privileged, np.concatenate(expected, axis=-1), rtol=1e-6)
-        state = env.step(state, jnp.zeros((3, 1, 4)))
+        state = step(state, jnp.zeros((3, 1, 4)))
     assert np.abs(state.obs["pos"] - state.data.states.pos).max() > 0.01
     assert len(np.unique(privileged[..., -5:])) > 10
     learner, _ = init_learner(env, minibatches=1, critic="privileged")
@@ -206,7 +206,8 @@ def test_privileged_observations_are_true_states_and_drawn_parameters():
     agent = take_seed(learner.agents, 0)
     values = [agent.estimate_value(agent.observe(obs, config)[1], (), config)[0] for obs in (state.obs, other)]
     assert np.abs(values[0] - values[1]).min() > 1e-4
-    assert agent.n_obs == flatten(base.reset(jax.random.key(0)).obs).shape[-1] == agent.as_policy().stats.mean.shape[0]
+    n_obs = flatten({name: x for name, x in state.obs.items() if name != "privileged"}).shape[-1]
+    assert agent.n_obs == n_obs == agent.as_policy().stats.mean.shape[0]
     with pytest.raises(ConfigError, match=r"observation 'privileged' .*AutoReset\(PrivilegedObservation"):
         init_learner(AutoReset(base), minibatches=1, critic="privileged")
     with pytest.raises(ConfigError, match="observations without 'privileged', got "):
@@ -295,7 +296,8 @@ def test_a_custom_network_is_trained_saved_and_loaded(tmp_path):
     obs, memory = result.env.reset(jax.random.key(0)).obs, policy.initial_memory(8, 1)
     np.testing.assert_array_equal(policy.act(obs, memory)[0], result.policy.act(obs, memory)[0])
     assert evaluate(result.env, policy)["nonfinite"] == 0
-    start = take_seed(ppo.init(AutoReset(result.env), (ppo.Config(),), jax.random.key(0)[None], network).as_policy(), 0)
+    init = jax.jit(lambda key: ppo.init(AutoReset(result.env), (ppo.Config(),), key[None], network))
+    start = take_seed(init(jax.random.key(0)).as_policy(), 0)
     changed = jax.tree.map(lambda x, y: bool(np.any(x != y)), start.body, policy.body)
     assert all(jax.tree.leaves(changed)), "all weights are trained"
     with pytest.raises(ConfigError, match=r"custom network with which .* was trained, got None\. Use"):

@@ -146,21 +146,22 @@ def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
     class Local(Low):
         """Low, in a function."""
 
-    train.run(Local(seconds=0.4), tmp_path / "local", log=list, **QUIET)
+    local_config = TrainConfig.create(Local(seconds=0.4))
     forget_tasks(monkeypatch)
     with pytest.raises(ConfigError, match="task that you have named"):
-        load_policy(tmp_path / "local")[1].make_env(1)
+        local_config.make_env(1)
 
 
-def test_a_registered_task_is_made_trained_and_vectorised_by_name(tmp_path):
+def test_a_registered_task_is_made_trained_and_vectorised_by_name():
     assert envs.register("low_hover", Low, control="body_rate") == "crazysim/LowHover-v0"
     assert envs.make("low_hover", depth=0.2).task.depth == 0.2
     assert envs.make("low_hover").sim.control.value == "body_rate"
     assert envs.make(Low(depth=0.5)).sim.control.value == "body_rate"
     vector = gymnasium.make_vec("crazysim/LowHover-v0", num_envs=3, depth=0.4)
     assert vector.unwrapped.env.task.depth == 0.4
-    result = train.run("low_hover", tmp_path / "run", log=list, options={"seconds": 0.4}, **QUIET)
-    assert load_policy(result.folder)[1].task == "low_hover"
+    config = TrainConfig.create("low_hover", options={"seconds": 0.4})
+    assert config.task == "low_hover"
+    assert type(config.make_training_env().task) is Low
 
     class Lower(Low):
         """Low again, as from a cell that is executed again."""
@@ -182,15 +183,16 @@ def test_a_file_that_was_edited_is_loaded_again(file):
     assert envs.make(str(file)).task.extra == 0.75
 
 
-def test_a_script_trains_its_own_class(file, tmp_path):
+@pytest.mark.long("trains in a process of its own")
+def test_a_script_trains_its_own_class(file, tmp_path, own_list, capsys):
     """A class of the module that runs is found by its file; the command evaluates it in another process."""
-    run = f"train.run(High(seconds=0.4), 'run', log=print, **{QUIET!r})"
-    file.write_text(SOURCE + f"\nif __name__ == '__main__':\n    from crazysim import train\n    {run}\n")
-    environment = os.environ | {"HOME": str(tmp_path)}
+    run = f"train(TrainConfig.create(High(seconds=0.4), n_worlds=4, config={SMALL!r}), 'run')"
+    imports = "from crazysim.train import TrainConfig\nfrom crazysim.train.training import train\n"
+    file.write_text(SOURCE + f"\n{imports}\nif __name__ == '__main__':\n    {run}\n")
+    environment = os.environ | {"XDG_CACHE_HOME": str(own_list.parents[1])}
     subprocess.run([sys.executable, "my_tasks.py"], cwd=tmp_path, check=True, env=environment)
-    evaluate = [sys.executable, "-m", "crazysim", "evaluate", "run", "--worlds", "4"]
-    done = subprocess.run(evaluate, cwd=tmp_path, check=True, env=environment, capture_output=True, text=True)
-    assert "high, 4 starts: success" in done.stdout
+    assert main(["evaluate", str(tmp_path / "run"), "--worlds", "4"]) == 0
+    assert "high, 4 starts: success" in capsys.readouterr().out
 
 
 def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):

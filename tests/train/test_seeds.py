@@ -67,12 +67,19 @@ def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
         for name, x in block_observations(separate[i].env, 0).items():
             np.testing.assert_allclose(block_observations(joint.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
-    policies = joint.as_policy()
+
+
+def test_the_policies_of_all_seeds_are_evaluated_in_one_program_like_single_ones():
+    env = AutoReset(make("hover", 4, **SHORT_EPISODES))
+    init = jax.jit(lambda keys: ppo.init(env, tuple(PPO_CONFIGS), keys).as_policy())
+    policies = init(jax.random.split(jax.random.key(3), 2))
     result = evaluate_blocks(make("hover", 16, **SHORT_EPISODES), Policies(policies), n_blocks=2)
+    env_of_one = make("hover", 8, **SHORT_EPISODES)
     for i in range(2):
-        expected = evaluate(make("hover", 8, **SHORT_EPISODES), take_seed(policies, i))
+        expected = evaluate(env_of_one, take_seed(policies, i))
         for name, x in expected.items():
             np.testing.assert_allclose(result[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
+    assert result[0]["error"] != result[1]["error"]
 
 
 def test_one_kernel_call_steps_the_worlds_of_all_seeds():

@@ -609,7 +609,9 @@ class Sight(Hover):
 """Task with other observations than hover."""
 
 
-def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
+def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("crazysim.train.runs.plot_curve", plot_curve)
+    monkeypatch.setattr("crazysim.train.runs.plot_episode", plot_episode)
     folder, task_file = str(tmp_path / "hover"), tmp_path / "sight.py"
     task_file.write_text(SIGHT, encoding="utf-8")
     small_options = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
