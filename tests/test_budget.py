@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 1089,
     "lab": 11233,
     "media": 967,
-    "plugins": 6823,
+    "plugins": 6822,
     "scene": 3091,
     "sim": 945,
     "train": 2355,

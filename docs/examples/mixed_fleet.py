@@ -88,9 +88,7 @@ def tracking_errors(data):
 
     cars = [data.plugins[name] for name in CARS]
     errors = [
-        jax.vmap(lambda *x, car=car: off_path(car, *x))(
-            jnp.broadcast_to(car.index, car.arc.shape)[:, 0, 0], car.arc[:, 0, 0], car.pos[:, 0, :2]
-        )
+        jax.vmap(lambda *x, car=car: off_path(car, *x))(car.index[:, 0, 0], car.arc[:, 0, 0], car.pos[:, 0, :2])
         for car in cars
     ]
     return jnp.concatenate([jnp.linalg.norm(body - goal, axis=-1), jnp.stack(errors, axis=-1)], axis=-1)

@@ -67,6 +67,21 @@ OPERATIONS = {
 }
 
 
+LOOPS = {
+    "loop": OPERATIONS["loop"],
+    "several numbers": lambda x, y: sum(
+        jax.lax.fori_loop(0, 6, lambda i, c: (jnp.sin(c[1]) * y, c[0] + x * i, c[2]), (x, y, x * y))
+    ),
+    "branches": lambda x, y: jax.lax.fori_loop(
+        0, 5, lambda i, z: jax.lax.cond(z > y, lambda z: jnp.cos(z) * x, lambda z: z + y * z, z), x * y
+    ),
+    "nested": lambda x, y: jax.lax.fori_loop(
+        0, 4, lambda i, z: jax.lax.fori_loop(0, 3, lambda j, w: jnp.sin(w) * x + y, z * y), x
+    ),
+    "one that no input enters": lambda x, y: x * y * jax.lax.fori_loop(0, 5, lambda i, z: jnp.cos(z), 1.0),
+}
+
+
 def branching(x, y):
     """Use what only forward mode supports: a loop with a computed number of iterations, and a loop over an integer."""
     z = jax.lax.while_loop(lambda c: c[0] < 3.0, lambda c: (c[0] + 1.0 + y * y, jnp.sin(c[1]) * y), (jnp.abs(x), x))[1]
@@ -86,13 +101,24 @@ def test_tangents_of_a_block_equal_those_of_jax(fn, x64):
             np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_a_transposed_block_equals_the_vjp_of_jax(name, x64):
-    fn = OPERATIONS[name]
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_loop_is_reversed_as_a_loop_like_by_jax(name, x64, monkeypatch):
+    monkeypatch.setattr("crazysim.engine.lowering.transpose.MAX_UNROLLED_OPERATIONS", 0)
+    check_transposed_block(LOOPS[name])
+
+
+@pytest.mark.parametrize("fn", OPERATIONS.values(), ids=OPERATIONS)
+def test_a_transposed_block_equals_the_vjp_of_jax(fn, x64):
+    check_transposed_block(fn)
+
+
+def check_transposed_block(fn):
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
     _, vjp_fn = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
-    result = xla.run_block(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
+    transposed = transpose_block(block, block.inputs)
+    verify_block(transposed)
+    result = xla.run_block(transposed, [jnp.asarray(v) for v in (x, y, ct)], (16,))
     for a, b in zip(result, vjp_fn(jnp.asarray(ct)), strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 

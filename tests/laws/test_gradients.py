@@ -114,31 +114,37 @@ def test_gradient_equals_central_differences(dynamics, control, engine, mode, x6
 
 @pytest.mark.long("compiles a kernel of contacts and of their derivative")
 def test_gradients_of_contacts_equal_central_differences(x64):
-    """A tilted drone slides over the floor, and another is put down on it, in one kernel in float64.
+    """A tilted drone slides over the floor, another is put down on it, and a third one hits a wall, in float64.
 
-    Worlds are at the start, one step ahead of it and one step behind it. Errors are as in the test above.
+    The step, its derivative in one direction, and its gradient are one kernel each. Worlds are at the start, one step
+    ahead of it and one step behind it. Errors are as in the test above.
     """
-    sim = Sim(6, control="rotor_vel", engine="auto", plugins=[ContactResponse(objects=())])
-    step, rng, h = sim.build_step_fn(), np.random.default_rng(1), 1e-7
+    sim = Sim(9, control="rotor_vel", plugins=[ContactResponse()])
+    sim.scene.add("wall", pos=[0.2, 0.0, 0.0], length=2.0, height=1.0, thickness=0.1)
+    step, rng, h = sim.build_step_fn(), np.random.default_rng(1), 1e-6
     start = {"pos": [0.0, 0.0, 0.005], "vel": [0.4, 0.2, -0.3], "ang_vel": [0.1, -0.2, 0.3]}
-    directions = {name: np.zeros((6, 1, 3)) for name in start}
-    x = {name: np.tile(value, (6, 1, 1)).astype(float) for name, value in start.items()}
-    for name in start:
-        directions[name][:] = rng.normal(size=3)
-        x[name] += h * np.tile([0.0, 1.0, -1.0], 2)[:, None, None] * directions[name]
-    x["vel"][3:] *= 0.0
-    directions["vel"][3:] = 0.0
+    x = {name: np.tile(value, (9, 1, 1)).astype(float) for name, value in start.items()}
+    x["vel"][3:6] = 0.0
+    x["pos"][6:], x["vel"][6:] = [0.098, 0.0, 0.5], [1.2, 0.2, 0.1]
+    directions = {name: np.broadcast_to(rng.normal(size=3), (9, 1, 3)).copy() for name in start}
+    directions["vel"][3:6] = 0.0
+    for name, direction in directions.items():
+        x[name] += h * np.tile([0.0, 1.0, -1.0], 3)[:, None, None] * direction
 
     def end(x):
         data = jax.tree.map(lambda a: a.astype(float) if a.dtype == np.float32 else a, sim.data)
-        quat = jnp.broadcast_to(jnp.array([0.1, 0.05, 0.0, 1.0]) / np.sqrt(1.0125), (6, 1, 4))
+        quat = jnp.broadcast_to(jnp.array([0.1, 0.05, 0.0, 1.0]) / np.sqrt(1.0125), (9, 1, 4))
         after = step(data.replace(states=data.states.replace(quat=quat, **x)), 5)
-        states, push = after.states, after.plugins["contact_response"].impulse[..., 2]
-        return states.pos @ jnp.array([1.0, -2.0, 3.0]) + states.vel @ jnp.ones(3) + states.ang_vel @ jnp.ones(3), push
+        states, impulse = after.states, jnp.abs(after.plugins["contact_response"].impulse)
+        ends = states.pos @ jnp.array([1.0, -2.0, 3.0]) + states.vel @ jnp.ones(3) + states.ang_vel @ jnp.ones(3)
+        return ends[:, 0], impulse[:, 0]
 
-    (values, push), (slopes, _) = jax.tree.map(np.ravel, jax.jit(functools.partial(forward_mode, end))(x, directions))
-    assert np.all(push > 0)
-    for k in (0, 3):
+    (values, impulse), (slopes, _) = jax.jit(functools.partial(forward_mode, end))(x, directions)
+    assert np.all(impulse[:6, 2] > 0)
+    assert np.all(impulse[6:, 0] > 0)
+    _, gradient_slopes = jax.jit(functools.partial(reverse_mode, lambda x: end(x)[0]))(x, directions)
+    np.testing.assert_allclose(np.ravel(gradient_slopes), slopes, rtol=1e-9)
+    for k in (0, 3, 6):
         numeric = (values[k + 1] - values[k + 2]) / (2 * h)
         assert abs(numeric) > 0.1
         np.testing.assert_allclose(slopes[k], numeric, rtol=1e-5)

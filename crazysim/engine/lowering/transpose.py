@@ -23,7 +23,10 @@ from crazysim.engine.lowering.selections import add_selections
 from crazysim.engine.pytree import replace_leaves
 
 MAX_UNROLLED_OPERATIONS = 4096
-"""Maximum number of operations, over all iterations, of a loop that is unrolled for its derivative."""
+"""Maximum number of operations, over all iterations, of a loop that is unrolled for its derivative. A longer loop is
+reversed as a loop, whose iteration k recomputes the k iterations before it."""
+MAX_REVERSED_ITERATIONS = 64
+"""Maximum number of iterations of a loop that is reversed as a loop."""
 
 Cotangents = dict[Value, Element]
 """Cotangents by the values of the block that is differentiated."""
@@ -237,14 +240,60 @@ def _over_others(
     )
 
 
+def _loop(
+    builder: Builder, op: Operation, values: dict, active_set: set[Value], result_cts: ResultCotangents, cts: Cotangents
+) -> None:
+    (body,), length = op.blocks, op.param("length")
+    start = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
+    carried = [k for k, x in enumerate(body.inputs) if x in active_set]
+    used = body.used_values()
+    captured = [x for x in values if x in used and x in active_set]
+    inner = Builder(builder)
+    iteration = inner.input("int32")  # from the last one to the first
+    carried_cts = [inner.input(body.inputs[k].dtype) for k in carried]
+    sums = [inner.input(x.dtype) for x in captured]
+    # The numbers with which the iteration began.
+    test, again = Builder(inner), Builder(inner)
+    count, *_ = [test.input(x) for x in ("int32", *(x.dtype for x in start))]
+    is_earlier = test.finish([test.add("lt", (count, iteration), bool)])
+    count, *numbers = [again.input(x) for x in ("int32", *(x.dtype for x in start))]
+    outputs = inline(again, body, values | dict(zip(body.inputs, numbers, strict=True)))
+    repeat = again.finish([again.add("add", (count, constant(1, "int32")), "int32"), *outputs])
+    first = (constant(0, "int32"), *start)
+    _, *numbers = inner.add_many("while", first, [x.dtype for x in first], (), (is_earlier, repeat))
+    # The iteration itself, and its derivative.
+    inner_values, inner_cts = values | dict(zip(body.inputs, numbers, strict=True)), Cotangents()
+    inline(inner, body, inner_values)
+    for k, ct in zip(carried, carried_cts, strict=True):
+        if isinstance(x := body.outputs[k], Value) and x in active_set:
+            _accumulate(inner, inner_cts, x, ct)
+    _add_cotangents(inner, body, inner_values, active_set, inner_cts)
+    results = [inner_cts.get(body.inputs[k], constant(0, body.inputs[k].dtype)) for k in carried]
+    results += [inner.add("add", (a, inner_cts[x]), x.dtype) if x in inner_cts else a
+                for a, x in zip(sums, captured, strict=True)]  # fmt: skip
+    block = inner.finish([inner.add("sub", (iteration, constant(1, "int32")), "int32"), *results])
+    args = [constant(length - 1, "int32")]
+    args += [constant(0, op.results[k].dtype) if result_cts[k] is None else result_cts[k] for k in carried]
+    args += [constant(0, x.dtype) for x in captured]
+    _, *totals = builder.add_many("loop", args, [x.dtype for x in args], op.params, (block,))
+    for x, total in zip([*(op.args[k] for k in carried), *captured], totals, strict=True):
+        if isinstance(x, Value) and x in active_set:
+            _accumulate(builder, cts, x, total)
+
+
 Rule = Callable[[Builder, Operation, dict, set[Value], ResultCotangents, Cotangents], None]
 """Function that adds the cotangents of the values that a structured operation uses."""
-STRUCTURED_RULES: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
+STRUCTURED_RULES: dict[str, Rule] = {
+    "when": _when,
+    "custom_jvp": _custom_jvp,
+    "over_others": _over_others,
+    "loop": _loop,
+}
 
 
 def _unroll_loops(block: Block) -> Block:
     # Loops that carry no float have no derivative and are not unrolled.
-    if not any(_is_differentiable_loop(op) for inner in block.blocks() for op in inner.operations):
+    if not any(_is_unrolled(op) for inner in block.blocks() for op in inner.operations):
         return block
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
@@ -252,8 +301,19 @@ def _unroll_loops(block: Block) -> Block:
     return Block(tuple(values[x] for x in block.inputs), tuple(builder.operations), tuple(outputs))
 
 
-def _is_differentiable_loop(op: Operation) -> bool:
-    return op.name == "loop" and any(x.dtype.kind == "f" for x in op.results)
+def _is_unrolled(op: Operation) -> bool:
+    if op.name != "loop" or not any(x.dtype.kind == "f" for x in op.results):
+        return False
+    (body,), length = op.blocks, op.param("length")
+    if length * sum(1 for _ in body.walk()) <= MAX_UNROLLED_OPERATIONS:
+        return True
+    if length > MAX_REVERSED_ITERATIONS:
+        raise UnsupportedError(
+            f"a loop of {length} iterations is too long to be reversed; jax.jvp and jax.jacfwd have a kernel",
+            op.name,
+            op.stage,
+        )
+    return False
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
@@ -262,16 +322,9 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
 
     for op in block.operations:
         builder.stage = op.stage
-        if _is_differentiable_loop(op):
-            (body,) = op.blocks
-            length, carry = op.param("length"), [map_element(x) for x in op.args]
-            if length * sum(1 for _ in body.walk()) > MAX_UNROLLED_OPERATIONS:
-                raise UnsupportedError(
-                    f"a loop of {length} iterations is too long to be reversed; jax.jvp and jax.jacfwd have a kernel",
-                    op.name,
-                    op.stage,
-                )
-            for _ in range(length):
+        if _is_unrolled(op):
+            (body,), carry = op.blocks, [map_element(x) for x in op.args]
+            for _ in range(op.param("length")):
                 inner_values = values | dict(zip(body.inputs, carry, strict=True))
                 carry = _unroll(builder, body, inner_values)
             values.update(zip(op.results, carry, strict=True))

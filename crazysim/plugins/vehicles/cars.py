@@ -67,10 +67,11 @@ class Cars(Population):
     reference: Literal["time", "arc"] = "time"
     """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the path where the car is."""
     index: Param = param(default=None, whole=True, dtype=np.int32)
-    """Index of each car's path; with None, car i follows path i modulo the number of paths. (1,)"""
+    """Index of each car's path; with None, car i follows path i modulo the number of paths. A
+    number for each of them, (n_members,), or (n_worlds, n_members, 1), as the data has it."""
     start: Param = param(default=None)
     """Time at which a car is at the start of its path, s; None for zero, or equal intervals for the cars of one closed
-    path. (1,)"""
+    path. (n_worlds, n_members, 1)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
     freq: int | None = None
@@ -189,8 +190,9 @@ class Cars(Population):
                 sim, "index", self._path_indices(paths), allowed=range_between(0, paths.n_paths - 1),
                 dtype=np.int32, n_members=self.n_members,
             )  # fmt: skip
-            start = starts.spread_start_times(paths, np.asarray(index), self.n_members)
-            start = check_parameter(sim, "start", start if self.start is None else self.start, n_members=self.n_members)
+            index = np.broadcast_to(index, (*counts, 1))
+            start = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
+            start = np.broadcast_to(check_parameter(sim, "start", start, n_members=self.n_members), (*counts, 1))
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
             gains, memory = controller.gains(vehicle, params, control_freq), controller.memory()
         if self.pos is not None:
@@ -210,8 +212,8 @@ class Cars(Population):
             applied_command=zeros if self.needs_controller else None,
             params=params,
             path=paths,
-            index=index,
-            start=start,
+            index=index if index is None else device_array(index, np.int32),
+            start=start if start is None else device_array(start),
             arc=arc if arc is None else device_array(arc),
             memory=_repeat_for_members(memory, counts),
             gains=gains,

@@ -19,20 +19,19 @@ def row_positions(n: int) -> NDArray:
 
 
 def path_poses(
-    paths: Path, index: ArrayLike, start: ArrayLike, counts: tuple[int, int]
+    paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
 
     Args:
         paths: Paths.
-        index: Index of each car's path. (1,) or (n_worlds, n_members, 1)
-        start: Time at which each car is at the start of its path, s. (1,) or (n_worlds, n_members, 1)
+        index: Index of each car's path. (n_worlds, n_members, 1)
+        start: Time at which each car is at the start of its path, s. (n_worlds, n_members, 1)
         counts: Numbers of worlds and of cars.
 
     Returns:
         Arrays (n_worlds, n_members, 2), (n_worlds, n_members, 1) and (n_worlds, n_members, 1).
     """
-    index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
     pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
     poses: dict[tuple[int, float], tuple[ArrayLike, float, float]] = {}
     for member in np.ndindex(counts):
@@ -48,12 +47,12 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
 
     Args:
         paths: Paths.
-        index: Index of each car's path. (1,) or (n_worlds, n_members, 1)
+        index: Index of each car's path. (n_worlds, n_members, 1)
         pos: Positions of the cars, m. (n_worlds, n_members, 2)
         arc: Reference arc lengths, m; on closed paths the result is in the lap nearest to them.
             (n_worlds, n_members, 1)
     """
-    index, projections = np.broadcast_to(index, arc.shape), np.empty_like(arc)
+    projections = np.empty_like(arc)
     for member in np.ndindex(arc.shape[:2]):
         k = int(index[member][0])
         nearest_arc, length = paths.nearest_arc(k, pos[member]), float(paths.length[k])
@@ -64,8 +63,7 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
 
 def spread_start_times(paths: Path, index: NDArray, n: int) -> NDArray:
     """Return start times of n cars, s: equally spaced over the duration of a closed path, zero on open paths. (n,)"""
-    indices = np.broadcast_to(index.reshape(-1)[:n], (n,))
-    times = np.zeros(n)
+    indices, times = index.reshape(-1)[:n], np.zeros(n)
     for path in np.unique(indices):
         cars = np.flatnonzero(indices == path)
         if np.asarray(paths.closed)[path]:

@@ -252,3 +252,11 @@ def test_wrong_commands_are_errors():
     for command, message in ((np.zeros((2, 3, 4)), "(2, 3, 2)"), (np.full((2, 3, 2), np.nan), "finite")):
         with pytest.raises(ValueError, match=re.escape(message)):
             cars.with_command(sim.data, command)
+
+
+@pytest.mark.parametrize("members", [1, 2])
+def test_every_car_has_an_index_and_a_start_of_its_own(members):
+    sim, cars = build(2, members=members, path=[EIGHT, EIGHT])
+    record = cars.read(sim.data)
+    for values in (record.index, record.start, record.arc):
+        assert values.shape == (2, members, 1)
