@@ -16,7 +16,7 @@ BUDGET = {
     "crazysim": 836,
     "drones": 514,
     "dynamics": 574,
-    "engine": 6746,
+    "engine": 6785,
     "envs": 3233,
     "geometry": 1089,
     "lab": 11233,
