@@ -1,9 +1,13 @@
 """Every example runs, prints its result, and passes its own checks."""
 
+import functools
 import importlib.util
 from pathlib import Path
 
 import pytest
+
+from crazysim import train
+from crazysim.train import runs
 
 NEEDS_TORCH = {"sac"}
 """Examples that need Torch, which ``.ci/sb3`` runs."""
@@ -104,7 +108,26 @@ CHECKS = {
 """Further checks of the values that ``main`` of an example returns."""
 
 
-LONG_REASONS = {"student": "trains two policies", "waypoints": "trains a policy"}
+LONG_REASONS = {"student": "trains two policies", "waypoints": "trains a policy unless student has"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shared_trainings(tmp_path_factory):
+    """Let examples with equal trainings share them, without plots."""
+
+    @functools.cache
+    def run_once(task, settings):
+        config, options = dict(settings[0]), dict(settings[1:])
+        return runs.run(task, tmp_path_factory.mktemp("run") / "out", config=config, **options)
+
+    def run(task, _, config, **options):
+        return run_once(task, (tuple(config.items()), *sorted(options.items())))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "run", run)
+        patch.setattr(runs, "plot_curve", lambda *_: None)
+        patch.setattr(runs, "plot_episode", lambda *_: None)
+        yield
 
 
 @pytest.mark.parametrize(

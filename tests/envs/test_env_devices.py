@@ -66,7 +66,7 @@ def test_law_10_worlds_on_four_devices_are_those_of_one(mesh):
 def test_gymnasium_worlds_on_four_devices_are_those_of_one(mesh):
     """Actions may be JAX arrays on the default device, and states may be read in between."""
     settings = {"num_envs": N_WORLDS, "seconds": 0.1}
-    envs = [gymnasium.make_vec("crazysim/Race-v0", **settings, **options) for options in ({}, {"mesh": mesh})]
+    envs = [gymnasium.make_vec("crazysim/Hover-v0", **settings, **options) for options in ({}, {"mesh": mesh})]
     shape = envs[0].action_space.shape
     for i, (kind, argument) in enumerate(sequence(12, shape)):
         if kind == "step":

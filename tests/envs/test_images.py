@@ -60,7 +60,8 @@ def test_final_observations_of_episodes_have_the_images_of_the_step_before(recor
 
 
 def test_restarted_worlds_have_images_of_their_new_episodes(envs_with_and_without_images, recorded_flight):
-    restarted = envs_with_and_without_images[0].restart(recorded_flight[0][1], np.array([True, False, False]))
+    restart = jax.jit(envs_with_and_without_images[0].restart)
+    restarted = restart(recorded_flight[0][1], np.array([True, False, False]))
     assert jax.tree.structure(restarted) == jax.tree.structure(recorded_flight[0][1])
     for obs in (restarted.obs, restarted.final_obs):
         np.testing.assert_array_equal(obs["depth"][1:], recorded_flight[0][1].obs["depth"][1:])
@@ -98,17 +99,17 @@ def test_adapters_have_the_images_in_their_spaces():
 def test_wrappers_around_images_leave_them_as_they_are():
     env = CameraImages(make("hover", 2, engine="interpret"), Camera(**SIZE), DEPTH)
     for wrap in (lambda env: FrameStack(env, 2), Normalize, lambda env: ObservationNoise(env, {"pos": 0.1})):
-        state = wrap(env).reset(jax.random.key(0))
-        state = wrap(env).step(state, jnp.zeros((2, 1, 4)))
+        state = jax.eval_shape(wrap(env).reset, jax.random.key(0))
+        state = jax.eval_shape(wrap(env).step, state, jnp.zeros((2, 1, 4)))
         assert state.obs["depth"].shape == (2, 1, 48)
 
 
 def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode():
     """25 images/s in an environment of 50 steps/s, delivered 30 ms later, between two of its steps."""
-    base = make("avoid", 3, seconds=0.2, n_boxes=1, n_poles=3)
+    base = make("avoid", 3, seconds=0.2, n_boxes=1, n_poles=3, engine="interpret")
     env = AutoReset(CameraImages(base, Camera(**SIZE, freq=25, latency=0.03, outputs=("depth", "normal"))))
     measure_depth = jax.jit(env.sim.scene.depth_fn("fpv_cam", **SIZE))
-    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(3))
+    step, restart, state = jax.jit(env.step), jax.jit(env.restart), jax.jit(env.reset)(jax.random.key(3))
     assert {name: x.shape for name, x in state.obs.items() if "camera" in name} == {
         "camera.depth": (3, 1, 48),
         "camera.normal": (3, 1, 144),
@@ -118,7 +119,7 @@ def test_a_slow_and_late_camera_shows_old_images_and_a_new_one_in_a_new_episode(
         if k:
             state = step(state, random_action(state, k))
         if k == 5:  # one world begins an episode on its own
-            state = env.restart(state, np.array([True, False, False]))
+            state = restart(state, np.array([True, False, False]))
         images.append(np.minimum(measure_depth(state.data).distance, 10.0).reshape(3, 1, -1))
         steps = np.asarray(state.full_data.core.steps)[:, 0] // env.n_substeps
         # The images of steps 0, 2, 4 ... of an episode arrive 1.5 steps later, the first one at once.
@@ -149,4 +150,5 @@ def test_law_09_wrong_images_are_refused():
         (lambda: Observe(CameraImages(base, Camera(), DEPTH), scale_all), "images unchanged .*'depth'"),
     ]:
         with pytest.raises(ConfigError, match=message):
-            call().step(call().reset(jax.random.key(0)), jnp.zeros((2, 1, 4)))
+            env = call()
+            jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros((2, 1, 4)))

@@ -59,7 +59,7 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
     """Paths: environments with and without automatic resets, rollouts, and steps of simulations, traced and not."""
     auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
     key = jax.random.key(0)
-    start, start_state, before = env.reset(key), auto.reset(key), sim.data
+    start, start_state, before = jax.jit(env.reset)(key), jax.jit(auto.reset)(key), sim.data
     plain = jax.jit(build_stagewise_step(sim), static_argnums=1)
     step = sim.step_fn
     paths = {
@@ -129,7 +129,7 @@ def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_rep
 def test_gradients_of_an_environment_step_by_parameters_that_are_zero(env):
     """Derivatives of velocities by gravity, and of rates by the inverse inertia, are those of the stages."""
     auto, stages = envs.AutoReset(env), build_stagewise_step(env.sim)
-    start = auto.reset(jax.random.key(0))
+    start = jax.jit(auto.reset)(jax.random.key(0))
     action = 0.3 * jnp.ones_like(start.action).at[..., 0].set(0.2)
     parameters = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}
 
