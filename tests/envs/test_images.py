@@ -136,6 +136,11 @@ def scale_all(obs, _):
     return {name: 2 * x for name, x in obs.items()}
 
 
+def trace_step(make_env):
+    env = make_env()
+    jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros((2, 1, 4)))
+
+
 def test_law_09_wrong_images_are_refused():
     base = make("hover", 2, engine="interpret")
     for call, message in [
@@ -150,5 +155,4 @@ def test_law_09_wrong_images_are_refused():
         (lambda: Observe(CameraImages(base, Camera(), DEPTH), scale_all), "images unchanged .*'depth'"),
     ]:
         with pytest.raises(ConfigError, match=message):
-            env = call()
-            jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros((2, 1, 4)))
+            trace_step(call)

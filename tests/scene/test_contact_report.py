@@ -351,15 +351,11 @@ def test_law_09_wrong_queries_are_refused(attached_bodies):
 
 
 @pytest.mark.long("compiles contacts in the step and in a report")
-@pytest.mark.parametrize("has_boxes", [False, True])
-@pytest.mark.parametrize("n_drones", [1, 3, 9])
+@pytest.mark.parametrize(("n_drones", "has_boxes"), [(1, False), (3, True), (9, False)])
 def test_the_log_and_a_report_have_the_same_contacts_between_drones(n_drones, has_boxes, rng):
-    """In the step one drone loops over the others; a report has all pairs of a world.
-
-    With boxes, nine drones loop in a kernel; all pairs of three drones, unrolled, would take g++ 18 s.
-    """
-    engine = "interpret" if has_boxes and n_drones == 3 else "auto"
-    sim = Sim(n_worlds=4, n_drones=n_drones, control="rotor_vel", engine=engine)
+    """In the step one drone loops over the others, of which up to eight are unrolled; a report has all pairs of a
+    world."""
+    sim = Sim(n_worlds=4, n_drones=n_drones, control="rotor_vel", engine="interpret")
     if has_boxes:
         use_box_collision(sim)
     pos = rng.uniform(-0.2, 0.2, (4, n_drones, 3)) * [1, 1, 0.2] + [0, 0, 1]
@@ -372,7 +368,7 @@ def test_the_log_and_a_report_have_the_same_contacts_between_drones(n_drones, ha
     np.testing.assert_array_equal(log.read(sim.data).drones, expected)
 
 
-@pytest.mark.parametrize("n_drones", [1, 3, 9])
+@pytest.mark.parametrize("n_drones", [3, 9])
 def test_one_kernel_reports_the_same_as_xla(n_drones, rng):
     """Distances between more than eight drones have no kernel; fields that are not requested are None in both."""
     sims = [Sim(n_worlds=5, n_drones=n_drones, engine=engine) for engine in ("auto", "lanes")]
@@ -381,7 +377,7 @@ def test_one_kernel_reports_the_same_as_xla(n_drones, rng):
         sim.scene.add("box", count=2, pos=[[1, 0, 0.5], [0, 1, 0.5]])
         sim.scene.add("pole", pos=[0.2, 0.2, 0])
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-    for options in ({}, {"floor": False}, {"objects": (), "drones": False}, {"objects": "pole:0", "floor": False}):
+    for options in ({}, {"objects": "pole:0", "floor": False}):
         report, expected = (sim.contact_report(**options) for sim in sims)
         assert jax.tree.structure(report) == jax.tree.structure(expected)
         for x, y in zip(jax.tree.leaves(report), jax.tree.leaves(expected), strict=True):
@@ -413,7 +409,7 @@ def test_thousands_of_objects_are_reported_by_a_small_program(has_boxes, rng):
     distances = np.asarray(report.object_distance)[0, 0]
     assert distances.shape == (2 * n + 31,)
     assert report.nearest_object[0, 0] == np.argmin(distances)
-    chosen_names = [f"{name}:{k}" for name in ("moves", "stays", "turned") for k in (0, 7, 29)]
+    chosen_names = [f"{name}:{k}" for name in ("moves", "stays", "turned") for k in (7, 29)]
     chosen_distances = np.asarray(sim.contact_report(chosen_names).object_distance)[0, 0]
     np.testing.assert_allclose(
         distances[[report.object_names.index(name) for name in chosen_names]], chosen_distances, atol=1e-5

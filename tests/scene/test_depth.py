@@ -11,11 +11,11 @@ import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.engine.backends import native
-from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import EngineWarning
 from crazysim.scene.depth import pixel_directions
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
+HIT_FIELDS = ("body_index", "distance", "normal", "point")
 
 
 def place_drones(sim, pos, quat=None):
@@ -117,20 +117,6 @@ def test_a_drone_sees_other_drones_but_not_itself(room):
     assert np.argwhere(others)[:, 1].min() > 48, "a drone at -y is in the right half"
     assert (hits_with_own.body_index[0, 0] == first + 1).sum() > 8
     assert not (hits_without_own.body_index[0, 0] == first + 1).any()
-
-
-def test_images_of_one_world_equal_those_of_all_worlds(room):
-    """A task observes images of one world: its loop over bodies gives the kernel's results up to rounding."""
-    sim = room[0]
-    depth = sim.scene.depth_fn("fpv_cam", 9, 6, drones=False)
-    names = ("body_index", "distance", "normal", "point")
-    all_at_once, one_by_one = (
-        jax.jit(transform(lambda data: [getattr(depth(data), name) for name in names]))(sim.data)
-        for transform in (lambda fn: fn, vmap_worlds)
-    )
-    for k, name in enumerate(names):
-        np.testing.assert_allclose(all_at_once[k], one_by_one[k], rtol=2e-6, atol=2e-6, err_msg=name)
-    assert all_at_once[-1].shape == (2, 2, 6, 9, 3)
 
 
 def test_law_09_data_of_one_drone_has_no_image(room):
@@ -321,32 +307,6 @@ def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
         assert message in str(error.value)
 
 
-def test_rays_equal_those_of_c_mujoco(room, rng):
-    """Many rays in all directions, at movable and fixed objects."""
-    from crazysim.scene.ray_casting import cast_rays
-
-    sim, _, box = room
-    data = box.set_pose(sim.data, [-1.0, 0.3, 1.2], [0.3, -0.1, 0.5, 0.7])
-    n = 400
-    origin, direction = rng.uniform([-2, -2, 0.2], [2, 2, 2], (n, 3)), rng.normal(size=(n, 3))
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    rays = (np.tile(np.float32(x), (2, 1, 1)) for x in (origin, direction))
-    hits = jax.jit(lambda data, *rays: cast_rays(sim.scene.visual_model, data, *rays, drones=False))(data, *rays)
-    distance = np.asarray(hits.distance)[0]
-    sim.scene.sync_one(data, 0)
-    group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
-    geom = np.zeros(1, np.int32)
-    n_hits = 0
-    for k in range(n):
-        expected = mujoco.mj_ray(sim.mj_model, sim.mj_data, origin[k], direction[k], group, 1, -1, geom, None)
-        if expected < 0:
-            assert not np.isfinite(distance[k])
-        else:
-            n_hits += 1
-            assert distance[k] == pytest.approx(expected, rel=1e-4, abs=1e-4)
-    assert 100 < n_hits < n
-
-
 ALL_KINDS = """<mujoco><asset>
 <mesh name="wedge" vertex="0 0 0 .4 0 0 0 .5 0 0 0 .6"/>
 <hfield name="hill" nrow="3" ncol="4" size=".5 .4 .3 .1" elevation="0 .2 .1 0 .5 1 .6 .3 0 .4 .2 .1"/></asset>
@@ -368,20 +328,17 @@ def mixed_scene():
 
 
 def cast_functions(sim, own):
-    """Return functions from data and rays to hits: by a kernel, by XLA, and for each world as in a stage."""
+    """Return functions from data and rays to hits: by a kernel, and by XLA for each world as in a stage."""
     from crazysim.engine.stage import Axes
     from crazysim.scene.ray_casting import RayKernels, cast_rays
 
     model = sim.scene.collision_model
-    # Every other geom: compiling the gradients of each world takes long.
+    # Every other geom: compiling the loop over those of each world takes long.
     objects = tuple(dataclasses.replace(body, geoms=body.geoms[::-1][::2]) for body in model.objects)
     model = dataclasses.replace(model, objects=objects)
 
     def cast_by_kernel(data, origin, direction):
         return cast_rays(model, data, origin, direction, own, kernels=RayKernels("cpu", strict=True))
-
-    def cast_by_xla(data, origin, direction):
-        return cast_rays(model, data, origin, direction, own)
 
     def cast_in_each_world(data, origin, direction):
         axes = Axes(data)
@@ -396,7 +353,7 @@ def cast_functions(sim, own):
         mapped = jax.vmap(cast_in_world, ([batch_axes.get(scope) for scope in axes.scopes], 0, 0))
         return mapped(leaves_of_drone, origin, direction)
 
-    return cast_by_kernel, cast_by_xla, cast_in_each_world
+    return cast_by_kernel, cast_in_each_world
 
 
 def draw_rays(rng, n):
@@ -410,7 +367,8 @@ def draw_rays(rng, n):
 
 
 def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
-    """Hits and gradients agree in the kernel, the same function in XLA, and the loop over bodies of a stage."""
+    """Hits agree in the kernel and in the loop over bodies of a stage. Gradients of the kernel are slopes of its
+    results."""
     n = 300
     data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, mixed_scene.data)
     quat = data.objects.quat / jnp.linalg.norm(data.objects.quat, axis=-1, keepdims=True)
@@ -422,35 +380,31 @@ def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
     direction[:, 40:100] = to_drones / np.linalg.norm(to_drones, axis=-1, keepdims=True)
     weight, slant = rng.uniform(size=(2, n)), rng.normal(size=(2, n, 3))
 
-    def value_and_gradients(cast_all):
-        def weighted_sum(pos, quat, object_pos, ray_origin, ray_direction):
-            states = data.states.replace(pos=pos, quat=quat)
-            hits = cast_all(
-                data.replace(states=states, objects=data.objects.replace(pos=object_pos)), ray_origin, ray_direction
-            )
-            lengths = jnp.sum(jnp.where(jnp.isfinite(hits.distance), weight * hits.distance, 0.0))
-            return lengths + jnp.sum(slant * hits.normal), hits
+    by_kernel, by_world = cast_functions(mixed_scene, own)
 
-        args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
-        return jax.jit(jax.value_and_grad(weighted_sum, (0, 1, 2, 3, 4), has_aux=True))(*args)
+    @jax.jit
+    def weighted_sum(pos, quat, object_pos, ray_origin, ray_direction):
+        states = data.states.replace(pos=pos, quat=quat)
+        moved_data = data.replace(states=states, objects=data.objects.replace(pos=object_pos))
+        hits = by_kernel(moved_data, ray_origin, ray_direction)
+        lengths = jnp.sum(jnp.where(jnp.isfinite(hits.distance), weight * hits.distance, 0.0))
+        return lengths + jnp.sum(slant * hits.normal), hits
 
-    by_kernel, by_xla, by_world = cast_functions(mixed_scene, own)
-    ((_, kernel_hits), gradients), ((_, hits_by_world), expected_gradients) = map(
-        value_and_gradients, (by_kernel, by_world)
-    )
+    args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
+    gradients, kernel_hits = jax.jit(jax.grad(weighted_sum, range(len(args)), has_aux=True))(*args)
     hit_kinds = {kernel_hits.names[k].partition(":")[0] for k in np.unique(kernel_hits.body_index) if k >= 0}
     assert hit_kinds == {"floor", "fixed", "moving", "drone"}
-    np.testing.assert_array_equal(kernel_hits.body_index, hits_by_world.body_index)
-    np.testing.assert_allclose(kernel_hits.distance, hits_by_world.distance, rtol=1e-9)
-    np.testing.assert_allclose(kernel_hits.normal, hits_by_world.normal, atol=1e-9)
-    xla_hits = jax.jit(by_xla)(data, origin, direction)
-    for name in ("body_index", "distance", "normal", "point"):
-        np.testing.assert_allclose(getattr(xla_hits, name), getattr(kernel_hits, name), rtol=1e-9, atol=1e-9)
-    distance = np.where(np.isfinite(hits_by_world.distance), hits_by_world.distance, 0.0)[..., None]
-    np.testing.assert_allclose(kernel_hits.point, np.where(distance > 0, origin + distance * direction, 0.0), atol=1e-9)
-    for gradient, expected_gradient in zip(gradients, expected_gradients, strict=True):
-        assert np.abs(expected_gradient).max() > 0.1
-        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-8 * np.abs(expected_gradient).max())
+    hits = jax.jit(lambda *args: [getattr(by_world(*args), name) for name in HIT_FIELDS])(data, origin, direction)
+    for name, x in zip(HIT_FIELDS, hits, strict=True):
+        np.testing.assert_allclose(getattr(kernel_hits, name), x, rtol=1e-9, atol=1e-9, err_msg=name)
+    h = 1e-6
+    for k, gradient in enumerate(gradients):
+        assert np.abs(gradient).max() > 0.1
+        shift = rng.normal(size=gradient.shape)
+        if k == 4:
+            shift[:, : n // 8] = 0  # along axes, parallel to the floor
+        sums = [weighted_sum(*args[:k], args[k] + sign * h * shift, *args[k + 1 :])[0] for sign in (1, -1)]
+        np.testing.assert_allclose(np.sum(gradient * shift), (sums[0] - sums[1]) / (2 * h), rtol=1e-6, err_msg=k)
 
 
 def test_rays_hit_geoms_of_every_kind_where_rays_of_c_mujoco_do(mixed_scene, rng):
