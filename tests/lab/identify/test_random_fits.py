@@ -87,22 +87,26 @@ def fly_airframes(airframes, seconds, rng, *, at_samples):
     return np.stack(rows[250:], axis=1).astype(np.float64)
 
 
-def normalised_errors(folder, n, seconds, seed, *, at_samples):
-    """Return the errors of fits with commands and without, in stated deviations, by parameter."""
+def normalised_errors(folder, n, seconds, seed, *, at_samples, fits_both=False):
+    """Return the errors of fits in stated deviations, by parameter.
+
+    Flights are fitted with commands and without in turn, or each of them in both ways.
+    """
     rng, errors = np.random.default_rng(seed), {}
     paths, airframes, truths = zip(*(draw_airframe(rng, folder, k) for k in range(n)), strict=True)
     flights = fly_airframes(airframes, seconds, rng, at_samples=at_samples)
-    for path, flight, truth in zip(paths, flights, truths, strict=True):
+    for k, (path, flight, truth) in enumerate(zip(paths, flights, truths, strict=True)):
         x = flight[4::5] + 0
         x[1:, :13] = flight[9 - N_LATE_STEPS :: 5][: len(x) - 1, :13]
         x = x[1:]
         x[:, :13] += NOISE_STD * rng.normal(size=(len(x), 13))
         x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=-1, keepdims=True)
         x[:, 13:17] += ROTOR_NOISE * x[:, 13:17].mean() * rng.normal(size=(len(x), 4))
-        commands = [f"command{k}" for k in range(1, 5)]
+        commands = [f"command{i}" for i in range(1, 5)]
         table = {"t": 0.01 * np.arange(len(x)), **dict(zip([*COLUMN_NAMES, *commands], x.T, strict=True))}
-        for has_commands in (True, False):
-            result = identify([read_log({k: y for k, y in table.items() if has_commands or k not in commands})], path)
+        for has_commands in (True, False) if fits_both else (k % 2 == 0,):
+            log = {name: y for name, y in table.items() if has_commands or name not in commands}
+            result = identify([read_log(log)], path)
             assert abs(next(iter(result.delays.values())) - 0.002 * N_LATE_STEPS) < 5e-4
             for name, value in result.values.items():
                 errors.setdefault(name, []).append((value - truth.get(name, 0.0)) / result.deviations[name])
@@ -117,19 +121,19 @@ def shares_within(errors):
     return np.array([np.mean(np.abs(errors) <= k) for k in (1, 2, 3)])
 
 
-@pytest.mark.long("flies four airframes for 40 s and fits each twice")
+@pytest.mark.long("flies four airframes for 30 s and fits them")
 @pytest.mark.parametrize(
     "at_samples", [False, pytest.param(True, marks=pytest.mark.slow("commands between samples are harder to fit"))]
 )
 def test_errors_are_as_large_as_their_deviations(tmp_path, at_samples):
-    """Of four airframes; a share of 196 numbers, most of them alike in both fits, scatters by 5% of 1."""
-    errors = normalised_errors(tmp_path, 4, 40.0, 0, at_samples=at_samples)
+    """Of four airframes, half of them with commands; a share of some 100 numbers scatters by 5% of 1."""
+    errors = normalised_errors(tmp_path, 4, 30.0, 0, at_samples=at_samples)
     all_errors = np.concatenate(list(errors.values()))
     shares = shares_within(all_errors)
     assert np.all(shares >= [0.63, 0.93, 0.985]), shares
     assert 0.5 < np.sqrt(np.mean(all_errors**2)) < 1.2  # deviations that are too large are wrong, too
     assert shares[0] < 0.93, shares
-    assert len(errors["motor lag"]) == 4
+    assert len(errors["motor lag"]) == 2
     assert np.all(np.abs(errors["motor lag"]) < 3), errors["motor lag"]
 
 
@@ -137,7 +141,7 @@ def test_errors_are_as_large_as_their_deviations(tmp_path, at_samples):
 @pytest.mark.parametrize("at_samples", [False, True])
 def test_errors_of_50_airframes_are_as_large_as_their_deviations(tmp_path, at_samples):
     """Shares of all numbers, and of each parameter, within one, two and three deviations."""
-    errors = normalised_errors(tmp_path, 50, 60.0, 1, at_samples=at_samples)
+    errors = normalised_errors(tmp_path, 50, 60.0, 1, at_samples=at_samples, fits_both=True)
     shares = shares_within(np.concatenate(list(errors.values())))
     assert np.all(shares >= [0.68, 0.95, 0.997]), shares
     for name, numbers in errors.items():
