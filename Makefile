@@ -21,9 +21,11 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(call tests_of,geometry,heightfield manifold rays shapes) \
   $(call tests_of,scene,build contact_report contacts sync) \
   tests/trajectories/test_formation.py
-# What depends neither on JAX nor on optimisation: messages, the scene, compilers and files of kernels.
-ANY_JAX = $(call tests_of,engine,arm kernel_cache native) \
-  $(call tests_of,laws,faults law_05_no_stale_scene law_09_any_input law_09_wrong_input law_09_wrong_numbers masks)
+# What a new JAX can break: derivatives, tracing, lowering, devices and the cache of programs.
+NEEDS_JAX = $(call tests_of,engine,cache ffi_handlers fuzz gradient_kernels host_call index_map indexing interpret) \
+  $(call tests_of,engine,jaxcompat pair_reductions plain plan pytree record rules sharding stage step tables targets) \
+  $(call tests_of,laws,gradients law_02_batch_axes law_03_functional_core law_06_no_retrace law_07_no_nan) \
+  $(call tests_of,laws,law_10_same_seed law_11_no_buffer_taken transformations) tests/docs/test_first_pages.py
 # Tests start processes that import JAX: without bytecode each takes seconds more.
 unexport PYTHONDONTWRITEBYTECODE
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
@@ -46,10 +48,9 @@ test: $(VENV)/installed-test
 test-rest: $(VENV)/installed-test
 	$(PYTEST) -m "not slow" $(addprefix --ignore=,$(TESTS))
 
-# Laws, engine and first pages with all optimisations of XLA, as users have them; CI runs it on the newest JAX.
+# With all optimisations of XLA, as users have them; CI runs it on the newest JAX.
 test-newest: $(VENV)/installed-test
-	XLA_FLAGS=--xla_backend_optimization_level=3 $(PYTEST) -m "not slow" $(addprefix --ignore=,$(ANY_JAX)) \
-	  tests/laws tests/engine tests/docs/test_first_pages.py
+	XLA_FLAGS=--xla_backend_optimization_level=3 $(PYTEST) -m "not slow" $(NEEDS_JAX)
 
 # Everything, with new examples for the tests of properties.
 test-all: $(VENV)/installed-test
