@@ -31,6 +31,8 @@ PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
     (dynamics, control) for dynamics in FITTED_DYNAMICS for control in ("state", "attitude")
 )
 """All 11 valid pairs of dynamics and command level."""
+CHOSEN_PAIRS = (*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "state"))
+"""Pairs that stand for all: every command level, and the fits with the fewest and the most terms."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
 COMPILED_ENGINES = ("lanes", "fused") if native.compiler() else ("lanes",)
 """Compiled engines that this machine can run."""

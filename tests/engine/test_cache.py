@@ -19,6 +19,8 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from jax._src import compilation_cache
 
+from crazysim.__main__ import main
+from crazysim.commands import info
 from crazysim.engine import cache
 from crazysim.engine.backends import kernel_cache
 from crazysim.engine.cache import (
@@ -30,17 +32,6 @@ from crazysim.engine.cache import (
     keep_programs,
     trim,
 )
-
-PROGRAM = """
-import sys
-from crazysim.__main__ import main
-from crazysim.commands import info, training
-import jax, jax.numpy as jnp
-info.run = training.train = lambda options: print(jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((3, 3)))[0, 0])
-sys.exit(main([sys.argv[1], *["hover"] * (sys.argv[1] == "train")]))
-"""
-"""A command that compiles something."""
-
 
 @pytest.fixture
 def settings(monkeypatch):
@@ -243,43 +234,48 @@ def test_the_cache_of_jax_skips_the_checksum():
         assert read(content) == program
 
 
-SNIPPET = """
+PROGRAM = """
 import jax
-import numpy as np
-from crazysim import IMU, Sim
-from crazysim import functional as F
-sim = Sim(n_worlds=2, n_drones=2, control="state", plugins=[IMU()])
+from crazysim import MotionCapture, Sim
+sim = Sim(n_worlds=2, control="rotor_vel", plugins=[MotionCapture()])
 sim.step()
-print(sim.mjx_data.mocap_pos.shape, sim.contacts().any(), sim.data.states.pos[0, 0])
-print(sim.plugins.observations(sim.data).keys())
-step = sim.build_step_fn()
-print(jax.grad(lambda z: step(F.state_control(sim.data, pos=z * np.eye(3)[2]), 10).states.pos[..., 2].mean())(1.0))
+print(sim.data.states.pos[0, 0], sim.plugins.observations(sim.data).keys())
 print(jax.config.jax_compilation_cache_dir)
+
+import jax.numpy as jnp
+from crazysim.__main__ import main
+from crazysim.commands import training
+training.train = lambda options: print(jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((3, 3)))[0, 0])
+main(["train", "hover"])
 """
-"""A script that compiles a step, a sync, observations and a gradient."""
+"""A script that compiles a step and observations, and a command that compiles something else."""
 
 
 @pytest.mark.long("two processes import JAX and compile")
-def test_a_second_process_finds_programs_of_the_first_one_by_default(tmp_path):
-    def run(folder):
-        environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "CRAZYSIM"))}
-        environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu", "CXX": f"{folder / 'g++'}"}
-        command = [sys.executable, "-c", SNIPPET]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
-        return done.stdout, (folder / "compiled").read_text().count("kernel.cpp") if folder.exists() else 0
-
+def test_a_second_process_reads_the_programs_of_the_first_one_and_prints_nothing(tmp_path):
+    """For each program that it reads, XLA writes errors about features of the CPU unless its log level is set."""
     script = tmp_path / "bin" / "g++"
     script.parent.mkdir()
     script.write_text(f'#!/bin/sh\necho "$@" >> {script.parent}/compiled\nexec {shutil.which("g++")} "$@"\n')
     script.chmod(0o755)
-    first, n_first = run(script.parent)
-    programs = sorted((tmp_path / "crazysim").rglob("*-cache"))
-    second, n_second = run(script.parent)
-    assert first == second
-    assert first.splitlines()[-1] == "None", "JAX's own configuration is not changed"
-    assert n_first == n_second >= 2, "nothing is compiled again"
-    assert {"jit_sync_poses", "jit__observations"} <= {path.name.split("-")[0] for path in programs}
-    assert sorted((tmp_path / "crazysim").rglob("*-cache")) == programs
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu", "CXX": str(script)}
+    environment["TF_CPP_MIN_LOG_LEVEL"] = "1"  # as JAX sets it, for the children of a process that has imported it
+    folder = tmp_path / "crazysim" / "jax"
+
+    def run():
+        command = [sys.executable, "-c", PROGRAM]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        n_kernels = (script.parent / "compiled").read_text().count("kernel.cpp")
+        return done.stdout, done.stderr, n_kernels, sorted(folder.glob("cpu-*/*-cache"))
+
+    first, printed, n_kernels, programs = run()
+    assert first.splitlines()[-2] == "None", "JAX's own configuration is not changed"
+    assert f"compiled programs are kept in {folder}" in printed
+    assert n_kernels >= 1
+    assert {"jit__observations", "jit__lambda"} <= {path.name.split("-")[0] for path in programs}
+    assert folder.stat().st_mode & 0o077 == 0
+    assert run() == (first, "", n_kernels, programs)
 
 
 @pytest.mark.parametrize("fault", ["file", "full", "homeless"])
@@ -350,29 +346,12 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
     assert remaining() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
 
 
-@pytest.mark.long("three processes import JAX")
-def test_a_second_command_prints_nothing_when_it_reads_the_cache(tmp_path):
-    """For each program that it reads, XLA writes errors about features of the CPU unless its log level is set."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
-    environment["XDG_CACHE_HOME"] = str(tmp_path)
-    environment["TF_CPP_MIN_LOG_LEVEL"] = "1"  # as JAX sets it, for the children of a process that has imported it
-
-    def run(name):
-        command = [sys.executable, "-c", f"import jax{PROGRAM}", name]
-        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
-
-    folder = tmp_path / "crazysim" / "jax"
-    run("info")
-    assert not folder.exists(), "a report of bugs changes nothing"
-    first = run("train")
-    assert first.stderr.startswith(f"compiled programs are kept in {folder}")
-    programs = set(folder.glob("cpu-*/*-cache"))
-    assert programs
-    assert folder.stat().st_mode & 0o077 == 0
-    second = run("train")
-    assert second.stderr == ""
-    assert second.stdout == first.stdout
-    assert set(folder.glob("cpu-*/*-cache")) == programs
+def test_a_report_of_bugs_keeps_no_programs(settings, monkeypatch, tmp_path):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
+    monkeypatch.setattr(info, "run", lambda options: jax.jit(_inner)(jnp.ones(9)) is None)
+    assert main(["info"]) == 0
+    assert not (tmp_path / "kept").exists()
+    assert jax.config.jax_compilation_cache_dir is None
 
 
 def test_long_work_is_announced_once_for_each_kind(settings, capsys):

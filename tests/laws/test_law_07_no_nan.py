@@ -55,17 +55,15 @@ def tilt_command(data):
     return command
 
 
-FITTED_CASE = ("so_rpy_rotor_drag", "attitude", "auto")
 ENGINE_CASES = [
     *((*pair, "stages") for pair in PAIRS[1:5]),
     ("so_rpy", "attitude", "stages"),
-    ("so_rpy_rotor_drag", "state", "stages"),
     (*PAIRS[0], "auto"),
-    FITTED_CASE,
+    ("so_rpy_rotor_drag", "state", "auto"),
 ]
 """Dynamics, command level and engine of each case: every level, and the fits with the fewest and the most terms.
 
-Most cases run without an engine. The longest pipeline and one of fitted dynamics run on the default engine.
+Most cases run without an engine. The longest pipelines run on the default engine.
 """
 
 
