@@ -33,6 +33,7 @@ from crazysim.engine.cache import (
     trim,
 )
 
+
 @pytest.fixture
 def settings(monkeypatch):
     """Restore JAX's settings after the test, which begins without a cache and without the variables that choose one."""
@@ -269,9 +270,8 @@ def test_a_second_process_reads_the_programs_of_the_first_one_and_prints_nothing
         n_kernels = (script.parent / "compiled").read_text().count("kernel.cpp")
         return done.stdout, done.stderr, n_kernels, sorted(folder.glob("cpu-*/*-cache"))
 
-    first, printed, n_kernels, programs = run()
+    first, _, n_kernels, programs = run()
     assert first.splitlines()[-2] == "None", "JAX's own configuration is not changed"
-    assert f"compiled programs are kept in {folder}" in printed
     assert n_kernels >= 1
     assert {"jit__observations", "jit__lambda"} <= {path.name.split("-")[0] for path in programs}
     assert folder.stat().st_mode & 0o077 == 0

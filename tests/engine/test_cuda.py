@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim import ConfigError, Downwash, FreeBodies, Kalman, Sim
+from crazysim import ConfigError, Downwash, Kalman, Sim
 from crazysim.engine import Step, explain, jaxcompat
 from crazysim.engine.backends import cuda, kernel, native
 from crazysim.engine.backends.exchange import make_exchange
@@ -176,10 +176,12 @@ def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():
 
 
 def test_a_step_that_splits_is_described():
-    sim = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
-    sim.add(FreeBodies(2, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.5), (0.02, 0, 0.8)]))
+    def undeclared_stage(data):
+        return data.replace(states=data.states.replace(force=0 * data.states.force))
+
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    text = explain(Step(sim.step_pipeline, "fused", "gpu"), sim.data)
-    assert "splits the step: 'bodies_contacts' is not fused" in text
+    text = explain(Step({"mine": undeclared_stage} | sim.step_pipeline, "fused", "gpu"), sim.data)
+    assert "splits the step: 'mine' is not fused" in text
     assert text.splitlines()[-1].startswith("kernel: ")

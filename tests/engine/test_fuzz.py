@@ -99,9 +99,9 @@ def test_refused_programs_are_refused_when_the_step_is_planned(fuzzer):
 
 def test_random_programs_give_the_results_of_plain(fuzzer):
     """Few programs are run here; ``python tests/engine/fuzz.py --programs 20000`` runs many."""
-    findings = list(fuzzer.check(fuzzer.draw(16)))
+    findings = list(fuzzer.check(fuzzer.draw(8)))
     assert not findings, "\n".join(map(str, findings))
-    assert fuzzer.counts["compared on lanes"] > 8
+    assert fuzzer.counts["compared on lanes"] >= 4
 
 
 def subtract_from_zero(ctx, eqn, args):

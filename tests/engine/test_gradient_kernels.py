@@ -21,14 +21,15 @@ from crazysim.errors import EngineWarning
 COMMAND = np.array([0.05, -0.08, 0.1, 1.02 * 0.0434 * 9.81])
 
 
-def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
+def make_losses(n_worlds=3, n_drones=1, stages=(), n_steps=7):
     """Return (losses, step, data) for kernels and for the plain stages, and the point to evaluate the losses at.
 
-    The losses are a function of commands and velocities, (n_worlds,).
+    The losses are a function of commands and velocities, (n_worlds,). The dynamics are those that compile fastest;
+    ``tests/laws/test_gradients.py`` has the others.
     """
     result = []
     for engine in ("fused", "plain"):
-        sim = Sim(n_worlds, n_drones, engine=engine, **options)
+        sim = Sim(n_worlds, n_drones, dynamics="so_rpy", engine=engine)
         for stage_fn in stages:
             insert_fn_before(sim.step_pipeline, "integration", stage_fn)
         phases = jnp.arange(n_worlds * n_drones * 3.0).reshape(n_worlds, n_drones, 3)
@@ -168,7 +169,7 @@ def test_a_kernel_computes_tangents(x64):
 @pytest.mark.long("compiles second derivatives")
 @needs_compiler
 def test_second_derivatives_are_those_of_lanes(x64):
-    pairs, (cmd, vel) = make_losses(n_worlds=1, n_steps=1, dynamics="so_rpy")
+    pairs, (cmd, vel) = make_losses(n_worlds=1, n_steps=1)
 
     def second_derivatives(losses):
         loss = lambda x: jnp.sum(losses((cmd, x)))  # noqa: E731
@@ -203,7 +204,7 @@ def long_loop(data):
 @pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_programs_without_a_kernel_are_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), point = make_losses(stages=[long_loop], n_steps=1, dynamics="so_rpy")
+    ((fast, step, data), (plain, *_)), point = make_losses(stages=[long_loop], n_steps=1)
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
         result = jit_gradient(fast)(point)
     assert_close(result, jit_gradient(plain)(point))

@@ -383,16 +383,17 @@ def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
     assert not native._INTERRUPTED.is_set()
 
 
-@pytest.mark.parametrize("end_signal", [signal.SIGKILL, signal.SIGINT])
-def test_compilers_end_with_their_process(tmp_path, end_signal):
-    with compile_in_another_process(tmp_path, "slow") as process:
-        try:
-            wait_for(lambda: len(compiler_commands(tmp_path)) >= 3)  # the script, the driver and the compiler
-            process.send_signal(end_signal)
-            process.wait(300)
-        finally:
-            process.kill()
-    wait_for(lambda: not compiler_commands(tmp_path))
+@pytest.mark.long("three processes import JAX")
+def test_compilers_end_with_their_process(tmp_path):
+    for end_signal in (signal.SIGKILL, signal.SIGINT):
+        with compile_in_another_process(tmp_path, "slow") as process:
+            try:
+                wait_for(lambda: len(compiler_commands(tmp_path)) >= 3)  # the script, the driver and the compiler
+                process.send_signal(end_signal)
+                process.wait(300)
+            finally:
+                process.kill()
+        wait_for(lambda: not compiler_commands(tmp_path))
     assert compile_in_another_process(tmp_path, "quick").wait(300) == 0
     assert [path.suffix for path in (tmp_path / "cache" / "crazysim").iterdir()] == [".so"]
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
