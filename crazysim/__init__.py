@@ -123,7 +123,3 @@ __all__ = [
 set_xla_log_level()
 
 __getattr__ = lazy_getattr(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__

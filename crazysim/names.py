@@ -140,8 +140,13 @@ NAMES: dict[str, dict[str, str]] = {
 
 
 def lazy_getattr(module: str) -> Callable[[str], Any]:
-    """Make the ``__getattr__`` of a package, which imports its names of the table at their first use."""
+    """Make the ``__getattr__`` of a package, which imports its names of the table at their first use.
+
+    ``dir`` of the package lists these names and its others in ``__all__``.
+    """
     origins = {name: origin for origin, names in NAMES[module].items() for name in names.split()}
+    namespace = vars(sys.modules[module])
+    namespace["__dir__"] = lambda: sorted({*namespace.get("__all__", ()), *origins})
 
     def import_name(name: str) -> Any:
         if name not in origins:

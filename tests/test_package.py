@@ -82,6 +82,7 @@ def test_names_of_the_table_exist(module):
         pytest.importorskip("optax")
     assert all(getattr(package, name) is not None for name in exported(module) if name in package.__all__)
     assert not hasattr(package, "nothing")
+    assert {*exported(module), *package.__all__} <= {*dir(package)}
     if package.__spec__.has_location:
         assert dict(imported_for_types(module)).keys() == set(exported(module))
     else:

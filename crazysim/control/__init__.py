@@ -62,7 +62,3 @@ __all__ = [
 ]
 
 __getattr__ = lazy_getattr(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__
