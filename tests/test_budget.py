@@ -11,7 +11,7 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 1164,
-    "control": 1765,
+    "control": 1763,
     "core": 1577,
     "crazysim": 836,
     "drones": 514,
