@@ -78,7 +78,7 @@ def test_a_script_prints_lines_with_their_figure(run, tmp_path, command, figure,
         assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
 
 
-@pytest.mark.long("compiles a training and evaluations of two airframes")
+@pytest.mark.slow("compiles trainings and evaluations; tests/train/test_networks.py trains with memory")
 def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.import_module("memory"), "AIRFRAMES", ("cf2x_L250",))
     small = ["--worlds", 16, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]

@@ -5,6 +5,7 @@ import json
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -59,6 +60,9 @@ def test_a_seed_trains_with_others_like_a_single_seed(algorithm, hyperparameters
             separate[i], reference = algorithm.iterate(separate[i], env_of_one, (hyperparameters[i],))
             for name in metrics:
                 np.testing.assert_allclose(metrics[name][i], reference[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
+    lost = joint.agents.replace(policy=jax.tree.map(lambda x: x + jnp.inf, joint.agents.policy))
+    _, metrics = algorithm.iterate(joint.replace(agents=lost), env_of_both, tuple(hyperparameters))
+    assert not metrics["finite"].any()
     for i in range(2):
         actual, reference = (jax.tree.leaves(take_seed(x.agents, j)) for x, j in ((joint, i), (separate[i], 0)))
         for x, y in zip(actual, reference, strict=True):

@@ -6,7 +6,7 @@ import io
 import json
 import re
 import shutil
-import subprocess
+import signal
 import sys
 
 import jax
@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from disks import full_disk
 from pictures import read_frames
-from waiting import wait_for
 
 import crazysim
 from crazysim import ConfigError, Randomize
@@ -26,7 +25,7 @@ from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import DamagedFileError, DivergedError
 from crazysim.storage import write_figure
-from crazysim.train import apg, checkpoint, ppo
+from crazysim.train import checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
@@ -117,33 +116,36 @@ def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(uninterrupted_run,
     assert [p["iteration"] for p in read_curve(tmp_path)] == [0, 4]
 
 
-@pytest.mark.long("trains in a process of its own")
-def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
-    """Sent SIGTERM twice, as ``timeout`` does, it ends with the status of that signal and continues from there."""
-    small_options = [
-        "--worlds",
-        "8",
-        "--set",
-        "seconds=0.1",
-        "--config",
-        "n_steps=4",
-        "hidden=[8]",
-        "minibatches=1",
-        "iterations=1000000",
-    ]
-    options = ["--out", tmp_path, "--checkpoint-every", "0.01", *small_options]
-    command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert "hover by ppo" in process.stdout.readline()
-        wait_for(
-            lambda: (tmp_path / CHECKPOINT_FILE).exists() and checkpoint_arrays(tmp_path)["['learner'].iteration"] > 0
-        )
-        process.terminate()
-        process.terminate()
-        out = process.stdout.read()
-    assert process.returncode == 143
-    last_iteration = int(re.search(r"interrupted after iteration (\d+); wrote", out)[1])
-    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == last_iteration > 0
+def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path, monkeypatch, capsys):
+    """Sent SIGTERM twice, as ``timeout`` does, it ends with the status of that signal and continues from there.
+
+    The second signal arrives while the checkpoint is written.
+    """
+    save, seen = checkpoint.save, []
+
+    def save_in_spite_of_signal(*arguments):
+        if seen:
+            signal.raise_signal(signal.SIGTERM)
+        save(*arguments)
+
+    @contextlib.contextmanager
+    def bar(*_):
+        def terminate(*_):
+            seen.append(signal.getsignal(signal.SIGTERM))
+            signal.raise_signal(signal.SIGTERM)
+
+        yield terminate
+
+    monkeypatch.setattr(runs.checkpoint, "save", save_in_spite_of_signal)
+    monkeypatch.setattr(runs, "_iteration_bar", bar)
+    small_options = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
+    with pytest.raises(SystemExit) as end:
+        main(["train", "hover", "--worlds", "8", "--set", "seconds=0.4", "--out", str(tmp_path), "--no-film",
+              "--config", *small_options, "iterations=4"])  # fmt: skip
+    assert (end.value.code, len(seen)) == (143, 1)
+    assert "interrupted after iteration 1; wrote" in capsys.readouterr().out
+    assert checkpoint_arrays(tmp_path)["['learner'].iteration"] == 1
+    assert signal.getsignal(signal.SIGTERM) != seen[0], "the handler is removed"
 
 
 def test_a_later_policy_within_two_standard_errors_is_kept():
@@ -581,22 +583,6 @@ def test_ppo_finds_the_action_that_pays():
     assert not metrics["finite"]
     assert np.abs(action.mean(axis=(0, 1)) - 0.5).max() < 0.1
     assert float(jnp.exp(learner.agents.log_std).max()) < 0.3
-
-
-def test_analytic_gradients_follow_the_eight():
-    """Thirty updates with 32 worlds more than halve the distance from the trajectory."""
-    config = apg.Config(iterations=30)
-    env = make("track", 32, engine="plain", dynamics="so_rpy")
-    learner = jax.jit(apg.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
-    errors = []
-    for _ in range(config.iterations):
-        learner, metrics = apg.iterate(learner, env, (config,))
-        errors.append(float(metrics["error"][0]))
-        assert np.isfinite(float(metrics["gradient"][0]))
-        assert metrics["finite"]
-    assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
-    broken = learner.agents.replace(policy=jax.tree.map(lambda x: x + jnp.inf, learner.agents.policy))
-    assert not apg.iterate(learner.replace(agents=broken), env, (config,))[1]["finite"]
 
 
 SIGHT = """
