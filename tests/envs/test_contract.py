@@ -25,8 +25,8 @@ from crazysim.envs.state import EnvState
 from crazysim.envs.tasks.hover import Hover
 
 N_WORLDS = 4
-N_FLYING, N_STEPS = 32, 1250
-"""Worlds and environment steps of the random flight: 40,000 steps, and at least two episodes in each world."""
+N_FLYING, N_STEPS = 8, 1250
+"""Worlds and environment steps of the random flight: 10,000 steps, and at least two episodes in each world."""
 IS_ENDING = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 WITH_INDICES = ("race", "avoid", "deliver")
