@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import json
 import os
 import re
 import subprocess
@@ -170,7 +171,7 @@ def test_the_poles_are_where_drones_can_hit_them():
 
 
 PROGRAM_WITHOUT_PACKAGES = """
-import sys
+import contextlib, io, json, sys
 
 class Missing:
     def find_spec(self, name, path=None, target=None):
@@ -179,37 +180,38 @@ class Missing:
 
 sys.meta_path.insert(0, Missing())
 from crazysim.__main__ import main
-sys.exit(main(sys.argv[2:]))
+for command in sys.argv[2:]:
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+        status = main(command.split())
+    print(json.dumps([status, out.getvalue()]))
 """
-"""The command line of an installation without the packages of the first argument."""
+"""The command line of an installation without the packages of the first argument, which runs the other arguments."""
+COMMANDS_BY_EXTRA = {
+    "train hover --iterations 1 --out {0}": "train",
+    "evaluate {0}": "train",
+    "export {0} --c {0}/policy.h": "train",
+    "render {0}": "train",
+    "replay {0}/flight.npz": "web",
+    "live --browser --seconds 0.1 --port 0": "web",
+    "demo --worlds 1 --drones 1 --seconds 0.1 --out {0}": "demo",
+}
+"""The extra that a command lacks."""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        ("train hover --iterations 1 --out {0}", "train"),
-        ("evaluate {0}", "train"),
-        ("export {0} --c {0}/policy.h", "train"),
-        ("render {0}", "train"),
-        ("replay {0}/flight.npz", "web"),
-        ("live --browser --seconds 0.1 --port 0", "web"),
-        ("demo --worlds 1 --drones 1 --seconds 0.1 --out {0}", "demo"),
-    ],
-)
-def test_a_command_names_the_extra_that_it_lacks(arguments, extra, tmp_path):
-    if "replay" in arguments:
-        recorder = Recorder(Sim())
-        recorder.add()
-        recorder.flight().save(tmp_path / "flight.npz")
-    packages = ",".join({*EXTRAS, "trimesh"})
-    command = [sys.executable, "-c", PROGRAM_WITHOUT_PACKAGES, packages, *arguments.format(tmp_path).split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    text = done.stdout + done.stderr
-    assert f"pip install 'crazysim[{extra}]'" in text
-    assert "Traceback" not in text
-    assert done.returncode == (0 if extra == "demo" else 2), "the demo flies without plot and film"
-    assert "1 worlds" not in text
-    assert "1 drones" not in text
+def test_a_command_names_the_extra_that_it_lacks(tmp_path):
+    recorder = Recorder(Sim())
+    recorder.add()
+    recorder.flight().save(tmp_path / "flight.npz")
+    commands = [command.format(tmp_path) for command in COMMANDS_BY_EXTRA]
+    program = [sys.executable, "-c", PROGRAM_WITHOUT_PACKAGES, ",".join({*EXTRAS, "trimesh"}), *commands]
+    done = subprocess.run(program, capture_output=True, text=True, check=True)
+    for extra, line in zip(COMMANDS_BY_EXTRA.values(), done.stdout.splitlines(), strict=True):
+        status, text = json.loads(line)
+        assert f"pip install 'crazysim[{extra}]'" in text
+        assert status == (0 if extra == "demo" else 2), "the demo flies without plot and film"
+        assert "1 worlds" not in text
+        assert "1 drones" not in text
+    assert "Traceback" not in done.stderr
 
 
 def test_the_extras_of_the_table_bring_their_packages():
