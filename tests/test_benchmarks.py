@@ -66,10 +66,16 @@ SCRIPTS = [
     ("gradient.py --worlds 4 --controls rotor_vel --steps 3 --repeats 1", "steps_per_s", [{"control": "rotor_vel"}]),
 ]  # fmt: skip
 """Scripts with small settings, a positive number that each line has, and parts of the lines."""
+SLOW_SCRIPTS = {
+    "first_results": pytest.mark.slow("starts two processes; compile.py, too, is tested in a process of its own")
+}
 
 
 @pytest.mark.long("compiles the programs that it measures")
-@pytest.mark.parametrize(("command", "figure", "expected"), SCRIPTS, ids=[x[0].split(".")[0] for x in SCRIPTS])
+@pytest.mark.parametrize(
+    ("command", "figure", "expected"),
+    [pytest.param(*x, id=x[0].split(".")[0], marks=SLOW_SCRIPTS.get(x[0].split(".")[0], ())) for x in SCRIPTS],
+)
 def test_a_script_prints_lines_with_their_figure(run, tmp_path, command, figure, expected):
     lines = run(*command.format(tmp_path).split())
     assert [{name: line[name] for name in part} for line, part in zip(lines, expected, strict=True)] == expected

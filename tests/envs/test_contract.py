@@ -220,9 +220,7 @@ def test_law_07_the_gradient_of_the_reward_is_finite(flight):
 
 
 @pytest.mark.long("compiles a kernel for the host and for a GPU")
-@pytest.mark.parametrize(
-    "name", names_with_slow(("avoid", "race", "follow_car", "track"), "tests/gpu runs the kernels of all tasks")
-)
+@pytest.mark.parametrize("name", names_with_slow(("race", "follow_car"), "tests/gpu runs the kernels of all tasks"))
 def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(name):
     """JAX runs a compiled function on the device of its arguments, which may differ from that of the environment."""
     if cuda.nvrtc() is None:
