@@ -30,11 +30,6 @@ def test_without_a_command_the_program_lists_its_commands(capsys):
     assert all(f"\n    {name} " in out for name in COMMANDS)
 
 
-def test_python_m_crazysim_prints_its_help():
-    out = subprocess.run([sys.executable, "-m", "crazysim", "--help"], capture_output=True, text=True, check=True)
-    assert "demo" in out.stdout
-
-
 def test_a_closed_pipe_is_no_traceback():
     command = [sys.executable, "-m", "crazysim", "airframe", "check", "crazyflie"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
