@@ -438,6 +438,7 @@ CRAZYFLOW_CODE = textwrap.dedent("""
 """).replace("BOX", BOX.replace('type="box"', 'type="box" contype="0"'))  # XLA takes 3 s for a box against a box
 
 
+@pytest.mark.slow("tests/docs/test_pages.py runs this code on its pages, and law 5 counts the syncs")
 def test_code_of_crazyflows_documentation_runs(screen, opengl):
     """Boxes, a sync loop, grouped and interleaved calls in a window, and a compiled check of contacts."""
     display, _ = screen
