@@ -70,10 +70,11 @@ def reverse_mode(losses, x, directions):
 
 
 CASES = [
-    ("first_principles", "state", "plain", reverse_mode),
+    ("first_principles", "state", "stages", forward_mode),
     ("first_principles", "body_rate", "stages", forward_mode),
     ("first_principles", "rotor_vel", "stages", forward_mode),
     ("so_rpy_rotor_drag", "state", "stages", forward_mode),
+    ("so_rpy", "attitude", "plain", reverse_mode),
     ("first_principles", "attitude", "auto", reverse_mode),
 ]
 """Dynamics, command level, engine and mode. At state level, controllers of lower levels are differentiated too.
@@ -112,12 +113,12 @@ def test_gradient_equals_central_differences(dynamics, control, engine, mode, x6
     assert compared >= 5, "the loss hardly depends on its inputs: nothing was compared"
 
 
-@pytest.mark.long("compiles a kernel of contacts and of their derivative")
+@pytest.mark.long("compiles a kernel of contacts and of their gradient")
 def test_gradients_of_contacts_equal_central_differences(x64):
     """A tilted drone slides over the floor, another is put down on it, and a third one hits a wall, in float64.
 
-    The step, its derivative in one direction, and its gradient are one kernel each. Worlds are at the start, one step
-    ahead of it and one step behind it. Errors are as in the test above.
+    The step and its gradient are one kernel each. Worlds are at the start, one step ahead of it and one step behind it.
+    Errors are as in the test above.
     """
     sim = Sim(9, control="rotor_vel", plugins=[ContactResponse()])
     sim.scene.add("wall", pos=[0.2, 0.0, 0.0], length=2.0, height=1.0, thickness=0.1)
@@ -139,11 +140,15 @@ def test_gradients_of_contacts_equal_central_differences(x64):
         ends = states.pos @ jnp.array([1.0, -2.0, 3.0]) + states.vel @ jnp.ones(3) + states.ang_vel @ jnp.ones(3)
         return ends[:, 0], impulse[:, 0]
 
-    (values, impulse), (slopes, _) = jax.jit(functools.partial(forward_mode, end))(x, directions)
+    @jax.jit
+    def differentiate(x):
+        values, pullback, impulse = jax.vjp(end, x, has_aux=True)
+        (gradient,) = pullback(jnp.ones_like(values))
+        return values, impulse, sum(jnp.sum(gradient[name] * directions[name], (1, 2)) for name in x)
+
+    values, impulse, slopes = differentiate(x)
     assert np.all(impulse[:6, 2] > 0)
     assert np.all(impulse[6:, 0] > 0)
-    _, gradient_slopes = jax.jit(functools.partial(reverse_mode, lambda x: end(x)[0]))(x, directions)
-    np.testing.assert_allclose(np.ravel(gradient_slopes), slopes, rtol=1e-9)
     for k in (0, 3, 6):
         numeric = (values[k + 1] - values[k + 2]) / (2 * h)
         assert abs(numeric) > 0.1

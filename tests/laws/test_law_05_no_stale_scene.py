@@ -15,7 +15,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from crazysim import ConfigError, SlungLoad
 from crazysim.core import functional as F
-from crazysim.engine import Step
 from crazysim.scene import mjx_scene
 from crazysim.scene.sync import poses_of, sync_poses
 from crazysim.sim import Sim
@@ -298,11 +297,10 @@ def with_traced_height(data, height):
     return data.replace(states=data.states.replace(pos=data.states.pos.at[..., 2].set(height)))
 
 
-@pytest.mark.parametrize("engine", ["plain", "fused"])
-def test_a_pure_step_clears_the_flag(two_world_sim, engine):
+def test_a_pure_step_clears_the_flag(two_world_sim):
     """Functional code asks the flag of its data, which is False after every step, also inside jit."""
     data, _ = sync_sim2mjx(two_world_sim.data, two_world_sim.mjx_data, two_world_sim.mjx_model)
-    step = Step(two_world_sim.step_pipeline, engine)
+    step = two_world_sim.build_step_fn()
     for fn in (step, jax.jit(step)):
         assert not fn(data).core.mjx_synced
 

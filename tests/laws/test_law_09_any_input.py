@@ -372,7 +372,7 @@ def test_the_calls_work_with_right_arguments(label):
 
 
 @pytest.mark.parametrize("label", CALLS)
-@settings(max_examples=settings.default.max_examples // 3)
+@settings(max_examples=settings.default.max_examples // 6)
 @given(data=st.data())
 def test_any_argument_is_taken_or_refused_with_what_was_expected(label, data):
     call, arguments = CALLS[label]

@@ -279,7 +279,7 @@ def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change
             continue
         low, high = max(declared.range.low, -1.0), min(declared.range.high, 1.0)
         fill = 1 if declared.dtype else 0.5 * (low + high)
-        for shape in ((2, 1, 5, 7), (11,), (7, 5), (1, 1, 1)):
+        for shape in ((11,), (7, 5)):
             if (name in TABLES and len(shape) == 2) or (name in LISTS and len(shape) == 1):
                 continue
 

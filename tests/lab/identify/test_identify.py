@@ -10,6 +10,7 @@ import pytest
 
 from crazysim.__main__ import main
 from crazysim.drones import load_airframe
+from crazysim.dynamics import first_principles
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import (
     Columns,
@@ -22,7 +23,7 @@ from crazysim.lab.identify import (
     read_log,
 )
 from crazysim.lab.identify.readers import Stream, resample
-from crazysim.plugins.effects import Residual
+from crazysim.plugins.effects.residual import Residual, residual_inputs, residual_wrench
 from crazysim.rotation import to_rpy
 from crazysim.sim import Sim
 
@@ -464,7 +465,7 @@ def test_other_order_of_rotors_is_refused(flights):
         identify([read_log(other)])
 
 
-@pytest.mark.long("fits 15 flights with commands and five without")
+@pytest.mark.slow("fits 20 logs; test_random_fits.py has noisy and late rotor speeds, with commands and without")
 def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
     """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact.
 
@@ -494,13 +495,15 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
 @pytest.mark.parametrize(
     "n_hidden", [4, pytest.param(0, marks=pytest.mark.slow("with hidden units the linear terms are trained too"))]
 )
-def test_training_a_residual_lowers_the_errors_of_predictions(flights, result, n_hidden):
-    """Rotor speeds that are 5% too high in the log: the residual takes the thrust away."""
+def test_training_a_residual_finds_a_wrong_thrust(flights, result, n_hidden):
+    """Rotor speeds that are 5% too high in the log: the residual takes a tenth of the thrust away."""
     logs = [read_log(x | {f"rpm{k}": 1.05 * x[f"rpm{k}"] for k in range(1, 5)}) for x in flights[:3]]
-    initial_errors = prediction_errors(logs[:1], result.model)
-    steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
+    steps = {"iterations": 12, "batch_size": 4, "learning_rate": 3e-2}
     trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
-    assert prediction_errors(logs[:1], trained)["position"][-1] < 0.5 * initial_errors["position"][-1]
+    level, rest, p = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), result.model.params
+    inputs = residual_inputs(level, rest, rest, 1.05 * first_principles.hover_rotor_vel(p), p)
+    force, _ = residual_wrench(inputs, trained.residual)
+    np.testing.assert_allclose(force[2], -0.1 * 9.81 * p.mass[0], rtol=0.4)
 
 
 def test_results_are_plain_numbers(result):

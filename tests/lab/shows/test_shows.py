@@ -95,7 +95,7 @@ def open_coarse(self, model, *settings):
     original_init(self, model, *settings)
 
 SceneWindow.__init__ = open_coarse
-view.MAX_FPS = 10.0
+view.MAX_FPS = 5.0
 
 def close(sim, world):
     frames.append(sim.time)
@@ -127,7 +127,7 @@ def test_a_window_plays_the_show_from_its_start_until_it_is_closed(screen, tmp_p
         red = np.all(picture[..., :1] > picture[..., 1:] + 180, axis=-1).sum()
         blue = np.all(picture[..., 2:] > picture[..., :2] + 180, axis=-1).sum()
         seen += [name for name, n in (("red", red), ("blue", blue)) if n > 12 and name not in seen]
-        time.sleep(0.1)
+        time.sleep(0.2)
     out = program.communicate(timeout=300)[0]
     assert program.returncode == 0
     assert " 2.0 s, computed in" in out

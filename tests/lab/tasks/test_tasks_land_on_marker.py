@@ -89,7 +89,7 @@ def test_each_drone_sees_only_its_own_marker():
     centres = env.task.path_centres(2)
     pos = np.stack([centres[0] + [0.4, 0, 1.0], centres[0] + [0, 0.4, 1.0]])[None].astype(np.float32)
     level = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1.0]), data.states.quat.shape)
-    images = env.task.policy_camera().image_fn(env.sim)
+    images = jax.jit(env.task.policy_camera().image_fn(env.sim))
     seen = images(data.replace(states=data.states.replace(pos=jnp.asarray(pos), quat=level)))["segmentation"]
     assert np.asarray(seen).any(axis=(2, 3)).tolist() == [[True, False]]
 

@@ -46,12 +46,37 @@ AT_GOAL = {
 """Cases, each in its own world."""
 
 
+N_WORLDS = 64
+"""Number of worlds of the environment that tests share; cases are repeated."""
+
+
 def make_env(n_worlds, n_drones=1, **options):
     """Return an environment whose gate has an opening of 0.8 m."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
     task = Transport(opening=0.8, **options)
     task.install(sim)
     return DroneEnv(sim, task)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env(N_WORLDS, seconds=9.0)
+
+
+@pytest.fixture(scope="module")
+def start_state(env):
+    return jax.jit(env.reset)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def step(env):
+    return jax.jit(env.step)
+
+
+def in_all_worlds(cases):
+    """Return the columns of cases, repeated for all worlds. (N_WORLDS, ...) each"""
+    columns = (np.array(x, np.float32) for x in zip(*cases, strict=True))
+    return [np.resize(x, (N_WORLDS, *x.shape[1:])) for x in columns]
 
 
 def place_drones(state, drone, load, vel, goal=GOAL):
@@ -68,12 +93,11 @@ def place_drones(state, drone, load, vel, goal=GOAL):
 
 
 @pytest.fixture(scope="module")
-def case_worlds_and_state():
+def case_worlds_and_state(start_state, step):
     """Return the world of each case, and the state after a step."""
-    env = make_env(len(CASES))
-    place, load_offset, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
-    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + load_offset, vel)
-    return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
+    place, load_offset, vel = in_all_worlds(CASES.values())
+    before = place_drones(start_state, GATE + place, GATE + place + load_offset, vel)
+    return {name: k for k, name in enumerate(CASES)}, step(before, before.action)
 
 
 def test_touching_and_missing_the_gate_or_leaving_the_corridor_is_a_crash(case_worlds_and_state):
@@ -91,30 +115,27 @@ def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(case_world
     assert {name for name, k in world.items() if passed[k]} - in_plane == {"through", "behind"}
 
 
-def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_the_gate():
-    env = make_env(len(AT_GOAL))
-    offset, vel, x = (np.array(v, np.float32) for v in zip(*AT_GOAL.values(), strict=True))
+def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_the_gate(env, start_state, step):
+    n, (offset, vel, x) = len(AT_GOAL), in_all_worlds(AT_GOAL.values())
     goal = np.broadcast_to(GOAL, offset.shape) * [0, 1, 1] + x[:, None] * [1, 0, 0]
-    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
-    step, hold = jax.jit(env.step), round(env.task.hold * env.sim.freq)
-    waiting = np.array([[hold - 15]] * len(AT_GOAL), np.int32)
+    state = place_drones(start_state, goal + offset - DOWN, goal + offset, vel, goal)
+    hold = round(env.task.hold * env.sim.freq)
+    waiting = np.full((N_WORLDS, 1), hold - 15, np.int32)
     task_record = state.data.plugins["task"].replace(steps_at_goal=jnp.asarray(waiting))
     state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"task": task_record}))
     first = step(state, state.action)
     assert not first.info["delivered"].any()
-    np.testing.assert_array_equal(first.data.plugins["task"].steps_at_goal[:, 0], [hold - 5, 0, 0, 0])
+    np.testing.assert_array_equal(first.data.plugins["task"].steps_at_goal[:n, 0], [hold - 5, 0, 0, 0])
     second = step(first, state.action)
-    np.testing.assert_array_equal(np.asarray(env.succeeded(second))[:, 0], [True, False, False, False])
+    np.testing.assert_array_equal(np.asarray(env.succeeded(second))[:n, 0], [True, False, False, False])
     away = place_drones(second, GOAL + np.array([0.0, 0.5, LENGTH]), GOAL + np.array([0.0, 0.5, 0.0]), 0.0)
     assert step(away, state.action).info["delivered"][0, 0], "it stays delivered"
 
 
-def test_progress_is_rewarded_by_its_length_and_passing_the_gate_never_costs(rng):
+def test_progress_is_rewarded_by_its_length_and_passing_the_gate_never_costs(env, start_state, rng):
     """The remaining way decreases, or does not change, where the gate is passed."""
-    env = make_env(64)
-    state = jax.jit(env.reset)(jax.random.key(0))
-    corner = np.array([0.0, 0.35, 0.35])
-    crossing_points = GATE + rng.uniform(-corner, corner, (64, 3))
+    state, corner = start_state, np.array([0.0, 0.35, 0.35])
+    crossing_points = GATE + rng.uniform(-corner, corner, (N_WORLDS, 3))
     aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
     crossing_points[0] = aim
     remaining_ways, remaining_way = [], jax.jit(vmap_worlds(env.task.remaining_way))
@@ -181,8 +202,7 @@ class Pilot(PyTree):
         return self.gain * jnp.clip(jnp.concatenate(actions, axis=-1), -1, 1)
 
 
-def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_that_idles_does_not():
-    env = make_env(64, seconds=9.0)
+def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_that_idles_does_not(env):
     metrics, idle = (evaluate(env, Pilot(jnp.float32(gain))) for gain in (1.0, 0.0))
     assert metrics["success"] > 0.95
     assert metrics["crashed"] < 0.05
