@@ -92,7 +92,7 @@ DEPENDANTS = {
 
 
 def build(dependant, companions):
-    sim = Sim(n_worlds=2, control="attitude", integrator="symplectic_euler", engine="plain")
+    sim = Sim(n_worlds=2, control="attitude", integrator="symplectic_euler", engine="interpret")
     pos = sim.data.states.pos.at[..., 2].set(1.0)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     sim.build_default_data()

@@ -1,9 +1,10 @@
-"""Derivatives through filters, and through all sensors, filters and effects at once, against central differences."""
+"""Derivatives through all sensors and through filters, and through all sensors, filters and effects at once, against central differences."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweep import REQUIRED_BY, SENSORS
 
 from crazysim import Battery, Downwash, GroundEffect, Latency, RangeFinder, Sim, Wind
 from crazysim.engine.stage import as_stages
@@ -19,11 +20,15 @@ MIN_SLOPE, RELATIVE_STEP = 1e-9, 1e-5
 """Largest slope that is not compared, and step of the differences as a multiple of the directions."""
 
 
-def create_filters():
-    """Return a filter that controls the drones, another one that only estimates, and their sensors."""
-    imu, tracked = IMU(ERRORS, ERRORS), MotionCapture(1e-3, 1e-2, delay=0.004)
-    aids = [OpticalFlow(0.1), TimeOfFlight(resolution=None), UWB(ANCHORS[:2], 0.1, tdoa=True)]
-    return [imu, tracked, *aids, Kalman([imu, tracked]), ESKF([imu, *aids], control=False)]
+def create_sensors_and_filters():
+    """Return every sensor, a filter that controls the drones, and another one that only estimates.
+
+    The filters fuse one number, since each adds an update of all states to compile.
+    """
+    sensors = {name: make() for name, make in SENSORS.items()}
+    inputs = [sensors["imu"], sensors["time_of_flight"]]
+    filters = [Kalman(inputs), ESKF(inputs, control=False)]
+    return [*[make() for make in REQUIRED_BY.values()], *sensors.values(), *filters]
 
 
 def create_all_plugins():
@@ -67,11 +72,11 @@ def push_forward(stage):
     return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
 
-SLOW = pytest.mark.slow("compiles the derivative of every plugin; the case of the filters covers the method")
+SLOW = pytest.mark.slow("compiles the derivative of every plugin; the case of sensors and filters covers the method")
 
 
 @pytest.mark.long("compiles the derivative of each stage, in float64")
-@pytest.mark.parametrize("plugins", [create_filters, pytest.param(create_all_plugins, marks=SLOW)])
+@pytest.mark.parametrize("plugins", [create_sensors_and_filters, pytest.param(create_all_plugins, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
     """Derivatives of every float of the data by the states at the start, with the stages as they are written.
 

@@ -8,13 +8,14 @@ from cases import hover_rotor_state, with_states
 from jax import Array
 from sweep import RANGES
 
-from crazysim import IMU, Battery, ConfigError, Latency, MotionCapture, Randomize, RotorAerodynamics, Sim, Wind
+from crazysim import IMU, Battery, ConfigError, Latency, Randomize, RotorAerodynamics, Sim, Wind
 from crazysim.core.pipeline import append_fn
 from crazysim.core.plugin import Param, Plugin, param, state
 from crazysim.engine.stage import stage
 from crazysim.envs import AutoReset, make
 from crazysim.plugins.effects.battery import open_circuit_voltage
 from crazysim.plugins.estimators import ESKF
+from crazysim.plugins.sensors import TimeOfFlight
 
 
 def build(n_worlds=3, n_drones=2, engine="interpret", **settings):
@@ -339,8 +340,8 @@ def test_a_filter_assumes_nominal_numbers():
     """The variances of a filter do not depend on the noise that its sensors have."""
     covariances, accelerations = [], []
     for ranges in ({}, {"plugins.imu.accel.noise": (9.0, 9.0)}):
-        imu, camera = IMU.bmi088(), MotionCapture()
-        sim = fly([imu, camera, ESKF([imu, camera], control=False), Randomize(ranges)])
+        imu, ranger = IMU.bmi088(), TimeOfFlight()
+        sim = fly([imu, ranger, ESKF([imu, ranger], control=False), Randomize(ranges)])
         sim.step(5)
         covariances.append(np.asarray(sim.data.plugins["eskf"].estimate.cov))
         accelerations.append(np.asarray(sim.plugins.observations(sim.data)["imu.accel"]))

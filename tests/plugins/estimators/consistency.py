@@ -8,13 +8,13 @@ import numpy as np
 from crazysim import rotation
 
 
-def errors(sim, name):
+def errors(sim, name, drones=0):
     """Return a filter's errors of position (world frame), velocity and attitude (body frame). (n_worlds, 9)"""
     e, s = sim.data.plugins[name].estimate, sim.data.states
     vel = rotation.rotate_inverse(s.quat, s.vel) - e.vel
     att_error = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
     att_error = att_error[..., :3] * jnp.sign(att_error[..., 3:])
-    return np.asarray(jnp.concatenate([s.pos - e.pos, vel, att_error], axis=-1))[:, 0]
+    return np.asarray(jnp.concatenate([s.pos - e.pos, vel, att_error], axis=-1))[:, drones]
 
 
 def assert_chi_squared(values, k):
