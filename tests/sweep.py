@@ -61,13 +61,6 @@ from crazysim.trajectories import figure_eight
 ROUNDING = 1e-4
 """Tolerance after 100 steps in float32: some 1,000 roundings of 1e-7, since errors in the speeds of rotors and in
 angular velocities add up in attitudes and positions. Two engines of the CPU differ by 2e-5 at most."""
-LOAD_TOLERANCE = 1e-3
-"""Tolerance of flights with loads, as slack cables and friction enlarge roundings.
-
-Two engines of the CPU differ by 8e-5 with cables. Kernels of GPUs divide to 2 units in the last place; with exact
-division a hook agrees to 1e-4. The task ``deliver`` needs no more than other tasks: after 20 steps two engines of the
-CPU differ by 2e-6, and each from float64 by 4e-6.
-"""
 COMMAND_NOISE = {
     "state": [0.2, 0.2, 0.2, *[0.0] * 13],
     "attitude": [0.2, 0.2, 0.2, 0.0],

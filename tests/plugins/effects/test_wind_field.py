@@ -1,12 +1,9 @@
 """Wind fields: the air at drones and loads by hand, displacements, engines, gradients, and wrong input."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from cases import with_states
 
 from crazysim import Sim, SlungLoad, Wind, WindField
-from crazysim.engine.stage import as_stages
 from crazysim.plugins.effects import wind_field
 from crazysim.plugins.effects.grid import Grid
 
@@ -97,26 +94,3 @@ def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monke
         ends.append(sim.data)
     np.testing.assert_allclose(ends[0].states.vel, ends[1].states.vel, rtol=1e-5, atol=1e-6)  # float32
     assert np.abs(np.asarray(ends[0].plugins["wind_field"].air_vel)).min() > 0
-
-
-def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
-    sim = build(Grid(rng.normal(size=(6, 6, 6, 3)), (-1, -1, 0), 0.8), n_worlds=1, n_drones=1)
-    stages = as_stages(sim.step_pipeline)
-
-    def step(data, _):
-        for apply in stages:
-            data = apply(data)
-        return data, None
-
-    @jax.jit
-    @jax.value_and_grad
-    def end(pos):
-        data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-        data, _ = jax.lax.scan(step, data, length=20)
-        return jnp.sum(data.states.vel * np.array([1.0, 2.0, 3.0]))
-
-    start, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
-    result = np.asarray(end(start)[1])
-    central = [float(end(start + h * e)[0] - end(start - h * e)[0]) / (2 * h) for e in np.eye(3)]
-    assert np.abs(central).max() > 1e-3
-    np.testing.assert_allclose(result[0, 0], central, rtol=1e-5, atol=1e-9)
