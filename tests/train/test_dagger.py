@@ -122,9 +122,9 @@ def test_a_recipe_trains_its_teacher_first(recipe_with_teacher, tmp_path):
         4,
         {"seconds": 0.1},
     )
-    run("hover", folder, film=False, resume=True, config={"iterations": 2}, **settings)
+    run("hover", folder, film=False, resume=True, **settings)
     assert sum("by ppo" in line for line in lines) == 1
-    assert sum("by dagger" in line and "continues after iteration 1" in line for line in lines) == 1
+    assert any("nothing is left to train" in line for line in lines)
 
     with pytest.raises(ConfigError, match=r"run to resume in .*none, got none"):
         run("hover", tmp_path / "none", resume=True, **settings)
