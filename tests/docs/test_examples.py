@@ -108,6 +108,8 @@ CHECKS = {
 """Further checks of the values that ``main`` of an example returns."""
 
 
+SETTINGS = {"student": {"iterations": 40}}
+"""Arguments of ``main`` for quicker tests."""
 LONG_REASONS = {"student": "trains two policies", "waypoints": "trains a policy unless student has"}
 
 
@@ -142,7 +144,7 @@ def test_example_runs(path, capsys):
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    result = module.main()
+    result = module.main(**SETTINGS.get(path.stem, {}))
     if path.stem in CHECKS:
         CHECKS[path.stem](result)
     assert capsys.readouterr().out.strip(), "an example prints its result"
