@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import LEVELS, hover_command, shared_sim
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crazysim import ConfigError
@@ -211,7 +211,7 @@ def test_any_action_of_flat_data_is_a_right_result_or_an_error(edit):
     check_call("env advance", edit)
 
 
-@pytest.mark.long("compiles the functions that are drawn")
+@settings(max_examples=settings.default.max_examples // 3)  # each compiles a function
 @given(name=st.sampled_from(sorted(CALLS)), edit=st.sampled_from(sorted(EDITS)))
 def test_any_array_is_a_right_result_or_an_error(name, edit):
     check_call(name, edit)
