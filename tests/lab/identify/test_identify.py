@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crazysim import rotation
 from crazysim.__main__ import main
 from crazysim.drones import load_airframe
 from crazysim.dynamics import first_principles
@@ -24,7 +25,6 @@ from crazysim.lab.identify import (
 )
 from crazysim.lab.identify.readers import Stream, resample
 from crazysim.plugins.effects.residual import Residual, residual_inputs, residual_wrench
-from crazysim.rotation import to_rpy
 from crazysim.sim import Sim
 
 FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}
@@ -100,17 +100,22 @@ def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, r
         np.testing.assert_allclose(errors[f"{name} at constant body rates"], errors[name], rtol=1e-4)
 
 
-def test_of_one_prediction_the_mean_is_the_root_mean_square(flights, result):
+def test_the_errors_of_predictions_that_are_off_by_a_known_amount(flights, result, monkeypatch):
     """The root mean square of attitudes is computed from the chord 2 sin(a / 2) of an angle."""
-    log = read_log(flights[-1])
-    n = round(0.5 / log.dt) + 4  # one window, and one more sample at each end
-    fields = ("t", "pos", "quat", "vel", "ang_vel", "rotor_vel")
-    log = replace(log, **{key: getattr(log, key)[:n] for key in fields})
-    errors = prediction_errors([log], result.model)
-    for name in (key for key in errors if not key.endswith("(mean)")):
-        mean = errors[f"{name} (mean)"]
-        chord = np.degrees(2 * np.sin(np.radians(mean) / 2)) if "attitude" in name else mean
-        np.testing.assert_allclose(chord, errors[name], rtol=1e-6, err_msg=name)
+    shift, angle = jnp.array([0.0, 0.3, -0.4]), 0.6
+    turn = jnp.array([0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2)])
+
+    def predict(model, batch, dt, constant_rates=False):
+        return batch.pos + shift, rotation.multiply(batch.quat, jnp.broadcast_to(turn, batch.quat.shape))
+
+    monkeypatch.setattr("crazysim.lab.identify.prediction._predict_all", predict)
+    errors = prediction_errors([read_log(flights[-1])], result.model)
+    chord = 2 * np.sin(angle / 2)
+    expected = {"position": (0.5, 0.5), "attitude": (np.degrees(chord), np.degrees(angle))}
+    for name, (rmse, mean) in expected.items():
+        for kind in (name, f"{name} at constant body rates"):
+            np.testing.assert_allclose(errors[kind], rmse, rtol=1e-5)
+            np.testing.assert_allclose(errors[f"{kind} (mean)"], mean, rtol=1e-5)
 
 
 @pytest.mark.long("identifies and predicts as the command does")
@@ -345,7 +350,7 @@ def test_wrong_columns_are_refused(flights):
 
 def test_angles_are_read_in_place_of_quaternions(flights):
     log, angles = read_log(flights[0]), [f"angle{k}" for k in range(3)]
-    rpy = np.degrees(np.asarray(to_rpy(jnp.asarray(log.quat)), np.float64)) * [1, -1, 1]
+    rpy = np.degrees(np.asarray(rotation.to_rpy(jnp.asarray(log.quat)), np.float64)) * [1, -1, 1]
     table = {k: x for k, x in flights[0].items() if k[0] != "q"} | dict(zip(angles, rpy.T, strict=True))
     columns = Columns(rpy=("angle0", "-angle1", "angle2"), rad_per_angle=np.pi / 180)
     # float32 of the conversions.
