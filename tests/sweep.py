@@ -362,7 +362,7 @@ CASES |= {
     "eskf": make_builder(eskf, n_drones=1, control="state"),
     "complementary": make_builder(complementary, control="attitude"),
     "load": make_builder(
-        lambda: [SlungLoad(0.005, 0.3, cable=True, drag=0.01), RotorJet(), ContactResponse()],
+        lambda: [SlungLoad(0.005, 0.3, cable=True, drag=0.01), RotorJet(), ContactResponse(iterations=2)],
         control="attitude", prepare=add_ball,
     ),
     "shared": make_builder(lambda: [SharedLoad(0.005)], control="attitude", integrator="symplectic_euler"),
@@ -373,7 +373,8 @@ CASES |= {
         control="rotor_vel",
     ),
     "terrain": make_builder(
-        lambda: [Terrain(HILLS, (8.0, 8.0)), RangeFinder(drones=True), ContactLog()], control="attitude",
+        lambda: [Terrain(HILLS, (8.0, 8.0)), RangeFinder([(0, 1, 0), (0.5, 0, -1)], drones=True), ContactLog()],
+        control="attitude",
     ),
     "bodies": make_builder(
         lambda: [FreeBodies(3, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.11), (0.02, 0, 0.35), (1, 0, 2.0)])],

@@ -94,12 +94,12 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
         sim.add(plugin)
     pos = jnp.array([[[0.2, 0.1, 0.3], [0.25, 0.05, 0.9]]])
     sim.state_control(pos=np.asarray(pos) + 0.1)
-    start = {
+    start = {  # of one type, since others would compile the stages again
         "pos": pos,
-        "vel": jnp.full((1, 2, 3), 0.3),
+        "vel": jnp.full((1, 2, 3), 0.3, float),
         "quat": jnp.tile(jnp.array([0.1, -0.05, 0.2, 1.0]), (1, 2, 1)),
         "ang_vel": jnp.tile(jnp.array([0.4, -0.5, 0.6]), (1, 2, 1)),
-        "rotor_vel": jnp.full((1, 2, 4), 15_000.0),
+        "rotor_vel": jnp.full((1, 2, 4), 15_000.0, float),
     }
     rng = np.random.default_rng(1)
     sizes = {name: 100.0 if name == "rotor_vel" else 0.1 for name in start}
