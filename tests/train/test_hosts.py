@@ -104,7 +104,7 @@ train = training._train
 
 def train_in_turn(options, **settings):
     train(options, **settings)
-    print("ended", flush=True)
+    print("trained to the end", flush=True)
     options.resume, options.iterations, options.checkpoint_every = True, 100_000, 0.01
     try:
         train(options, **settings)
@@ -123,7 +123,7 @@ def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_pa
     """One process with all devices trains the same policy, and continues the training after a host was killed."""
     out, one_process_folder = tmp_path / "two", tmp_path / "one"
     first, second = start(tmp_path, training_arguments(out, "--iterations", "3"), program=("-c", HOST))
-    first.wait_for("ended")
+    first.wait_for("trained to the end")
     copytree(out, tmp_path / "ended")
     wait_for(lambda: iteration(out) > 3 or first.has_ended)
     second.signal(signal.SIGINT)
