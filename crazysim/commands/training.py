@@ -141,7 +141,7 @@ def train(options: argparse.Namespace) -> int | None:
     if options.task == "list":
         for name, entry in TASKS.items():
             text = (entry.task.__doc__ or "").splitlines()[0].replace("``", "")
-            n_drones = f" {entry.n_drones} drones by default." if entry.n_drones > 1 else ""
+            n_drones = f" {n} drones by default." if (n := entry.defaults["n_drones"]) > 1 else ""
             print(f"{name:{max(map(len, TASKS))}} {text}{n_drones}")
         return None
     if hosts.has_several_hosts(options):

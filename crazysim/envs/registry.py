@@ -37,10 +37,10 @@ class Entry:
     """Class of the task, or ``MODULE:NAME`` of a class that is imported at its first use."""
     id: str
     """Id in Gymnasium's registry; empty if it is not registered there."""
-    control: str = "attitude"
-    """Default command level."""
-    n_drones: int = 1
-    """Default number of drones."""
+    control: str | None = None
+    """Default command level; None for that of the class."""
+    n_drones: int | None = None
+    """Default number of drones; None for that of the class."""
 
     @property
     def task(self) -> type[Task]:
@@ -49,6 +49,11 @@ class Entry:
             return self.source
         module, _, name = self.source.partition(":")
         return getattr(importlib.import_module(module), name)
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Options of the simulation, by name, unless others are given."""
+        return {"control": self.control or self.task.control, "n_drones": self.n_drones or self.task.n_drones}
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -68,11 +73,11 @@ TASKS: dict[str, Entry] = {
     "deliver": Entry("crazysim.lab.tasks.deliver:Deliver", "crazysim/Deliver-v0"),
     "race": Entry("crazysim.envs.tasks.race:Race", "crazysim/Race-v0"),
     "multi_race": Entry("crazysim.envs.tasks.race:Race", "crazysim/MultiRace-v0", n_drones=2),
-    "race_by_camera": Entry("crazysim.envs.tasks.race_by_camera:RaceByCamera", "crazysim/RaceByCamera-v0", "body_rate"),
+    "race_by_camera": Entry("crazysim.envs.tasks.race_by_camera:RaceByCamera", "crazysim/RaceByCamera-v0"),
     "avoid": Entry("crazysim.envs.tasks.avoid:Avoid", "crazysim/Avoid-v0"),
     "forest": Entry("crazysim.envs.tasks.forest:Forest", "crazysim/Forest-v0"),
     "transport": Entry("crazysim.lab.tasks.transport:Transport", "crazysim/Transport-v0"),
-    "swarm": Entry("crazysim.envs.tasks.swarm:Swarm", "crazysim/Swarm-v0", n_drones=4),
+    "swarm": Entry("crazysim.envs.tasks.swarm:Swarm", "crazysim/Swarm-v0"),
 }
 """All registered tasks, by name. Those that show a feature are in the laboratory."""
 
@@ -133,8 +138,7 @@ def make(
                 f"task {name!r} has no option {option!r}{hint} It has {', '.join(entry.options)}; every task has "
                 f"{', '.join(make_options)}; the simulation has {', '.join(SIM_OPTIONS)}"
             )
-    settings = {"control": entry.control, "n_drones": entry.n_drones}
-    settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
+    settings = entry.defaults | {k: v for k, v in options.items() if k in SIM_OPTIONS}
     task_options = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
@@ -172,7 +176,7 @@ def make(
     return CameraImages(env, Camera(*depth_image), {"depth": "depth"})
 
 
-def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
+def register(name: str, task: type[Task], control: str | None = None, n_drones: int | None = None) -> str:
     """Register a custom task by name, for ``make``, training and Gymnasium, and return its Gymnasium id.
 
     Registering a name again, such as by executing a notebook cell again, replaces the class of the name.
@@ -180,8 +184,8 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
     Args:
         name: Name, such as ``"two_hoops"``: lower case letters, digits and underscores.
         task: Class of the task.
-        control: Default command level.
-        n_drones: Default number of drones.
+        control: Default command level; None for that of the class.
+        n_drones: Default number of drones; None for that of the class.
 
     Returns:
         Id in Gymnasium's registry, such as ``"crazysim/TwoHoops-v0"``, for ``gymnasium.make_vec``.
@@ -191,12 +195,11 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
         f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
         f"Use for example 'two_hoops'.",
     )
-    control = enum_member(Control, "control", control).value
     entry = Entry(
         _check_class(task),
         f"crazysim/{''.join(part.capitalize() for part in name.split('_'))}-v0",
-        control,
-        positive_integer("n_drones", n_drones),
+        control and enum_member(Control, "control", control).value,
+        n_drones if n_drones is None else positive_integer("n_drones", n_drones),
     )
     TASKS[name] = entry
     _register_with_gymnasium(name, entry)

@@ -48,6 +48,13 @@ class Task:
     """True for a task that needs all worlds at once. Its methods then receive the data of all worlds, with all batch
     axes, and one key per world. The phases of an environment step are then not fused."""
 
+    control: ClassVar[str] = "attitude"
+    """Default command level."""
+    n_drones: ClassVar[int] = 1
+    """Default number of drones."""
+    recipe: ClassVar[Mapping[str, Any]] = {}
+    """Hyperparameters with which ``crazysim train`` solves the task, such as ``{"discount": 0.99, "n_worlds": 4096}``;
+    the others have their defaults."""
     unit: ClassVar[str] = "m"
     """Unit of ``error``."""
     film_view: ClassVar[Mapping[str, Any] | None] = None

@@ -130,13 +130,21 @@ DEFAULT_RECIPES: dict[str, Recipe] = {
 
 
 def find_recipe(task: str, algorithm: str | None = None) -> Recipe:
-    """Return the recipe of a task for an algorithm.
+    """Return the recipe of a task for an algorithm: of a built-in task, or ``Task.recipe`` of another.
 
     Args:
-        task: Name of the task.
+        task: Name of the task, or reference of its class.
         algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for the algorithm of the task's recipe.
     """
-    recipe = RECIPES.get(task, DEFAULT_RECIPES["ppo"])
+    recipe = RECIPES.get(task)
+    if recipe is None:
+        own = entry_of(task, is_named=False).task.recipe
+        expect(isinstance(own, Mapping), f"recipe of task {task!r} as a dict of hyperparameters by name", own)
+        config = {name: value for name, value in own.items() if name not in ("algorithm", "n_worlds")}
+        default = DEFAULT_RECIPES[own.get("algorithm", "ppo")]
+        recipe = dataclasses.replace(
+            default, n_worlds=own.get("n_worlds", default.n_worlds), config=default.config | config
+        )
     return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(str(algorithm), Recipe(algorithm))
 
 

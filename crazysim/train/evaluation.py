@@ -140,7 +140,8 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
 
     Returns:
         ``success``: fraction of drones that succeed;
-        ``crashed``: fraction of worlds that terminated although not all of their drones had succeeded;
+        ``crashed``: fraction of drones that had not succeeded when their episode was terminated; the others were late,
+        or had too large an error at the end;
         ``nonfinite``: fraction of worlds that became non-finite;
         ``length``: mean length of an episode, s;
         ``error``: mean error of the worlds that did not crash, in ``task.unit``, over the last ``task.hold`` seconds,
@@ -183,8 +184,8 @@ def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dic
         if has_own_criterion
         else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
     )
-    crashed = is_over & ~np.all(succeeded, axis=-1)
-    error = error[:, ~crashed]
+    crashed = (is_over & ~np.all(succeeded, axis=-1))[:, None] & ~succeeded
+    error = error[:, ~np.any(crashed, axis=-1)]
     error = error[~np.isnan(error)]
     return {
         "success": float(succeeded.mean()),
@@ -204,7 +205,8 @@ def describe_outcome(metrics: Mapping[str, float], unit: str) -> str:
         metrics: Metrics, from ``evaluate``.
         unit: Unit of the error, ``task.unit``.
     """
-    crashed = f"crashed {metrics['crashed']:.1%}"
+    late = max(1 - metrics["success"] - metrics["crashed"], 0.0)
+    crashed = f"crashed {metrics['crashed']:.1%}, late or outside {late:.1%}"
     if metrics["nonfinite"]:
         crashed += f" (of all worlds {metrics['nonfinite']:.1%} became non-finite)"
     if not math.isnan(metrics["error"]):

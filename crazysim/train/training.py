@@ -153,7 +153,7 @@ def train_many(
     try:
         if not resume or n_done >= n_iterations:
             run.evaluate()
-        with _iteration_bar(n_iterations, n_done, progress) as show_progress:
+        with _iteration_bar(n_iterations, n_done, progress, run) as show_progress:
             for i in range(n_done + 1, n_iterations + 1):
                 run.iterate(i)
                 show_progress(run.metrics if i % 5 == 1 else {})
@@ -648,7 +648,7 @@ def _require_same_on_hosts(metadata: Mapping[str, dict[str, Any]], **other_setti
 
 
 @contextmanager
-def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[..., None]]:
+def _iteration_bar(total: int, n_done: int, enabled: bool, run: _Run) -> Iterator[Callable[..., None]]:
     bar = progress_bar(unit="iteration", total=total, initial=n_done, ncols=100) if enabled else None
     if bar is None:
         yield lambda *_: None
@@ -660,5 +660,8 @@ def _iteration_bar(total: int, n_done: int, enabled: bool) -> Iterator[Callable[
             shown.update({k: f"{np.median(metrics[k]):.3f}" for k in ("success", "error", "reward") if k in metrics})
             bar.set_postfix(shown, refresh=False)
             bar.update(iterations)
+            if bar.disable and not iterations:  # no terminal: a line at each evaluation
+                numbers = ", ".join(f"{name} {value}" for name, value in shown.items())
+                run.log(f"iteration {int(run.learner.iteration)} of {total}: {numbers}; {run.seconds:.0f} s")
 
         yield show

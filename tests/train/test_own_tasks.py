@@ -339,3 +339,30 @@ def test_law_09_wrong_places_names_and_settings_are_errors(file, tmp_path):
     with pytest.raises(ModuleNotFoundError, match="nothing_of_this_name"):
         envs.make(f"{tmp_path / 'broken.py'}:Any")
     assert not (tmp_path / "x").exists()
+
+
+RECIPE_SOURCE = """
+from crazysim.envs.tasks.hover import Hover
+
+class Pair(Hover):
+    name, control, n_drones = "pair", "body_rate", 2
+    recipe = {"discount": 0.9, "n_worlds": 64}
+"""
+
+
+def test_a_class_says_its_level_its_drones_and_its_recipe(tmp_path):
+    (tmp_path / "pair.py").write_text(RECIPE_SOURCE)
+    config = TrainConfig.create(f"{tmp_path / 'pair.py'}:Pair", config={"entropy": 0.01})
+    assert (config.n_worlds, config.config["discount"], config.config["entropy"]) == (64, 0.9, 0.01)
+    assert TrainConfig.create(config.task, config={"discount": 0.8}, n_worlds=8).config["discount"] == 0.8
+    sim = envs.make(config.task, 2).sim
+    assert (sim.control.value, sim.n_drones) == ("body_rate", 2)
+    (tmp_path / "pair.py").write_text(RECIPE_SOURCE.replace('"discount": 0.9', '"discont": 0.9'))
+    with pytest.raises(ConfigError, match="discont"):
+        TrainConfig.create(f"{tmp_path / 'pair.py'}:Pair")
+
+
+def test_a_training_without_terminal_prints_a_line_at_each_evaluation(file, tmp_path):
+    lines = []
+    train.run(f"{file}:High", tmp_path / "run", log=lines.append, options={"seconds": 0.4}, **QUIET | {"progress": True})
+    assert any(line.startswith("iteration 2 of 2: ") and "success 0." in line for line in lines)

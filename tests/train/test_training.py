@@ -495,7 +495,8 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     assert crashed["crashed"] == 1
     assert crashed["success"] == 0
     assert re.fullmatch(
-        r"crashed 100\.0%, on average after 0\.\d+ s, so there is no mean error", describe_outcome(crashed, "m")
+        r"crashed 100\.0%, late or outside 0\.0%, on average after 0\.\d+ s, so there is no mean error",
+        describe_outcome(crashed, "m"),
     )
     assert re.match(r"mean error 0\.\d+ m/s, ", describe_outcome(evaluate(easy, idle), "m/s"))
     lost = evaluate(easy, ConstantPolicy(jnp.full(4, jnp.nan)))

@@ -25,7 +25,6 @@ TASKS = {
     "dock": "Dock",
     "loop": "Loop",
 }
-OPTIONS = {"formation": {"n_drones": 2}, "loop": {"control": "body_rate"}}
 QUICK = ("push", "wall", "formation")
 """One with contacts of its own, one with objects and a sensor, and one with two drones; the others are slow tests."""
 
@@ -48,7 +47,7 @@ def anything(obs):
     ],
 )
 def test_a_hand_written_flight_succeeds_and_others_do_not(name):
-    env = envs.make(f"{FOLDER / name}.py:{TASKS[name]}", n_worlds=200, **OPTIONS.get(name, {}))
+    env = envs.make(f"{FOLDER / name}.py:{TASKS[name]}", n_worlds=200)
     assert env.task.tolerance <= 0.15
 
     assert train.evaluate(env, env.task.demonstrate)["success"] >= 0.99

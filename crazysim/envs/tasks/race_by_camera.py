@@ -36,6 +36,7 @@ class RaceByCamera(Race):
     """
 
     name = "race_by_camera"
+    control = "body_rate"
 
     speed: float = setting(default=1.5, positive=True)
     """Speed above which flying faster costs reward, m/s."""

@@ -50,6 +50,7 @@ class Swarm(Task):
     """
 
     name = "swarm"
+    n_drones = 4
 
     formation: Sequence[Sequence[float]] | None = None
     """Goals of the drones, in their order, m; None to change places. (n_drones, 3)"""

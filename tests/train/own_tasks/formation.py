@@ -9,9 +9,10 @@ from crazysim.envs import Task, draw, flying, state_of, terms
 
 
 class Formation(Task):
-    """Each drone keeps its slot beside a point that moves at up to 0.5 m/s; for two drones."""
+    """Each drone keeps its slot beside a point that moves at up to 0.5 m/s."""
 
     name = "formation"
+    n_drones = 2
 
     tolerance: float = 0.1
     seconds: float = 5.0

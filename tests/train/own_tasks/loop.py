@@ -8,9 +8,10 @@ from crazysim.envs import Task, draw, flying, state_of, terms
 
 
 class Loop(Task):
-    """Turn over once by the pitch axis, and hover within 15 cm of the start; for the command level body_rate."""
+    """Turn over once by the pitch axis, and hover within 15 cm of the start."""
 
     name = "loop"
+    control = "body_rate"
 
     tolerance: float = 0.15
     seconds: float = 5.0
