@@ -122,7 +122,7 @@ def replacements(draw):
 
 @settings(max_examples=settings().max_examples // 6)
 @given(drawn=replacements())
-@pytest.mark.long("compiles the steps of drawn plugins")
+@pytest.mark.long("traces the steps of drawn plugins")
 def test_plugins_follow_what_they_read(drawn):
     dependant, others, (first, *later) = drawn
     sim = build(dependant, [*others, first])

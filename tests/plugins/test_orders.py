@@ -129,7 +129,7 @@ def histories(draw):
 
 @settings(max_examples=EXAMPLES)
 @given(history=histories())
-@pytest.mark.long("compiles the steps of drawn plugins")
+@pytest.mark.long("traces the steps of drawn plugins")
 def test_objects_before_between_and_after_plugins_give_the_same_flight(history):
     sim, handles, positions, plugins = new_sim(), {}, {}, []
     for event, name in history:
@@ -455,7 +455,7 @@ def test_plugins_added_and_removed_in_any_order_give_the_same_simulation(names):
 
 @settings(max_examples=max(EXAMPLES // 2, 1))
 @given(names=st.lists(st.sampled_from(FLYING), min_size=4, max_size=8))
-@pytest.mark.long("compiles the steps of drawn plugins")
+@pytest.mark.long("traces the steps of drawn plugins")
 def test_plugins_added_and_removed_in_any_order_give_the_same_flight(names):
     sim = new_sim()
     try_orders(sim, names)

@@ -160,6 +160,7 @@ def test_a_reset_restores_the_records_of_its_worlds_only(sim_with_effects):
             np.testing.assert_array_equal(np.asarray(after)[~mask], np.asarray(before)[~mask])
 
 
+@pytest.mark.long("compiles the gradient of a step with all effects")
 def test_law_07_values_and_gradients_are_finite(sim_with_effects):
     """Drones on the floor, at one place, upside down, nose up and at rest, with saturated commands and a failure.
 

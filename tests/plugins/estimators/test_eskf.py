@@ -180,6 +180,7 @@ def all_errors(sim, name="eskf"):
     return error, np.asarray(error_state.covariance(estimate.cov), np.float64)[:, 0]
 
 
+@pytest.mark.long("compiles a filter that fuses twelve numbers")
 def test_the_errors_have_the_covariance_of_the_filter(indoor_sim):
     """NEES: 15 states, one degree of freedom each."""
     assert_chi_squared(normalised_square(*all_errors(indoor_sim)), 15)
