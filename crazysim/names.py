@@ -83,6 +83,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.sensors.triad": "Triad",
     },
     "crazysim.train": {
+        "crazysim.train.check": "check_task",
         "crazysim.train.config": "TrainConfig",
         "crazysim.train.dagger": "imitate",
         "crazysim.train.evaluation": "evaluate",

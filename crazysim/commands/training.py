@@ -57,6 +57,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     config_help = "hyperparameters of the algorithm, but not of a recipe's teacher"
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help=config_help)
     add("--no-film", action="store_true", help="write no film")
+    check_help = "fly the task without training and for ten iterations, say what is wrong with it, and write nothing"
+    add("--check", action="store_true", help=check_help)
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
     add("--worlds", type=number(), default=1000, help="number of initial states")
@@ -165,6 +167,12 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> None:
         "options": _parse_pairs(options.set) | specified_options(options, "device"),
         "config": _parse_pairs(options.config) | specified_options(options, "iterations", "teacher"),
     }
+    if options.check:
+        from crazysim.train.check import check_task
+
+        create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
+        check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
+        return
     if options.seeds is None and not options.sweep:
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
         return

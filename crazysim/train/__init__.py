@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
+    from crazysim.train.check import check_task as check_task
     from crazysim.train.config import TrainConfig
     from crazysim.train.dagger import imitate
     from crazysim.train.evaluation import evaluate
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Network",
     "TrainConfig",
+    "check_task",
     "evaluate",
     "film",
     "imitate",
