@@ -53,8 +53,9 @@ class Task:
     n_drones: ClassVar[int] = 1
     """Default number of drones."""
     recipe: ClassVar[Mapping[str, Any]] = {}
-    """Hyperparameters with which ``crazysim train`` solves the task, such as ``{"discount": 0.99, "n_worlds": 4096}``;
-    the others have their defaults."""
+    """Changes of the recipe with which ``crazysim train`` solves the task, such as ``{"discount": 0.99}``:
+    hyperparameters, ``n_worlds``, ``algorithm``, ``evaluate_every``, and options of the training alone as
+    ``"practice": {"radius": 0.6}``. A class that extends a built-in task begins with its recipe."""
     unit: ClassVar[str] = "m"
     """Unit of ``error``."""
     film_view: ClassVar[Mapping[str, Any] | None] = None

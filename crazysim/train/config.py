@@ -130,22 +130,31 @@ DEFAULT_RECIPES: dict[str, Recipe] = {
 
 
 def find_recipe(task: str, algorithm: str | None = None) -> Recipe:
-    """Return the recipe of a task for an algorithm: of a built-in task, or ``Task.recipe`` of another.
+    """Return the recipe of a task for an algorithm.
+
+    It is that of the built-in task, or of the one that the class of the task extends, with the changes of
+    ``Task.recipe``: hyperparameters, and fields of ``Recipe``.
 
     Args:
         task: Name of the task, or reference of its class.
         algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for the algorithm of the task's recipe.
     """
-    recipe = RECIPES.get(task)
-    if recipe is None:
-        own = entry_of(task, is_named=False).task.recipe
-        expect(isinstance(own, Mapping), f"recipe of task {task!r} as a dict of hyperparameters by name", own)
-        config = {name: value for name, value in own.items() if name not in ("algorithm", "n_worlds")}
-        default = DEFAULT_RECIPES[own.get("algorithm", "ppo")]
-        recipe = dataclasses.replace(
-            default, n_worlds=own.get("n_worlds", default.n_worlds), config=default.config | config
-        )
+    recipe = RECIPES.get(task) or _own_recipe(task)
     return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(str(algorithm), Recipe(algorithm))
+
+
+def _own_recipe(task: str) -> Recipe:
+    cls = entry_of(task, is_named=False).task
+    expect(isinstance(cls.recipe, Mapping), f"recipe of task {task!r} as a dict of values by name", cls.recipe)
+    names = {entry.source: name for name, entry in reversed(TASKS.items()) if name in RECIPES}
+    bases = (names.get(f"{base.__module__}:{base.__name__}") for base in cls.__mro__)
+    recipe = next((RECIPES[name] for name in bases if name is not None), DEFAULT_RECIPES["ppo"])
+    if (algorithm := cls.recipe.get("algorithm", recipe.algorithm)) != recipe.algorithm:
+        recipe = DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
+    fields = {f.name for f in dataclasses.fields(Recipe)} - {"config"}
+    config = recipe.config | {name: value for name, value in cls.recipe.items() if name not in fields}
+    given = {name: value for name, value in cls.recipe.items() if name in fields}
+    return dataclasses.replace(recipe, **given, config=config)
 
 
 ALTERABLE_HYPERPARAMETERS = ("iterations", *SWEEPABLE)
@@ -303,7 +312,7 @@ class TrainConfig:
 
     def practice_options(self) -> dict[str, Any]:
         """Return the options of the training environment that the recipe of the task adds."""
-        return dict(RECIPES.get(self.task, Recipe()).practice)
+        return dict(find_recipe(self.task).practice)
 
     def teacher_config(self) -> TrainConfig | None:
         """Return the configuration of the recipe's teacher; None if it has none, or if the run names a teacher."""

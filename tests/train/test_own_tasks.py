@@ -16,7 +16,7 @@ from crazysim.__main__ import main
 from crazysim.envs import TASKS, references, registry
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import UnknownNameError
-from crazysim.train.config import TrainConfig
+from crazysim.train.config import RECIPES, TrainConfig
 from crazysim.train.show import film
 from crazysim.train.training import load_policy
 
@@ -346,7 +346,7 @@ from crazysim.envs.tasks.hover import Hover
 
 class Pair(Hover):
     name, control, n_drones = "pair", "body_rate", 2
-    recipe = {"discount": 0.9, "n_worlds": 64}
+    recipe = {"discount": 0.9, "n_worlds": 64, "practice": {"reach": 0.5}}
 """
 
 
@@ -354,11 +354,16 @@ def test_a_class_says_its_level_its_drones_and_its_recipe(tmp_path):
     (tmp_path / "pair.py").write_text(RECIPE_SOURCE)
     config = TrainConfig.create(f"{tmp_path / 'pair.py'}:Pair", config={"entropy": 0.01})
     assert (config.n_worlds, config.config["discount"], config.config["entropy"]) == (64, 0.9, 0.01)
+    assert config.config["learning_rate"] == RECIPES["hover"].config["learning_rate"]  # of the task that it extends
+    assert (config.make_training_env().task.reach, config.make_env().task.reach) == (0.5, 1.0)
     assert TrainConfig.create(config.task, config={"discount": 0.8}, n_worlds=8).config["discount"] == 0.8
     sim = envs.make(config.task, 2).sim
     assert (sim.control.value, sim.n_drones) == ("body_rate", 2)
     (tmp_path / "pair.py").write_text(RECIPE_SOURCE.replace('"discount": 0.9', '"discont": 0.9'))
     with pytest.raises(ConfigError, match="discont"):
+        TrainConfig.create(f"{tmp_path / 'pair.py'}:Pair")
+    (tmp_path / "pair.py").write_text(RECIPE_SOURCE.replace('"discount"', '"algorithm": "pppo", "discount"'))
+    with pytest.raises(UnknownNameError, match="an algorithm of ppo, apg, dagger, got 'pppo'"):
         TrainConfig.create(f"{tmp_path / 'pair.py'}:Pair")
 
 
