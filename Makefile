@@ -13,7 +13,7 @@ PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile --junitxml=out/tests/$@$
 tests_of = $(patsubst %,tests/$(1)/test_%.py,$(2))
 TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(patsubst %,tests/test_%.py,eager machine package rotation startup storage utils) \
-  $(call tests_of,control,allocation attitude flat_state flatness setpoint state) \
+  $(call tests_of,control,allocation attitude flatness setpoint state) \
   $(call tests_of,docs,first_pages imports site) \
   $(call tests_of,engine,gradient_kernels interpret ir jaxcompat passes plan pytree record rules) \
   $(call tests_of,engine,simplify step symbolic) \

@@ -8,10 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.setpoint import Setpoint
-from crazysim.dynamics.models import GRAVITY
-from crazysim.engine.pytree import PyTree, leaf
-from crazysim.rotation import cross, dot, matvec
+from crazysim.rotation import cross, dot
 
 MIN_HEADING_SINE = 0.05
 """Sine of the angle between thrust and heading below which the body rate about z is limited.
@@ -33,50 +30,6 @@ class Attitude(NamedTuple):
     """Angular velocity, body frame, rad/s. (..., 3)"""
     ang_acc: Array
     """Angular acceleration, body frame, rad/s^2. (..., 3)"""
-
-
-class FlatState(PyTree):
-    """Attitude, angular velocity, angular acceleration and wrench of a drone that tracks a setpoint exactly."""
-
-    quat: Array = leaf("drone", 1)
-    """Attitude, body to world, unit, xyzw. (..., 4)"""
-    ang_vel: Array = leaf("drone", 1)
-    """Angular velocity, body frame, rad/s. (..., 3)"""
-    ang_acc: Array = leaf("drone", 1)
-    """Angular acceleration, body frame, rad/s^2. (..., 3)"""
-    thrust: Array = leaf("drone", 1)
-    """Collective thrust, N. (..., 1)"""
-    torque: Array = leaf("drone", 1)
-    """Torque, body frame, N m. (..., 3)"""
-
-
-def flat_state(
-    setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = GRAVITY
-) -> FlatState:
-    """Return attitude, its derivatives and wrench of a drone without drag that tracks a setpoint exactly.
-
-    Position and yaw are flat outputs of a multirotor: together with their derivatives they determine its state and its
-    inputs (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque
-    follows from Euler's equation, ``J w' + w x J w``. ``attitude_of_thrust`` explains what happens if a setpoint does
-    not determine an attitude.
-
-    Args:
-        setpoint: Position and yaw, with their derivatives.
-        mass: Mass, kg. () or (..., 1)
-        inertia: Inertia about the centre of mass, body frame, kg m^2. (3, 3) or (..., 3, 3)
-        gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
-    """
-    specific_thrust = setpoint.acc - jnp.asarray(gravity_vec, setpoint.acc.dtype)
-    s = setpoint
-    attitude = attitude_of_thrust(specific_thrust, s.jerk, s.snap, s.yaw, s.yaw_rate, s.yaw_acc)
-    axes = (attitude.matrix[..., 0], attitude.matrix[..., 1], attitude.matrix[..., 2])
-    return FlatState(
-        quat=rotation.quat_from_axes(*axes),
-        ang_vel=attitude.ang_vel,
-        ang_acc=attitude.ang_acc,
-        thrust=mass * rotation.safe_norm(specific_thrust),
-        torque=matvec(inertia, attitude.ang_acc) + cross(attitude.ang_vel, matvec(inertia, attitude.ang_vel)),
-    )
 
 
 def attitude_of_thrust(
