@@ -11,7 +11,7 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 1171,
-    "control": 1763,
+    "control": 1748,
     "core": 1577,
     "crazysim": 836,
     "drones": 514,
