@@ -155,7 +155,7 @@ def train(options: argparse.Namespace) -> int | None:
         signal.signal(signal.SIGTERM, old_handler)
 
 
-def _train(options: argparse.Namespace, devices: str | None = None) -> None:
+def _train(options: argparse.Namespace, devices: str | None = None) -> int | None:
     from crazysim.train.runs import run, run_many
 
     settings: dict[str, Any] = {
@@ -171,14 +171,15 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> None:
         from crazysim.train.check import check_task
 
         create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
-        check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
-        return
+        findings = check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
+        return int(bool(findings))
     if options.seeds is None and not options.sweep:
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
-        return
+        return None
     require(options.seeds is None or options.seed is None, "expected --seed or --seeds, got both. Use --seeds alone.")
     seeds = options.seeds or [options.seed or 0]
     run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
+    return None
 
 
 def _exit(*_: object) -> NoReturn:

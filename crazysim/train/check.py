@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.envs.env import Env
 from crazysim.envs.state import Obs
 from crazysim.envs.task import Task
+from crazysim.errors import ConfigError, expect
 from crazysim.train.config import TrainConfig
-from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate
+from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate, held_out_key
 from crazysim.train.runs import run
 from crazysim.train.show import read_curve
 
@@ -47,27 +49,42 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
     }
     if demonstrate := getattr(env.task, "demonstrate", None):
         flights[DEMONSTRATION] = demonstrate
+        _check_demonstration(env, demonstrate)
     metrics = {name: evaluate(env, policy) for name, policy in flights.items()}
     for name, flown in metrics.items():
         terms = ", ".join(f"{term} {x:.3g}" for term, x in _terms(flown).items())
         outcome = describe_outcome(flown, env.task.unit)
         log(f"{name}: success {flown['success']:.1%}, {outcome}; return {flown['reward']:.3g} ({terms})")
-    findings = check_flights(metrics)
+    if demonstrate is None:
+        log("define demonstrate(obs) in the class, observations to actions, to see whether success can be reached")
+    findings = check_flights(metrics, env.task)
     with tempfile.TemporaryDirectory() as folder:
         settings["config"] = dict(settings.get("config") or {}) | {"iterations": ITERATIONS}
         run(task, Path(folder) / "run", film=False, log=lambda _: None, progress=False, **settings)
         before, *_, after = read_curve(Path(folder) / "run")
-    log(
-        f"{ITERATIONS} iterations: return {before['reward']:.3g} -> {after['reward']:.3g}, error {before['error']:.3g} "
-        f"-> {after['error']:.3g} {env.task.unit}, success {before['success']:.1%} -> {after['success']:.1%}"
-    )
-    if after["reward"] > before["reward"] and after["error"] > before["error"]:
-        findings.append("The return rises, but so does the error: compute the reward from error(data).")
+    log(f"after {ITERATIONS} iterations, the return has changed from {before['reward']:.3g} to {after['reward']:.3g}")
+    if after["reward"] > before["reward"] and after["error"] > 1.5 * before["error"]:
+        findings.append(
+            f"The return rises, but the error does, too, from {before['error']:.3g} to {after['error']:.3g} "
+            f"{env.task.unit}: compute the reward from error(data)."
+        )
     for finding in findings:
         log(f"- {finding}")
     if not findings:
         log("nothing was found")
     return findings
+
+
+def _check_demonstration(env: Env, demonstrate: Callable[[Obs], Array]) -> None:
+    shape = (N_WORLDS, env.sim.n_drones, env.actions.size)
+    try:
+        action = jax.eval_shape(demonstrate, jax.eval_shape(env.reset, held_out_key()).obs)
+    except Exception as error:
+        raise ConfigError(
+            f"expected {type(env.task).__name__}.demonstrate(obs) as a function from observations to actions {shape}, "
+            f"got {type(error).__name__}: {str(error)[:300]}. Make it a @staticmethod, or use demonstrate(self, obs)."
+        ) from error
+    expect(getattr(action, "shape", None) == shape, f"actions {shape} of demonstrate(obs)", action)
 
 
 def _noise(obs: Obs, n_actions: int) -> Array:
@@ -80,7 +97,7 @@ def _terms(flown: Mapping[str, float]) -> dict[str, float]:
     return {name.removeprefix(TERM_PREFIX): x for name, x in flown.items() if name.startswith(TERM_PREFIX)}
 
 
-def check_flights(metrics: Metrics) -> list[str]:
+def check_flights(metrics: Metrics, task: Task) -> list[str]:
     """Return what the metrics of the flights without training say about a task, a sentence with its remedy each."""
     hovering, crashing, by_hand = metrics[HOVER], metrics[RANDOM], metrics.get(DEMONSTRATION)
     findings = [
@@ -93,26 +110,31 @@ def check_flights(metrics: Metrics) -> list[str]:
             f"Hovering succeeds from {hovering['success']:.0%} of the starts: start farther away, or use a smaller "
             f"tolerance."
         )
-    if not any(flown["success"] for flown in metrics.values()):
-        findings.append(
-            "Success was never seen, so chance may not find it: reward progress towards it, use a larger tolerance or "
-            "nearer starts, and define demonstrate(obs) in the class to see that it can be reached."
-        )
-    if by_hand is not None and 0 < by_hand["success"] < 0.9:
-        findings.append(
-            f"The demonstration succeeds from {by_hand['success']:.0%} of the starts: seconds may be too short, or "
-            f"terminated(data) too strict."
-        )
-    if by_hand is not None and by_hand["success"] > hovering["success"] and by_hand["reward"] <= hovering["reward"]:
-        findings.append(
-            f"Hovering returns {hovering['reward']:.3g}, and the demonstration, which succeeds, "
-            f"{by_hand['reward']:.3g}: the sum of the terms does not grow towards the goal."
-        )
+    if by_hand is not None and by_hand["success"] < 0.9:
+        findings.append(f"The demonstration succeeds from {by_hand['success']:.0%} of the starts: " + (
+            f"it is terminated after {by_hand['length']:.2g} s on average. If that is the goal, define "
+            f"succeeded(data); "
+            f"else terminated(data) is too strict, or spawn starts there."
+            if by_hand["crashed"] > 0.5
+            else f"at the end its error is {by_hand['error']:.2g} {task.unit} on average, and must be below "
+            f"{task.tolerance:g} for the last {task.hold:g} s of {task.seconds:g} s, unless succeeded(data) says "
+            f"otherwise. seconds may be too short."
+        ))  # fmt: skip
+    elif by_hand is not None:
+        gains = {term: x - _terms(hovering)[term] for term, x in _terms(by_hand).items()}
+        lost = min(gains, key=gains.__getitem__)
+        if by_hand["reward"] <= hovering["reward"] or -gains[lost] > 0.3 * sum(x for x in gains.values() if x > 0):
+            findings.append(
+                f"The demonstration succeeds, but loses {-gains[lost]:.3g} by the term {lost!r} against hovering: "
+                f"is its sign right, and is it small enough?"
+            )
     if crashing["crashed"] > 0.5 > hovering["crashed"] and crashing["reward"] > hovering["reward"]:
+        terms, others = _terms(crashing), _terms(hovering)
+        term = max(terms, key=lambda name: terms[name] - others[name])
         findings.append(
-            f"Living costs more than failing: hovering for {hovering['length']:.1f} s returns "
-            f"{hovering['reward']:.3g}, and crashing after {crashing['length']:.1f} s {crashing['reward']:.3g}. Use a "
-            f"larger cost of failure, or smaller costs of each step."
+            f"Crashing after {crashing['length']:.1f} s returns {crashing['reward']:.3g}, and hovering for "
+            f"{hovering['length']:.1f} s {hovering['reward']:.3g}, mostly by the term {term!r} ({terms[term]:.3g} and "
+            f"{others[term]:.3g}): a policy learns to crash. Is the term's sign right, and does failing cost enough?"
         )
     for name in _terms(hovering):
         rates = [_terms(flown)[name] / flown["length"] for flown in metrics.values()]

@@ -3,6 +3,7 @@
 import pytest
 
 from crazysim.__main__ import main
+from crazysim.envs import TASKS
 from crazysim.train import check
 
 GOOD = {
@@ -15,10 +16,12 @@ CASES = {
     "nothing": ({}, ""),
     "NaN": ({check.RANDOM: {"nonfinite": 0.5}}, "became non-finite"),
     "the start is a success": ({check.HOVER: {"success": 0.9}}, "Hovering succeeds from 90%"),
-    "no success": ({check.DEMONSTRATION: {"success": 0.0}}, "Success was never seen"),
-    "too short": ({check.DEMONSTRATION: {"success": 0.5}}, "seconds may be too short"),
-    "living costs": ({check.HOVER: {"reward": -20.0}}, "Living costs more than failing"),
-    "no slope": ({check.DEMONSTRATION: {"reward": 0.5}}, "does not grow towards the goal"),
+    "too short": ({check.DEMONSTRATION: {"success": 0.0, "error": 0.3}}, "below 0.05 for the last 1 s of 5 s"),
+    "ends at the goal": ({check.DEMONSTRATION: {"success": 0.0, "crashed": 1.0}}, "define succeeded(data)"),
+    "living costs": ({check.HOVER: {"reward": -20.0, "reward near": -20.0}}, "mostly by the term 'near' (1 and -20)"),
+    "no slope": ({check.DEMONSTRATION: {"reward": 0.5, "reward near": 0.5}}, "loses 0.5 by the term 'near'"),
+    "sign": ({check.DEMONSTRATION: {"reward turn": -14.0}, check.HOVER: {"reward turn": 0.0},
+        check.RANDOM: {"reward turn": 0.0}}, "loses 14 by the term 'turn'"),
     "constant": (
         {name: {"reward alive": 0.1 * length} for name, length in LENGTHS.items()}, "'alive' is 0.1 a second",
     ),
@@ -32,7 +35,7 @@ def test_flights_tell_what_is_wrong(case):
         name: {"length": LENGTHS[name], "nonfinite": 0.0} | flown | changes.get(name, {})
         for name, flown in GOOD.items()
     }
-    findings = check.check_flights(metrics)
+    findings = check.check_flights(metrics, TASKS["hover"].task())
     assert len(findings) == bool(finding)
     assert finding in "".join(findings)
 
@@ -40,9 +43,31 @@ def test_flights_tell_what_is_wrong(case):
 def test_the_command_checks_a_task_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(check, "N_WORLDS", 8)
+    status = 0  # nothing was found
     small = "n_steps=8 epochs=1 minibatches=1 hidden=[8]"
-    assert main(["train", "hover", "--check", "--worlds", "4", "--set", "seconds=0.4", "--config", *small.split()]) == 0
+    assert (
+        main(["train", "hover", "--check", "--worlds", "4", "--set", "seconds=0.4", "--config", *small.split()])
+        == status
+    )
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines[:3]] == [check.HOVER, check.RANDOM, "10 iterations"]
-    assert lines[3].startswith("- Success was never seen")
+    assert [line.split(":")[0] for line in lines[:2]] == [check.HOVER, check.RANDOM]
+    assert lines[2].startswith("define demonstrate(obs)")
+    assert lines[3].startswith("after 10 iterations")
     assert not list(tmp_path.iterdir())
+
+
+BROKEN = """
+from crazysim.envs.tasks.hover import Hover
+
+class Broken(Hover):
+    name = "broken"
+
+    def demonstrate(obs):
+        return obs["speed"]
+"""
+
+
+def test_a_demonstration_that_fails_is_named(tmp_path, capsys):
+    (tmp_path / "broken.py").write_text(BROKEN)
+    assert main(["train", f"{tmp_path / 'broken.py'}:Broken", "--check"]) == 2
+    assert "Broken.demonstrate(obs) as a function" in capsys.readouterr().err
