@@ -92,7 +92,7 @@ def test_the_rotation_error_is_twice_the_sine_of_the_angle():
 
 @pytest.mark.parametrize("controller", [PID(), Mellinger()], ids=["pid", "mellinger"])
 def test_an_airframe_without_gains_is_refused(controller):
-    with pytest.raises(ConfigError, match=rf"bumblebee.*{controller.name}.*airframes\.md"):
+    with pytest.raises(ConfigError, match=rf"bumblebee.*{controller.name}.*airframe-keys\.md"):
         controller.params(load_airframe("bumblebee"))
 
 

@@ -32,7 +32,9 @@ def command_folders(code):
         options = parser.parse_args(arguments)
         if options.command != "train":
             yield None, False, options.policy if options.command == "live" else options.folder
-        elif options.task != "list" and not options.host_id:  # all hosts take part in the run of the first
+        elif (
+            options.task != "list" and not options.host_id and not options.check
+        ):  # all hosts take part in the run of the first
             yield options.out or default_folder(options.task), options.resume, options.teacher
 
 

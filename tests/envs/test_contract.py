@@ -89,7 +89,11 @@ def first_worlds(state, n=N_WORLDS):
 def test_gymnasium_makes_every_task(name):
     env = gymnasium.make_vec(TASKS[name].id, num_envs=2)
     assert isinstance(env.unwrapped, DroneVectorEnv)
-    assert (env.spec.id, env.num_envs, env.unwrapped.sim.n_drones) == (TASKS[name].id, 2, TASKS[name].n_drones)
+    assert (env.spec.id, env.num_envs, env.unwrapped.sim.n_drones) == (
+        TASKS[name].id,
+        2,
+        TASKS[name].defaults["n_drones"],
+    )
     assert env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
     assert env.observation_space == batch_space(env.single_observation_space, 2)
     assert env.action_space == batch_space(env.single_action_space, 2)
