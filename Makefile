@@ -9,7 +9,7 @@ WORKERS ?= auto
 RUN = $(VENV)/bin/python
 # One worker runs all tests of a file, which share simulations. The durations of all tests are kept in out/tests/.
 PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile --junitxml=out/tests/$@$(VENV:.venv%=%).xml
-# What `make test` runs, about eight minutes on two cores; TESTS=tests/control for another part.
+# What `make test` runs, about five minutes on two quiet cores; TESTS=tests/control for another part.
 tests_of = $(patsubst %,tests/$(1)/test_%.py,$(2))
 TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(patsubst %,tests/test_%.py,eager machine package rotation startup storage utils) \
