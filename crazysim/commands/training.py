@@ -191,7 +191,7 @@ def evaluate(options: argparse.Namespace) -> None:
     """Evaluate a policy, and print and plot the results."""
     import jax
 
-    from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate
+    from crazysim.train.evaluation import describe_flight, evaluate
     from crazysim.train.show import plot_episode
 
     if options.plot is not None:
@@ -199,11 +199,7 @@ def evaluate(options: argparse.Namespace) -> None:
     policy, config, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)
     key = None if options.seed is None else jax.random.key(options.seed)
     metrics = evaluate(env, policy, key)
-    terms = ", ".join(f"{k.removeprefix(TERM_PREFIX)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM_PREFIX))
-    print(
-        f"{config.title}, {options.worlds:,} starts: success {metrics['success']:.1%}, "
-        f"{describe_outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"
-    )
+    print(f"{config.title}, {options.worlds:,} starts: {describe_flight(metrics, env.task.unit)}")
     if options.plot is not None:
         plot_episode(env, policy, options.plot, key)
         print(f"wrote {options.plot}")

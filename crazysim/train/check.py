@@ -16,7 +16,7 @@ from crazysim.envs.state import Obs
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, expect
 from crazysim.train.config import TrainConfig
-from crazysim.train.evaluation import TERM_PREFIX, describe_outcome, evaluate, held_out_key
+from crazysim.train.evaluation import describe_flight, evaluate, held_out_key, terms_of
 from crazysim.train.runs import run
 from crazysim.train.show import read_curve
 
@@ -42,19 +42,16 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
     """
     config = TrainConfig.create(task, **settings)
     env = config.make_env(N_WORLDS)
-    n_actions = env.actions.size
     flights: dict[str, Callable[[Obs], Array]] = {
-        HOVER: lambda obs: 0.0 * _noise(obs, n_actions),
-        RANDOM: lambda obs: _noise(obs, n_actions),
+        HOVER: lambda obs: 0.0 * _noise(obs, env.actions.size),
+        RANDOM: lambda obs: _noise(obs, env.actions.size),
     }
     if demonstrate := getattr(env.task, "demonstrate", None):
         flights[DEMONSTRATION] = demonstrate
         _check_demonstration(env, demonstrate)
     metrics = {name: evaluate(env, policy) for name, policy in flights.items()}
     for name, flown in metrics.items():
-        terms = ", ".join(f"{term} {x:.3g}" for term, x in _terms(flown).items())
-        outcome = describe_outcome(flown, env.task.unit)
-        log(f"{name}: success {flown['success']:.1%}, {outcome}; return {flown['reward']:.3g} ({terms})")
+        log(f"{name}: {describe_flight(flown, env.task.unit)}")
     if demonstrate is None:
         log("define demonstrate(obs) in the class, observations to actions, to see whether success can be reached")
     findings = check_flights(metrics, env.task)
@@ -93,10 +90,6 @@ def _noise(obs: Obs, n_actions: int) -> Array:
     return 2 * ((digits * jnp.arange(1.0, 2.0 * n_actions, 2.0)) % 1.0) - 1
 
 
-def _terms(flown: Mapping[str, float]) -> dict[str, float]:
-    return {name.removeprefix(TERM_PREFIX): x for name, x in flown.items() if name.startswith(TERM_PREFIX)}
-
-
 def check_flights(metrics: Metrics, task: Task) -> list[str]:
     """Return what the metrics of the flights without training say about a task, a sentence with its remedy each."""
     hovering, crashing, by_hand = metrics[HOVER], metrics[RANDOM], metrics.get(DEMONSTRATION)
@@ -113,15 +106,15 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
     if by_hand is not None and by_hand["success"] < 0.9:
         findings.append(f"The demonstration succeeds from {by_hand['success']:.0%} of the starts: " + (
             f"it is terminated after {by_hand['length']:.2g} s on average. If that is the goal, define "
-            f"succeeded(data); "
-            f"else terminated(data) is too strict, or spawn starts there."
+            f"succeeded(data); else "
+            f"terminated(data) is too strict, or spawn starts there."
             if by_hand["crashed"] > 0.5
             else f"at the end its error is {by_hand['error']:.2g} {task.unit} on average, and must be below "
             f"{task.tolerance:g} for the last {task.hold:g} s of {task.seconds:g} s, unless succeeded(data) says "
             f"otherwise. seconds may be too short."
         ))  # fmt: skip
     elif by_hand is not None:
-        gains = {term: x - _terms(hovering)[term] for term, x in _terms(by_hand).items()}
+        gains = {term: x - terms_of(hovering)[term] for term, x in terms_of(by_hand).items()}
         lost = min(gains, key=gains.__getitem__)
         if by_hand["reward"] <= hovering["reward"] or -gains[lost] > 0.3 * sum(x for x in gains.values() if x > 0):
             findings.append(
@@ -129,15 +122,15 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
                 f"is its sign right, and is it small enough?"
             )
     if crashing["crashed"] > 0.5 > hovering["crashed"] and crashing["reward"] > hovering["reward"]:
-        terms, others = _terms(crashing), _terms(hovering)
+        terms, others = terms_of(crashing), terms_of(hovering)
         term = max(terms, key=lambda name: terms[name] - others[name])
         findings.append(
             f"Crashing after {crashing['length']:.1f} s returns {crashing['reward']:.3g}, and hovering for "
             f"{hovering['length']:.1f} s {hovering['reward']:.3g}, mostly by the term {term!r} ({terms[term]:.3g} and "
             f"{others[term]:.3g}): a policy learns to crash. Is the term's sign right, and does failing cost enough?"
         )
-    for name in _terms(hovering):
-        rates = [_terms(flown)[name] / flown["length"] for flown in metrics.values()]
+    for name in terms_of(hovering):
+        rates = [terms_of(flown)[name] / flown["length"] for flown in metrics.values()]
         if max(rates) - min(rates) <= 1e-3 * max(map(abs, rates)) and max(map(abs, rates)) > 0:
             findings.append(f"The term {name!r} is {rates[0]:.3g} a second in every flight: it teaches nothing.")
     return findings

@@ -184,7 +184,7 @@ def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dic
         if has_own_criterion
         else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
     )
-    crashed = (is_over & ~np.all(succeeded, axis=-1))[:, None] & ~succeeded
+    crashed = is_over[:, None] & ~succeeded
     error = error[:, ~np.any(crashed, axis=-1)]
     error = error[~np.isnan(error)]
     return {
@@ -196,6 +196,20 @@ def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dic
         "reward": float(flight["reward"][worlds].mean()),
         **{f"{TERM_PREFIX}{name}": float(x[:, block].sum()) for name, x in flight["terms"].items()},
     }
+
+
+def terms_of(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the contributions of the terms to the mean return, by the name of the term."""
+    return {name.removeprefix(TERM_PREFIX): x for name, x in metrics.items() if name.startswith(TERM_PREFIX)}
+
+
+def describe_flight(metrics: Mapping[str, float], unit: str) -> str:
+    """Return success, outcome, return and its terms as text; arguments as of ``describe_outcome``."""
+    terms = ", ".join(f"{name} {x:.4g}" for name, x in terms_of(metrics).items())
+    return (
+        f"success {metrics['success']:.1%}, {describe_outcome(metrics, unit)}, mean return {metrics['reward']:.4g} "
+        f"({terms})"
+    )
 
 
 def describe_outcome(metrics: Mapping[str, float], unit: str) -> str:

@@ -71,7 +71,7 @@ def run(
         film: True to write a film.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
-        progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
+        progress: True to show progress bars if tqdm is installed, or lines where stderr is no terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
             name. After an evaluation it also gets the metrics of the evaluation, with names that begin with

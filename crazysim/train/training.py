@@ -125,7 +125,7 @@ def train_many(
         resume: True to continue from the checkpoint in the folder, also with another number of devices.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
-        progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
+        progress: True to show a progress bar if tqdm is installed, or lines where stderr is no terminal.
         checkpoint_every: Time after which a checkpoint is also written between evaluations, s; None to write none.
         on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
             name. After an evaluation it also gets the metrics of the evaluation, with names that begin with
