@@ -76,7 +76,7 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     error_cm = float(out.split("tracking error")[1].split("cm")[0])
     assert 0.1 < error_cm < 20  # the cascade lags some centimetres behind; a crashed drone would be metres off
     assert (tmp_path / "tracks.png").read_bytes().startswith(b"\x89PNG")
-    flown = Flight.load(tmp_path / "flight.npz")
+    flown = Flight.load(tmp_path / "flight.journal")
     assert flown.pos.shape == (25, 1, 4, 3)
     assert np.ptp(flown.pos[:, 0, :, :2], axis=0).max(-1).min() > 0.4, "every drone is on its way"
     film = tmp_path / "flight.mp4"
@@ -186,7 +186,7 @@ COMMANDS_BY_EXTRA = {
     "evaluate {0}": "train",
     "export {0} --c {0}/policy.h": "train",
     "render {0}": "train",
-    "replay {0}/flight.npz": "web",
+    "replay {0}/flight.journal": "web",
     "live --browser --seconds 0.1 --port 0": "web",
     "demo --worlds 1 --drones 1 --seconds 0.1 --out {0}": "demo",
 }
@@ -196,7 +196,7 @@ COMMANDS_BY_EXTRA = {
 def test_a_command_names_the_extra_that_it_lacks(tmp_path):
     recorder = Recorder(Sim())
     recorder.add()
-    recorder.flight().save(tmp_path / "flight.npz")
+    recorder.flight().save(tmp_path / "flight.journal")
     commands = [command.format(tmp_path) for command in COMMANDS_BY_EXTRA]
     program = [sys.executable, "-c", PROGRAM_WITHOUT_PACKAGES, ",".join({*EXTRAS, "trimesh"}), *commands]
     done = subprocess.run(program, capture_output=True, text=True, check=True)

@@ -47,7 +47,7 @@ def run_demo_flight(
     out: Path = Path("out"),
     film: bool = True,
 ) -> None:
-    """Fly, print figures, and write ``flight.npz``, ``tracks.png`` and ``flight.mp4`` into a folder.
+    """Fly, print figures, and write ``flight.journal``, ``tracks.png`` and ``flight.mp4`` into a folder.
 
     Args:
         n_worlds: Number of worlds.
@@ -96,8 +96,8 @@ def run_demo_flight(
     )
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
     flight = recorder.flight()
-    flight.save(out / "flight.npz")
-    print(f"wrote {out / 'flight.npz'}")
+    flight.save(out / "flight.journal")
+    print(f"wrote {out / 'flight.journal'}")
     plot_tracks(sim, flight.pos[:, 0], np.concatenate(errors), out / "tracks.png")
     if film:
         film_flight(sim, flight, out / "flight.mp4")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,9 @@ from numpy.typing import NDArray
 
 from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, require
-from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
+from crazysim.media.journal import MAGIC, pack_chunk, read_journal
 from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
-from crazysim.storage import open_file, open_replacement, read_arrays, wrap_read_errors
-
-FORMAT = 1
-"""Version of the file format."""
+from crazysim.storage import read_arrays, wrap_read_errors, write_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +84,16 @@ class Flight:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the flight to a compressed ``.npz`` file.
+        """Write the flight to a file, compressed.
 
         Raises:
-            ConfigError: If the name has another suffix, or the file cannot be written. No file is left then.
+            ConfigError: If the file cannot be written. No file is left then.
         """
-        path = Path(path)
-        require(path.suffix == ".npz", f"expected the name of a recording to end with .npz, got {str(path)!r}")
-        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
-        arrays |= shape_arrays(self.shapes)
-        with open_replacement(path) as file:
-            np.savez_compressed(file, format=FORMAT, **arrays)
+        constants = {name: getattr(self, name) for name in ("worlds", "drone_ids", "body_ids", "shapes")}
+        samples = np.zeros(len(self.time), sample_dtype(*(getattr(self, name).shape[1:] for name in SAMPLE_FIELDS)))
+        for name in SAMPLE_FIELDS:
+            samples[name] = getattr(self, name)
+        write_file(path, MAGIC + pack_chunk(SCENE_CHUNK, pack_scene(constants, samples)))
 
     @classmethod
     @check_arguments
@@ -107,22 +104,44 @@ class Flight:
             ConfigError: If the file does not exist, or is of another format.
             DamagedFileError: If the file is damaged or not a recorded flight.
         """
-        path = Path(path)
         with wrap_read_errors(path, "a recorded flight", "Save it again, or use another copy."):
-            if is_journal(path):
-                arrays = _read_samples(path)
-            else:
-                with open_file(path) as file:
-                    arrays = read_arrays(file, str(path))
-            if int(arrays["format"]) != FORMAT:
-                raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")
-            return cls(
-                **{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=_read_shapes(arrays)
-            )
+            chunks = read_journal(path)
+            kind, content = next(chunks, (b"", b""))
+            require(kind == SCENE_CHUNK, "expected the scene of a flight first, got none", ValueError)
+            scene = read_arrays(io.BytesIO(content), str(path))
+            if int(scene["format"]) != FORMAT:
+                raise ConfigError(f"expected a recording of format {FORMAT}, got format {scene['format']} in {path}")
+            samples = scene["samples"]
+            appended = [np.frombuffer(content, samples.dtype) for kind, content in chunks if kind == SAMPLE_CHUNK]
+            samples = np.concatenate([samples, *appended])
+            require(len(samples), "expected at least one sample, got none", ValueError)
+            constants = {name: scene[name] for name in ("worlds", "drone_ids", "body_ids")}
+            return cls(**{name: samples[name] for name in SAMPLE_FIELDS}, **constants, shapes=_read_shapes(scene))
 
 
-def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
-    """Return geoms as arrays, for a file."""
+FORMAT = 2
+"""Version of the file format. A file is a journal (``crazysim.media.journal``): the scene, which may contain samples of
+a finished flight, and samples that were appended one by one."""
+SCENE_CHUNK, SAMPLE_CHUNK = b"SCEN", b"SAMP"
+"""Kinds of chunks of a flight."""
+SAMPLE_FIELDS = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
+"""Fields of a sample."""
+
+
+def sample_dtype(*shapes: Sequence[int]) -> np.dtype:
+    """Return the type of one sample, from the shapes of ``SAMPLE_FIELDS``."""
+    return np.dtype([(name, "<f8", tuple(shape)) for name, shape in zip(SAMPLE_FIELDS, shapes, strict=True)])
+
+
+def pack_scene(constants: dict[str, Any], samples: NDArray) -> bytes:
+    """Return the fields of a flight that do not change with time, and its first samples, as the content of a chunk."""
+    arrays = {name: x for name, x in constants.items() if name != "shapes"} | _shape_arrays(constants["shapes"])
+    stream = io.BytesIO()
+    np.savez_compressed(stream, format=FORMAT, samples=samples, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
     arrays = {"shape_kind": np.array([GEOM_KINDS.index(shape.kind) for shape in shapes], int)}
     for name in ("size", "rgba", "mocap", "pos", "quat"):
         arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
@@ -146,40 +165,3 @@ def _read_shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
         )
         for k, kind in enumerate(arrays["shape_kind"])
     ]
-
-
-SCENE_CHUNK, SAMPLE_CHUNK = b"SCEN", b"SAMP"
-"""Kinds of chunks of a flight: the constants, and one sample."""
-SAMPLE_FIELDS = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
-"""Fields of a sample, in their order in a chunk."""
-
-
-def pack_scene(scene: dict[str, Any]) -> bytes:
-    """Return the fields of a flight that do not change with time as a chunk of a journal."""
-    constant_fields = {name: x for name, x in scene.items() if name != "shapes"}
-    return pack_arrays(format=np.array(FORMAT), **constant_fields, **shape_arrays(scene["shapes"]))
-
-
-def pack_sample(sample: dict[str, Any]) -> bytes:
-    """Return a sample as a chunk of a journal: the numbers of ``SAMPLE_FIELDS`` in order, float64."""
-    return np.concatenate([np.ravel(sample[name]) for name in SAMPLE_FIELDS]).astype("<f8").tobytes()
-
-
-def _read_samples(path: Path) -> dict[str, NDArray]:
-    scene: dict[str, NDArray] = {}
-    samples: list[NDArray] = []
-    for kind, content in read_journal(path):
-        if kind == SCENE_CHUNK:
-            scene = unpack_arrays(content)
-        elif kind == SAMPLE_CHUNK:
-            samples.append(np.frombuffer(content, "<f8"))
-    require(samples and scene, "expected at least one sample, got none", ValueError)
-    n_worlds, n_drones, n_bodies = (len(scene[name]) for name in ("worlds", "drone_ids", "body_ids"))
-    values = np.stack(samples)
-    sizes = [(), (n_worlds, n_drones, 3), (n_worlds, n_drones, 4), (n_worlds, n_bodies, 3), (n_worlds, n_bodies, 4)]
-    ends = np.cumsum([int(np.prod(size)) for size in sizes])
-    parts = np.split(values, ends, axis=1)
-    shapes = [*sizes, (n_worlds, parts[-1].shape[1] // (3 * n_worlds), 3)]
-    return scene | {
-        name: part.reshape(len(values), *shape) for name, part, shape in zip(SAMPLE_FIELDS, parts, shapes, strict=True)
-    }

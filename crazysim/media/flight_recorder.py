@@ -15,7 +15,7 @@ from crazysim.arguments import check_arguments
 from crazysim.core.functional import default_feedforward, stage_command, staged_leaves
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, expect, require
-from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
+from crazysim.media.flight import SAMPLE_CHUNK, SAMPLE_FIELDS, SCENE_CHUNK, Flight, pack_scene, sample_dtype
 from crazysim.media.journal import Journal
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
@@ -44,7 +44,7 @@ class Recorder:
         for _ in range(100):
             sim.step(10)
             recorder.add()
-        recorder.flight().save("flight.npz")
+        recorder.flight().save("flight.journal")
 
     With a path, each sample is appended to that file as it is added, and no sample stays in memory. If the process
     crashes, ``Flight.load`` returns the flight up to the last sample.
@@ -54,13 +54,19 @@ class Recorder:
     def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
         self._sim = sim
         self._worlds = world_indices(sim, worlds)
-        self._scene = _constant_fields(sim, self._worlds)
+        self._constants = _constant_fields(sim, self._worlds)
+        n_worlds, n_bodies = len(self._worlds), len(self._constants["body_ids"])
+        n_setpoints = 0 if sim.data.controls.state is None else sim.n_drones
+        drones, bodies = (n_worlds, sim.n_drones), (n_worlds, n_bodies)
+        self._dtype = sample_dtype(
+            (), (*drones, 3), (*drones, 4), (*bodies, 3), (*bodies, 4), (n_worlds, n_setpoints, 3)
+        )
         self._clock = Clock()
-        self._samples: list[dict[str, Any]] = []
+        self._samples: list[NDArray] = []
         self._n_samples, self._last_time = 0, -np.inf
         self._journal = None if path is None else Journal(path)
         if self._journal is not None:
-            self._journal.append(SCENE_CHUNK, pack_scene(self._scene))
+            self._journal.append(SCENE_CHUNK, pack_scene(self._constants, np.zeros(0, self._dtype)))
 
     def __len__(self) -> int:
         return self._n_samples
@@ -86,21 +92,16 @@ class Recorder:
             self._samples.pop()
             self._n_samples -= 1
         states, state = sim.data.states, sim.data.controls.state
-        body_pos, body_quat = _body_poses(sim, self._worlds)
-        sample = {
-            "time": time,
-            "pos": np.asarray(states.pos, float)[worlds],
-            "quat": np.asarray(states.quat, float)[worlds],
-            "body_pos": body_pos,
-            "body_quat": body_quat,
-            "setpoint": np.zeros((len(worlds), 0, 3))
-            if state is None
-            else np.asarray(state.staged_cmd, float)[worlds, :, :3],
-        }
+        sample = np.zeros((), self._dtype)
+        sample["time"] = time
+        sample["pos"], sample["quat"] = (np.asarray(x, float)[worlds] for x in (states.pos, states.quat))
+        sample["body_pos"], sample["body_quat"] = _body_poses(sim, worlds)
+        if state is not None:
+            sample["setpoint"] = np.asarray(state.staged_cmd, float)[worlds, :, :3]
         if self._journal is None:
             self._samples.append(sample)
         else:
-            self._journal.append(SAMPLE_CHUNK, pack_sample(sample))
+            self._journal.append(SAMPLE_CHUNK, sample.tobytes())
         self._n_samples, self._last_time = self._n_samples + 1, time
 
     def flight(self) -> Flight:
@@ -108,9 +109,8 @@ class Recorder:
         require(self._n_samples, "expected at least one sample, got none. Call recorder.add() between steps.")
         if self._journal is not None:
             return Flight.load(self._journal.path)
-        return Flight(
-            **{name: np.stack([sample[name] for sample in self._samples]) for name in self._samples[0]}, **self._scene
-        )
+        samples = np.stack(self._samples)
+        return Flight(**{name: samples[name] for name in SAMPLE_FIELDS}, **self._constants)
 
     def close(self) -> None:
         """Close the file, if there is one; samples in memory stay."""

@@ -8,7 +8,6 @@ a chunk is cut off, by a full disk or a loss of power, readers warn and stop bef
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import struct
@@ -16,11 +15,8 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from crazysim.errors import ConfigError, require
-from crazysim.storage import Closeable, open_file, read_arrays
+from crazysim.storage import Closeable, open_file
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +60,7 @@ class Journal(Closeable):
         Raises:
             OSError: If the chunk cannot be written, for example because the disk is full.
         """
-        require(len(kind) == 4, f"expected a kind of 4 bytes, got {kind!r}")
-        self._write(CHUNK_HEADER.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content)
+        self._write(pack_chunk(kind, content))
 
     def close(self) -> None:
         if self.is_open:
@@ -76,6 +71,12 @@ class Journal(Closeable):
         remaining_bytes = memoryview(content)
         while remaining_bytes:
             remaining_bytes = remaining_bytes[os.write(self._file, remaining_bytes) :]
+
+
+def pack_chunk(kind: bytes, content: bytes) -> bytes:
+    """Return a chunk as it stands in a file."""
+    require(len(kind) == 4, f"expected a kind of 4 bytes, got {kind!r}")
+    return CHUNK_HEADER.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content
 
 
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
@@ -98,24 +99,3 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
                 log.warning("%s is cut off or damaged at byte %d of %d; the part before it was read", path, start, size)
                 return
             yield kind, content
-
-
-def is_journal(path: str | Path) -> bool:
-    """Return True if a file exists and begins with the first line of a journal."""
-    path = Path(path)
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
-
-
-def pack_arrays(**arrays: NDArray) -> bytes:
-    """Return arrays as the content of a chunk."""
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)  # type: ignore[arg-type]
-    return stream.getvalue()
-
-
-def unpack_arrays(content: bytes) -> dict[str, NDArray]:
-    """Return the arrays in the content of a chunk."""
-    return read_arrays(io.BytesIO(content), "a chunk of a journal")

@@ -264,7 +264,7 @@ CALLS = {
     "Recorder": (lambda **k: Recorder(sim(), **k), {"worlds": None, "path": None}),
     "flight_of": (lambda **k: flight_of(sim(), **k), {"states": Lazy(lambda: on_sim("rollout")(policy=FALL)),
         "dt": 0.1, "worlds": None}),
-    "Flight.load": (Flight.load, {"path": "nowhere.npz"}),
+    "Flight.load": (Flight.load, {"path": "nowhere.journal"}),
     "to_casadi": (to_casadi, {"sim": Lazy(Sim), "parameters": (), "world": 0, "drone": 0}),
     "draw_points": (draw_points, {"sim": Lazy(sim), "points": np.zeros(3), "rgba": None, "size": 0.01}),
     "draw_label": (draw_label, {"sim": Lazy(sim), "point": np.zeros(3), "text": "here"}),

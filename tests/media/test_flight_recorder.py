@@ -121,8 +121,8 @@ def test_poses_between_two_samples_are_interpolated(flight):
 
 
 def test_a_file_keeps_the_whole_flight(flight, tmp_path):
-    flight.save(tmp_path / "flight.npz")
-    loaded = Flight.load(tmp_path / "flight.npz")
+    flight.save(tmp_path / "flight.journal")
+    loaded = Flight.load(tmp_path / "flight.journal")
     for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(flight, name))
     assert len(loaded.shapes) == len(flight.shapes)
@@ -253,9 +253,8 @@ def test_invalid_recordings_flights_and_files_are_refused(sim, flight, tmp_path)
         (lambda: show_flight_at(Sim(n_worlds=2, n_drones=2), flight, 0.0), "got 2"),
         (lambda: show_flight_at(Sim(n_worlds=3, n_drones=2), flight, 0.0), "2 drones and 1 other .*got 2 and 0"),
         (lambda: flight.index(1), r"one of \[2, 0\], got 1"),
-        (lambda: flight.save(tmp_path / "flight.zip"), r"to end with \.npz"),
-        (lambda: flight.save(tmp_path / "nowhere" / "flight.npz"), "an existing folder"),
-        (lambda: Flight.load(tmp_path / "flight.npz"), "an existing file"),
+        (lambda: flight.save(tmp_path / "nowhere" / "flight.journal"), "an existing folder"),
+        (lambda: Flight.load(tmp_path / "flight.journal"), "an existing file"),
         (lambda: Flight.load(text), r"a recorded flight, got .*text\.npz"),
         (lambda: Flight.load(other), r"a recorded flight, got .*other\.npz"),
     ):
@@ -263,10 +262,10 @@ def test_invalid_recordings_flights_and_files_are_refused(sim, flight, tmp_path)
             call()
 
 
-@pytest.mark.parametrize("kind", ["npz", "journal"])
+@pytest.mark.parametrize("kind", ["saved", "appended"])
 def test_a_damaged_flight_is_refused_or_read_up_to_the_damage(flight, sim, tmp_path, kind):
-    path = tmp_path / f"flight.{kind}"
-    if kind == "npz":
+    path = tmp_path / "flight.journal"
+    if kind == "saved":
         flight.save(path)
     else:
         with closing(Recorder(sim, path=path)) as recorder:

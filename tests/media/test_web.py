@@ -95,12 +95,12 @@ def pixel(browser, flight, point, world):
 
 def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
     """After a click on the bar, forwards or backwards, the drone is shown at its position of that time."""
-    flight.save(tmp_path / "flight.npz")
+    flight.save(tmp_path / "flight.journal")
     # Programs that a shell started in the background ignore SIGINT, and so would this one.
     start = "import browsing, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     start += "browsing.use_simple_lights(); "
     start += "from crazysim.__main__ import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", start, "replay", "flight.npz", "--world", "1", "--port", "0"]
+    command = [sys.executable, "-c", start, "replay", "flight.journal", "--world", "1", "--port", "0"]
     program = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": ":".join(sys.path)}
     )
@@ -119,9 +119,9 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
 
 def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, capsys):
     """The file needs no server and has the requested world, here with a drone and a box at rest."""
-    flight.save(tmp_path / "flight.npz")
+    flight.save(tmp_path / "flight.journal")
     out = tmp_path / "flight.html"
-    assert main(["replay", str(tmp_path / "flight.npz"), "--export", str(out)]) == 0
+    assert main(["replay", str(tmp_path / "flight.journal"), "--export", str(out)]) == 0
     assert capsys.readouterr().out == f"wrote {out}\n"
     open_flight(chromium, out.as_uri())
     for fraction in (0.2, 0.8):
@@ -136,16 +136,16 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.npz"], "expected an existing file with a recorded flight, got 'nowhere.npz'"),
-        (["flight.npz", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
-        (["flight.npz", "--export", "flight.txt"], "a file that ends with .html"),
-        (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
-        (["flight.npz", "--host", "nohost.invalid"], "Choose another --host"),
+        (["nowhere.journal"], "expected an existing file with a recorded flight, got 'nowhere.journal'"),
+        (["flight.journal", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
+        (["flight.journal", "--export", "flight.txt"], "a file that ends with .html"),
+        (["flight.journal", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
+        (["flight.journal", "--host", "nohost.invalid"], "Choose another --host"),
     ],
 )
 def test_an_invalid_replay_is_refused_in_one_line(viser, flight, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
-    flight.save("flight.npz")
+    flight.save("flight.journal")
     assert main(["replay", *arguments]) == 2
     error = capsys.readouterr().err.strip()
     assert message in error
