@@ -23,6 +23,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.control.mppi": "MPPI",
         "crazysim.lab.plugins.rotor_jet": "RotorJet",
         "crazysim.lab.plugins.radar": "Radar",
+        "crazysim.lab.vehicles.cars": "Bicycles Cars",
         "crazysim.plugins.bodies": "FreeBodies",
         "crazysim.plugins.contacts.contact_log": "ContactLog",
         "crazysim.plugins.contacts.drone_collisions": "DroneCollisions",
@@ -36,7 +37,6 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.payloads": "Hook SharedLoad SlungLoad",
         "crazysim.plugins.scenery": "Clutter Forest Gates Pillars Rooms",
         "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture RangeFinder Sensor",
-        "crazysim.plugins.vehicles": "Bicycles Cars",
         "crazysim.scene.splats": "SplatScene",
     },
     "crazysim.control": {
@@ -93,9 +93,17 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.training": "load_policy",
     },
     "crazysim.plugins.vehicles": {
+        "crazysim.lab.vehicles.car_params": "CarParams",
+        "crazysim.lab.vehicles.car_state": "CarState ackermann",
+        "crazysim.lab.vehicles.cars": "Bicycles CarData Cars",
         "crazysim.lab.vehicles.commonroad": "CommonRoadParams CommonRoadState commonroad_single_track",
+        "crazysim.lab.vehicles.following": "PathController PathState PurePursuit Stanley",
+        "crazysim.lab.vehicles.kinematic": "kinematic",
         "crazysim.lab.vehicles.lpv": "LPV",
+        "crazysim.lab.vehicles.model": "VehicleModel load_vehicle vehicle_names",
+        "crazysim.lab.vehicles.path": "Path PathPoint",
         "crazysim.lab.vehicles.path_lqr": "PathLQR",
+        "crazysim.lab.vehicles.single_track": "single_track",
     },
     "crazysim.sim.export": {"crazysim.lab.export.casadi": "to_casadi"},
     # Modules of Crazyflow.

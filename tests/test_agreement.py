@@ -14,6 +14,7 @@ import sweep
 from cases import COMPILED_ENGINES
 
 import crazysim.lab.plugins
+import crazysim.lab.vehicles
 from crazysim import Plugin, plugins
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.engine import Step, plan
@@ -124,7 +125,11 @@ def assert_bad_worlds_change_no_other(sim, step):
 
 def test_every_plugin_and_controller_is_in_the_sweep():
     swept = {type(plugin) for factory in sweep.PLUGINS.values() for plugin in factory()}
-    found = [m for x in (plugins, crazysim.lab.plugins) for m in pkgutil.walk_packages(x.__path__, f"{x.__name__}.")]
+    found = [
+        m
+        for x in (plugins, crazysim.lab.plugins, crazysim.lab.vehicles)
+        for m in pkgutil.walk_packages(x.__path__, f"{x.__name__}.")
+    ]
     modules = [importlib.import_module(module.name) for module in found]
     classes = {x for module in modules for x in vars(module).values() if isinstance(x, type) and issubclass(x, Plugin)}
     # Images are taken between kernels of the step: tests/plugins/sensors/test_depth_errors.py compares the engines.

@@ -30,6 +30,7 @@ from crazysim.lab.live.mocap.tracker import Rules
 from crazysim.lab.live.mocap.twins import Twin
 from crazysim.lab.live.sitl import Origin
 from crazysim.lab.tasks.bring_load import BringLoad
+from crazysim.lab.vehicles.following import PathController
 from crazysim.plugins.effects import Battery, Grid
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.estimator import Estimator
@@ -40,7 +41,6 @@ from crazysim.plugins.sensors import IMU, Barometer, ImageSensor, MotionCapture,
 from crazysim.plugins.sensors.onboard import NoisySensor
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.plugins.vehicles import Path
-from crazysim.plugins.vehicles.following import PathController
 from crazysim.tables import MAX_NUMBER
 from crazysim.trajectories import circle
 
@@ -107,7 +107,7 @@ def concrete_classes(base, *packages):
     return sorted(named, key=lambda kind: kind.__name__)
 
 
-PLUGINS = concrete_classes(Plugin, crazysim.plugins, crazysim.lab.plugins)
+PLUGINS = concrete_classes(Plugin, crazysim.plugins, crazysim.lab.plugins, crazysim.lab.vehicles)
 TASKS = concrete_classes(Task, crazysim.envs.tasks, crazysim.lab.tasks)
 OTHER_CLASSES = [
     Origin,
@@ -115,7 +115,7 @@ OTHER_CLASSES = [
     Rules,
     Triad,
     Twin,
-    *concrete_classes(PathController, crazysim.plugins, crazysim.lab.vehicles),
+    *concrete_classes(PathController, crazysim.lab.vehicles),
 ]
 
 

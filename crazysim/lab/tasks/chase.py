@@ -14,8 +14,8 @@ from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tasks.touch_down import TouchDown
-from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.model import load_vehicle
+from crazysim.lab.vehicles.cars import Cars
+from crazysim.lab.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"

@@ -18,11 +18,11 @@ from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry, state_of
 from crazysim.lab.tasks.bring_load import BringLoad
+from crazysim.lab.vehicles.car_state import to_world_frame
+from crazysim.lab.vehicles.cars import Cars
+from crazysim.lab.vehicles.model import load_vehicle
+from crazysim.lab.vehicles.trailer import trailer_axles, trailer_rates
 from crazysim.plugins.payloads import Hook
-from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.car_state import to_world_frame
-from crazysim.plugins.vehicles.model import load_vehicle
-from crazysim.plugins.vehicles.trailer import trailer_axles, trailer_rates
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"

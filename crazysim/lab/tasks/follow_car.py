@@ -17,8 +17,8 @@ from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import motion_of
 from crazysim.lab.tasks.chase import CARS, VEHICLE, rolling_car
 from crazysim.lab.tasks.target_camera import TargetCamera
-from crazysim.plugins.vehicles import Cars
-from crazysim.plugins.vehicles.model import load_vehicle
+from crazysim.lab.vehicles.cars import Cars
+from crazysim.lab.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
 
 SPACING = 6.0

@@ -15,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.engine.pytree import as_parameter
 from crazysim.lab.validate.rows import Row
-from crazysim.plugins.vehicles import CarState, CommonRoadParams, CommonRoadState, commonroad_single_track, single_track
-from crazysim.plugins.vehicles.car_params import SLIP_SPEED, CarParams
+from crazysim.lab.vehicles.car_params import SLIP_SPEED, CarParams
+from crazysim.lab.vehicles.car_state import CarState
+from crazysim.lab.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
+from crazysim.lab.vehicles.single_track import single_track
 
 REFERENCE = "CommonRoad, BMW 320i"
 """Reference in the rows."""

@@ -1,1 +1,1 @@
-"""Controllers and dynamics of cars beyond pure pursuit: LQR and LPV along paths, and CommonRoad's single track."""
+"""Ground vehicles: cars, bicycles and trailers, paths on the ground, and controllers that follow them."""

@@ -11,10 +11,10 @@ from jax import Array
 
 from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.errors import ConfigError
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState
-from crazysim.plugins.vehicles.following import PathController, PathState
-from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState
+from crazysim.lab.vehicles.following import PathController, PathState
+from crazysim.lab.vehicles.model import VehicleModel
 from crazysim.rotation import clip, safe_arctan2
 
 LATERAL_GAINS = {

@@ -17,12 +17,12 @@ from crazysim.control.riccati import gain_discrete
 from crazysim.core.settings import setting
 from crazysim.engine.jaxcompat import fori_loop
 from crazysim.engine.pytree import PyTree, as_parameter, leaf
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState
-from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
-from crazysim.plugins.vehicles.kinematic import kinematic
-from crazysim.plugins.vehicles.model import VehicleModel
-from crazysim.plugins.vehicles.single_track import single_track
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState
+from crazysim.lab.vehicles.following import PathController, PathState, motor_reference
+from crazysim.lab.vehicles.kinematic import kinematic
+from crazysim.lab.vehicles.model import VehicleModel
+from crazysim.lab.vehicles.single_track import single_track
 from crazysim.rotation import clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24

@@ -3,19 +3,19 @@
 from typing import TYPE_CHECKING
 
 from crazysim.names import lazy_getattr
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState, ackermann
-from crazysim.plugins.vehicles.cars import Bicycles, CarData, Cars
-from crazysim.plugins.vehicles.following import PathController, PathState, PurePursuit, Stanley
-from crazysim.plugins.vehicles.kinematic import kinematic
-from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle, vehicle_names
-from crazysim.plugins.vehicles.path import Path, PathPoint
-from crazysim.plugins.vehicles.single_track import single_track
 
 if TYPE_CHECKING:
+    from crazysim.lab.vehicles.car_params import CarParams
+    from crazysim.lab.vehicles.car_state import CarState, ackermann
+    from crazysim.lab.vehicles.cars import Bicycles, CarData, Cars
     from crazysim.lab.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
+    from crazysim.lab.vehicles.following import PathController, PathState, PurePursuit, Stanley
+    from crazysim.lab.vehicles.kinematic import kinematic
     from crazysim.lab.vehicles.lpv import LPV
+    from crazysim.lab.vehicles.model import VehicleModel, load_vehicle, vehicle_names
+    from crazysim.lab.vehicles.path import Path, PathPoint
     from crazysim.lab.vehicles.path_lqr import PathLQR
+    from crazysim.lab.vehicles.single_track import single_track
 
 __all__ = [
     "LPV",

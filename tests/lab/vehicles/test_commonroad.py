@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
+from crazysim.lab.vehicles.car_params import CarParams
 from crazysim.lab.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
 from crazysim.plugins.vehicles import CarState, single_track
-from crazysim.plugins.vehicles.car_params import CarParams
 
 # Returned by vehicle_dynamics_st of f1tenth/f1tenth_gym, commit 4fdb9c7, with the default parameters of its
 # environment: state (x, y, steering angle, speed, heading, yaw rate, slip), command (steering rate, acceleration).

@@ -13,9 +13,9 @@ from crazysim import rotation
 from crazysim.core.data import Objects
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_rgba
-from crazysim.plugins.vehicles.car_state import ackermann, heading_quat, tilted_quat
-from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
-from crazysim.plugins.vehicles.trailer import trailer_axles
+from crazysim.lab.vehicles.car_state import ackermann, heading_quat, tilted_quat
+from crazysim.lab.vehicles.model import VehicleModel, load_vehicle
+from crazysim.lab.vehicles.trailer import trailer_axles
 
 BODY_COLOR, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
 RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)

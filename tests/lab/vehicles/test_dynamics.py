@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crazysim.lab.vehicles.single_track import drive_force, tyre_force
 from crazysim.plugins.vehicles import CarParams, CarState, ackermann, kinematic, load_vehicle, single_track
-from crazysim.plugins.vehicles.single_track import drive_force, tyre_force
 
 MODELS = {"single_track": single_track, "kinematic": kinematic}
 RATES = {name: jax.jit(model) for name, model in MODELS.items()}

@@ -8,8 +8,8 @@ import pytest
 
 from crazysim import ConfigError
 from crazysim.errors import UnknownNameError
+from crazysim.lab.vehicles.model import KEYS, VEHICLE_FOLDER
 from crazysim.plugins.vehicles import CarParams, load_vehicle, vehicle_names
-from crazysim.plugins.vehicles.model import KEYS, VEHICLE_FOLDER
 
 
 @pytest.mark.parametrize("name", vehicle_names())

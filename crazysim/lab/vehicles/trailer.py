@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.errors import ConfigError
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState, to_world_frame
 
 
 def trailer_rates(state: CarState, params: CarParams) -> Array:

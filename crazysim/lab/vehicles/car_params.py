@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.dynamics.models import GRAVITY, MAX_LAG_STEP
 from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.errors import ConfigError
-from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.lab.vehicles.model import VehicleModel
 
 SLIP_SPEED = 0.1
 """Smallest value of ``CarParams.slip_speed``, m/s."""

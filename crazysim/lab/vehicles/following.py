@@ -12,10 +12,10 @@ from crazysim.core.plugin import as_tuples
 from crazysim.core.settings import check_settings, setting
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
-from crazysim.plugins.vehicles.model import VehicleModel
-from crazysim.plugins.vehicles.path import Path
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState, to_world_frame
+from crazysim.lab.vehicles.model import VehicleModel
+from crazysim.lab.vehicles.path import Path
 from crazysim.rotation import clip, safe_arctan2
 
 

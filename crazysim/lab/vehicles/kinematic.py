@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState
-from crazysim.plugins.vehicles.single_track import drive_force, state_rates, steer_rate
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState
+from crazysim.lab.vehicles.single_track import drive_force, state_rates, steer_rate
 
 RETURN_RATE = 50.0
 """Rate at which velocities that are incompatible with rolling wheels decay, 1/s."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.plugins.vehicles.path import Path
+from crazysim.lab.vehicles.path import Path
 
 START_SPACING = 1.0
 """Distance between neighbours of the default row of cars, m."""

@@ -20,15 +20,15 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import PyTree, device_array
 from crazysim.errors import ConfigError
+from crazysim.lab.vehicles import appearance, starts
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
+from crazysim.lab.vehicles.following import PathController, PurePursuit, motor_reference, path_state
+from crazysim.lab.vehicles.kinematic import kinematic
+from crazysim.lab.vehicles.model import VehicleModel, VehicleSource, load_vehicle
+from crazysim.lab.vehicles.path import Path
+from crazysim.lab.vehicles.single_track import single_track
 from crazysim.plugins.effects.ground import HeightField, ground_at
-from crazysim.plugins.vehicles import appearance, starts
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
-from crazysim.plugins.vehicles.following import PathController, PurePursuit, motor_reference, path_state
-from crazysim.plugins.vehicles.kinematic import kinematic
-from crazysim.plugins.vehicles.model import VehicleModel, VehicleSource, load_vehicle
-from crazysim.plugins.vehicles.path import Path
-from crazysim.plugins.vehicles.single_track import single_track
 from crazysim.tables import range_between
 from crazysim.trajectories import Trajectory
 

@@ -9,11 +9,11 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Sim, Terrain
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState
+from crazysim.lab.vehicles.following import PathState, motor_reference
+from crazysim.lab.vehicles.model import load_vehicle
 from crazysim.plugins.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState
-from crazysim.plugins.vehicles.following import PathState, motor_reference
-from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.trajectories import circle, figure_eight
 
 EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)

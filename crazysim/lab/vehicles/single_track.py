@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.plugins.vehicles.car_params import CarParams
-from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
-from crazysim.plugins.vehicles.trailer import trailer_rates
+from crazysim.lab.vehicles.car_params import CarParams
+from crazysim.lab.vehicles.car_state import CarState, to_world_frame
+from crazysim.lab.vehicles.trailer import trailer_rates
 from crazysim.rotation import clip
 
 
