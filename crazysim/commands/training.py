@@ -207,7 +207,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     """Write a policy in other formats."""
-    from crazysim.train.export import to_c, to_onnx
+    from crazysim.lab.export.policies import to_c, to_onnx
     from crazysim.train.training import load_policy
 
     require(

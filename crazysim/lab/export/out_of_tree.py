@@ -17,8 +17,8 @@ from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
 from crazysim.errors import require, require_type
+from crazysim.lab.export.policies import POLICY_REMEDY, float_literal, to_c
 from crazysim.storage import as_path, write_file
-from crazysim.train.export import POLICY_REMEDY, float_literal, to_c
 from crazysim.train.interface import Interface
 from crazysim.train.networks import Policy
 

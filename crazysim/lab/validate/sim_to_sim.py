@@ -111,8 +111,8 @@ def export_policy(name: str, folder: Path | None = None) -> ExportedPolicy:
         name: Name of the policy.
         folder: Folder that contains or receives the folders of the trainings; None to keep none.
     """
+    from crazysim.lab.export.policies import to_c, to_onnx
     from crazysim.train import load_policy, run  # only here: they need packages of the extra train
-    from crazysim.train.export import to_c, to_onnx
 
     with tempfile.TemporaryDirectory() as temporary:
         run_folder = Path(temporary if folder is None else folder) / name
