@@ -8,9 +8,10 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from crazysim.commands import airframe, demo, identify, info, live, replay, show, training, validate
+from crazysim.commands import airframe, demo, info, replay, training
 from crazysim.engine import cache
 from crazysim.errors import DivergedError, RenderError, not_installed
+from crazysim.lab.commands import identify, live, show, validate
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
           "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",

@@ -92,7 +92,10 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.show": "film plot_episode",
         "crazysim.train.training": "load_policy",
     },
-    "crazysim.train.export": {"crazysim.lab.export.policies": "to_c to_onnx"},
+    "crazysim.train.export": {
+        "crazysim.lab.export.out_of_tree": "to_out_of_tree",
+        "crazysim.lab.export.policies": "to_c to_onnx",
+    },
     "crazysim.plugins.vehicles": {
         "crazysim.lab.vehicles.car_params": "CarParams",
         "crazysim.lab.vehicles.car_state": "CarState ackermann",

@@ -17,7 +17,8 @@ from pictures import read_frames
 
 from crazysim import Sim, errors
 from crazysim.__main__ import EXTRAS, main
-from crazysim.commands import airframe, demo, demo_flight, identify, info, live, replay, show, training, validate
+from crazysim.commands import airframe, demo, demo_flight, info, replay, training
+from crazysim.lab.commands import identify, live, show, validate
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
 

@@ -207,7 +207,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     """Write a policy in other formats."""
-    from crazysim.lab.export.policies import to_c, to_onnx
+    from crazysim.train.export import to_c, to_onnx, to_out_of_tree
     from crazysim.train.training import load_policy
 
     require(
@@ -224,8 +224,6 @@ def export(options: argparse.Namespace) -> None:
             write(policy, path, meta)
             print(f"wrote {path}")
     if options.out_of_tree is not None:
-        from crazysim.lab.export.out_of_tree import to_out_of_tree
-
         env = config.make_env(1)
         for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.base.freq):
             print(f"wrote {path}")

@@ -1,4 +1,4 @@
-"""Export of policies as ONNX and C: ``crazysim.lab.export.policies``, and the description that it needs."""
+"""Export of policies as ONNX, C and out of tree controllers, and the description that it needs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from crazysim.names import lazy_getattr
 from crazysim.train.interface import describe_env
 
 if TYPE_CHECKING:
+    from crazysim.lab.export.out_of_tree import to_out_of_tree
     from crazysim.lab.export.policies import to_c, to_onnx
 
-__all__ = ["describe", "to_c", "to_onnx"]
+__all__ = ["describe", "to_c", "to_onnx", "to_out_of_tree"]
 
 __getattr__ = lazy_getattr(__name__)
 

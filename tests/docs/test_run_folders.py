@@ -8,7 +8,8 @@ import shlex
 import pytest
 from pages import GENERATED, ROOT, navigation_pages
 
-from crazysim.commands import live, training
+from crazysim.commands import training
+from crazysim.lab.commands import live
 from crazysim.train.config import TrainConfig
 
 BLOCK = re.compile(r"^```(?P<language>sh(?=\n)|py|python)\b[^\n]*\n(?P<code>.*?)^```", re.DOTALL | re.MULTILINE)

@@ -23,7 +23,7 @@ sim.step()
 unused = ("crazysim.lab", "crazysim.plugins.effects", "crazysim.plugins.estimators")
 assert not [name for name in sys.modules if name.startswith(unused)]
 print(json.dumps(sorted(packages() - before - set(sys.stdlib_module_names))))
-import crazysim.commands.validate  # Crazyflow, which it compares with, refuses to be imported after SciPy
+import crazysim.lab.commands.validate  # Crazyflow, which it compares with, refuses to be imported after SciPy
 assert "scipy" not in sys.modules
 from crazysim.scene import mjx
 assert mjx.Model is sys.modules["mujoco.mjx"].Model

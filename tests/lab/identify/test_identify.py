@@ -128,7 +128,7 @@ def test_command_writes_an_airframe(flights, tmp_path, capsys, monkeypatch):
         hidden = jnp.ones((4, linear.shape[1]))
         return model.replace(residual=Residual(linear, hidden=hidden, output=jnp.full((6, 4), 1e-9), is_bound=True))
 
-    monkeypatch.setattr("crazysim.commands.identify.fit_residual", fit)
+    monkeypatch.setattr("crazysim.lab.commands.identify.fit_residual", fit)
     table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
     # Commands that these speeds follow with a lag of first order of 25 1/s.
     table |= {f"command{k}": table[f"rpm{k}"] + np.gradient(table[f"rpm{k}"], 0.004) / 25 for k in range(1, 5)}

@@ -62,7 +62,7 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
 
 
 def test_a_page_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("crazysim.commands.validate.validate", lambda *_: pytest.fail("minutes of work"))
+    monkeypatch.setattr("crazysim.lab.commands.validate.validate", lambda *_: pytest.fail("minutes of work"))
     for out, message in ((tmp_path, "got the folder"), (tmp_path / "none" / "page.md", "expected an existing folder")):
         assert main(["validate", "--only", "closed", "--out", str(out)]) == 2
         assert message in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Commands of the laboratory, in the form of ``crazysim.commands``."""
