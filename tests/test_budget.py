@@ -10,21 +10,21 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 1171,
+    "commands": 821,
     "control": 1748,
     "core": 1577,
-    "crazysim": 836,
+    "crazysim": 837,
     "drones": 514,
     "dynamics": 574,
     "engine": 6785,
     "envs": 3238,
     "geometry": 1089,
-    "lab": 12324,
+    "lab": 12673,
     "media": 953,
     "plugins": 5974,
     "scene": 3091,
     "sim": 945,
-    "train": 2219,
+    "train": 2220,
     "trajectories": 1393,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
