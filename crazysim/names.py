@@ -111,6 +111,13 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "crazysim.sim.export": {"crazysim.lab.export.casadi": "to_casadi"},
     # Modules of Crazyflow.
+    "crazysim.dynamics.utils": {},
+    "crazysim.dynamics.utils.data_utils": {
+        "crazysim.lab.identify.attitude_logs": "derivatives_svf preprocessing state_variable_filter",
+    },
+    "crazysim.dynamics.utils.identification": {
+        "crazysim.lab.identify.fitted": "sys_id_rotation sys_id_translation",
+    },
     "crazysim.exception": {
         "crazysim.errors": "ConfigError RenderError UnknownNameError",
         "crazysim.sim.crazyflow": "CrazyflowError",

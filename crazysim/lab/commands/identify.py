@@ -12,7 +12,6 @@ from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter, number, size
 from crazysim.drones import load_airframe
-from crazysim.dynamics.utils.identification import FITTED_MODELS
 from crazysim.errors import ConfigError, require
 from crazysim.lab.identify import (
     Columns,
@@ -31,6 +30,7 @@ from crazysim.lab.identify import (
     read_log,
     with_speeds,
 )
+from crazysim.lab.identify.fitted import FITTED_MODELS
 from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
 
 MAX_HIDDEN = 10_000

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import fitted
 from crazysim.dynamics.models import Dynamics
-from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing
-from crazysim.dynamics.utils.identification import fit_rotation, fit_translation
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError
+from crazysim.lab.identify.attitude_logs import derivatives_svf, preprocessing
 from crazysim.lab.identify.checks import check_turning
+from crazysim.lab.identify.fitted import fit_rotation, fit_translation
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import PADDING, State, Windows
 from crazysim.lab.identify.rotation import SAMPLING_ERROR, deviation_of_sum, sum_pieces

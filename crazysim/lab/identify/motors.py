@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_acceleration
-from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import require
+from crazysim.lab.identify.fitted import lag_signal
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 from crazysim.lab.identify.rotation import MEDIAN_OVER_MEAN, deviation_of_sum, sum_pieces

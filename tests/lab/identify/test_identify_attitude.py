@@ -7,10 +7,10 @@ import pytest
 
 from crazysim.__main__ import main
 from crazysim.drones import load_airframe
-from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing, state_variable_filter
-from crazysim.dynamics.utils.identification import sys_id_rotation, sys_id_translation
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import FittedModel, identify_attitude, prediction_errors, read_log
+from crazysim.lab.identify.attitude_logs import derivatives_svf, preprocessing, state_variable_filter
+from crazysim.lab.identify.fitted import sys_id_rotation, sys_id_translation
 from crazysim.sim import Sim
 
 MODEL = "so_rpy_rotor_drag"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from crazysim.drones import load_airframe
-from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Log, motor_lag, with_speeds
+from crazysim.lab.identify.fitted import lag_signal
 from crazysim.lab.identify.motors import mean_motor_lag
 
 DT, N = 0.01, 1500

@@ -1,1 +1,0 @@
-"""Identification of fitted dynamics, under the names of Crazyflow 0.4.0."""
