@@ -96,8 +96,8 @@ def test_names_of_the_table_exist(module):
              "sim.splat.attach_splats", "sim.dynamics.so_rpy_rotor_drag_dynamics",
              "control.Control", "control.parameters.load_params", "dynamics.Dynamics",
              "dynamics.parameters.load_fn_params", "dynamics.utils.data_utils.preprocessing",
-             "dynamics.utils.identification.sys_id_rotation", "drones.Drone", "utils.leaf_replace", "utils.enable_cache",
-             "utils.CORE_NDIM_KEY",
+             "dynamics.utils.identification.sys_id_rotation", "drones.Drone", "utils.leaf_replace",
+             "utils.enable_cache", "utils.CORE_NDIM_KEY",
              "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.CrazyflowError"],
 )  # fmt: skip
 def test_import_paths_of_crazyflow_exist(path):
