@@ -91,11 +91,22 @@ class Trail:
             rgba: Colour, one or one per drone; None for ``COLORS``. (4,) or (n_drones, 4)
             width: Width at the drone, pixels.
         """
-        path = self.path(world)
-        if len(path) < 2:
-            return
-        fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
-        is_moving = (np.ptp(path, axis=0) > 0).any(-1)
-        colors = choose_drone_colors(path.shape[1], rgba)
-        for drone in np.flatnonzero(is_moving):
-            overlays.line(path[:, drone], colors[drone] * fade, 1.0, width)
+        draw_paths(overlays, self.path(world), rgba, width)
+
+
+def draw_paths(overlays: Overlays, path: NDArray, rgba: ArrayLike | None = None, width: float = 3.0) -> None:
+    """Add lines through successive positions of drones, which fade towards their beginning, to overlays.
+
+    Args:
+        overlays: Overlays of the next image.
+        path: Positions, oldest first, m. (n, n_drones, 3)
+        rgba: Colour, one or one per drone; None for ``COLORS``. (4,) or (n_drones, 4)
+        width: Width at the drone, pixels.
+    """
+    if len(path) < 2:
+        return
+    fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
+    is_moving = (np.ptp(path, axis=0) > 0).any(-1)
+    colors = choose_drone_colors(path.shape[1], rgba)
+    for drone in np.flatnonzero(is_moving):
+        overlays.line(path[:, drone], colors[drone] * fade, 1.0, width)

@@ -6,7 +6,6 @@ import contextlib
 import http.server
 import io
 import socket
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, RenderError, address_message, optional_import
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, is_own_name, start_guarded_server, wrong_name_message
+from crazysim.media.browser_scene import BrowserScene, rgb
 from crazysim.media.flight import Flight
+from crazysim.media.picture import Picture, light_spheres, setpoint_spheres
 from crazysim.media.trail import choose_drone_colors
-from crazysim.scene.visual_geoms import VisualGeom
 from crazysim.storage import check_writable, write_file
 
 FPS = 30
 """Samples per second of a page."""
-PLANE_HALF_SIZE = 20.0
-"""Half size of infinite planes, m."""
-LIGHT_RADIUS = 0.03
-"""Radius of a light, m."""
 FOV = 50.0
 """Initial vertical field of view, degrees."""
 
@@ -147,17 +143,6 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
     camera = server.initial_camera
     camera.fov, (camera.position, camera.look_at) = np.deg2rad(FOV), initial_camera_pose(flight, k)
 
-    frames = {
-        int(mocap): scene.add_frame(f"/bodies/{mocap}", show_axes=False)
-        for mocap in (*flight.drone_ids, *flight.body_ids)
-    }
-    shapes_by_color: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
-    for shape in flight.shapes:
-        shapes_by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
-    for i, ((mocap, rgba), shapes) in enumerate(shapes_by_color.items()):
-        parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
-        add_geoms(scene, f"{parent}/{i}", shapes, rgba)
-
     colors = choose_drone_colors(flight.n_drones, None)
     for drone in range(flight.n_drones):
         path = flight.pos[:, k, drone]
@@ -167,110 +152,32 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
             scene.add_line_segments(
                 f"/trails/{drone}", segments, rgb(colors[drone]), thickness=1.5, thickness_units="screen"
             )
-    setpoint_balls = [
-        scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=rgb(colors[drone]))
-        for drone in range(flight.setpoint.shape[2])
-    ]
-
-    light_balls = [
-        scene.add_icosphere(f"/bodies/{mocap}/light", radius=LIGHT_RADIUS, color=rgb(color), opacity=0.8)
-        for mocap, color in zip(flight.drone_ids, [] if lights is None else lights[0], strict=False)
-    ]
-
-    recording = server.get_scene_serializer()
     end = float(flight.time[-1])
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
-    last_values: dict[Any, NDArray] = {}
-    light_colors: dict[str, tuple[int, int, int]] = {}
-
-    def move_handle(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
-        pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
-        if not np.isfinite(pose).all() or np.array_equal(last_values.get(handle.name, np.inf), pose):
-            return  # unchanged poses are not sent again, and non-finite poses are never sent
-        last_values[handle.name] = pose
-        handle.position = pose[:3]
-        if quat is not None:
-            handle.wxyz = pose[3:]
-
-    for i, time in enumerate(times):
-        if i:
-            recording.insert_sleep(float(time - times[i - 1]))
-        flight_poses = flight.at(float(time))
-        for ids, pos, quat in (
-            (flight.drone_ids, flight_poses["pos"][k], flight_poses["quat"][k]),
-            (flight.body_ids, flight_poses["body_pos"][k], flight_poses["body_quat"][k]),
-        ):
-            for mocap, p, q in zip(ids, pos, quat, strict=True):
-                move_handle(frames[int(mocap)], p, q)
-        for setpoint_ball, p in zip(setpoint_balls, flight_poses["setpoint"][k], strict=True):
-            move_handle(setpoint_ball, p)
-        if lights is not None:
-            colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
-            for light_ball, color in zip(light_balls, colors, strict=True):
-                if (value := rgb(color)) != light_colors.get(light_ball.name):
-                    light_colors[light_ball.name] = light_ball.color = value
+    pictures = (_take_picture(flight, k, float(time), lights, colors) for time in times)
+    browser_scene = BrowserScene(server, list(flight.shapes), next(pictures))
+    recording = server.get_scene_serializer()
+    for picture, duration in zip(pictures, np.diff(times), strict=True):
+        recording.insert_sleep(float(duration))
+        browser_scene.update(picture)
     return recording
 
 
-def add_geoms(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
-    """Add the geoms of one body and colour to a viser scene: each plane as a grid, all other geoms as one mesh."""
-    solid_shapes = [shape for shape in shapes if shape.kind != "plane"]
-    for i, shape in enumerate(shape for shape in shapes if shape.kind == "plane"):
-        width, height = (2 * PLANE_HALF_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
-        scene.add_grid(
-            f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=rgb(rgba, 0.9), section_size=5.0,
-            section_color=rgb(rgba, 0.8), plane_color=rgb(rgba), plane_opacity=float(rgba[3]),
-            infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_HALF_SIZE,
-            position=shape.pos, wxyz=np.roll(shape.quat, 1),
-        )  # fmt: skip
-    if solid_shapes:
-        mesh = create_mesh(solid_shapes)
-        scene.add_mesh_simple(
-            name,
-            np.asarray(mesh.vertices, np.float32),
-            np.asarray(mesh.faces, np.uint32),
-            color=rgb(rgba),
-            opacity=None if rgba[3] >= 1 else float(rgba[3]),
-            flat_shading=True,
-            side="double",
-        )
-
-
-def create_mesh(shapes: list[VisualGeom]) -> Any:
-    """Return the geoms of one body, except planes, as one trimesh mesh in the body's frame."""
-    import trimesh
-
-    meshes = []
-    for shape in shapes:
-        if shape.kind == "plane":
-            continue
-        pose = np.eye(4)
-        pose[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
-        pose[:3, 3] = shape.pos
-        meshes.append(_create_geom_mesh(shape).apply_transform(pose))
-    return trimesh.util.concatenate(meshes)
-
-
-def _create_geom_mesh(shape: VisualGeom) -> Any:
-    import trimesh
-
-    radius, half = float(shape.size[0]), float(shape.size[1])
-    if shape.kind == "box":
-        return trimesh.creation.box(extents=2 * shape.size)
-    if shape.kind == "cylinder":
-        return trimesh.creation.cylinder(radius=radius, height=2 * half, sections=24)
-    if shape.kind == "capsule":
-        return trimesh.creation.capsule(radius=radius, height=2 * half, count=[12, 12])
-    if shape.kind == "mesh":
-        return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
-    mesh = trimesh.creation.icosphere(subdivisions=2)
-    return mesh.apply_scale(shape.size if shape.kind == "ellipsoid" else radius)
-
-
-def rgb(rgba: Any, brightness: float = 1.0) -> tuple[int, int, int]:
-    """Return red, green and blue from 0 to 255 of a colour from 0 to 1, multiplied by ``brightness``."""
-    r, g, b = (round(255 * brightness * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
-    return r, g, b
+def _take_picture(flight: Flight, k: int, time: float, lights: NDArray | None, colors: NDArray) -> Picture:
+    poses, ids = flight.at(time), np.concatenate([flight.drone_ids, flight.body_ids])
+    pos, quat = (np.zeros((1, len(ids), n)) for n in (3, 4))
+    pos[0, ids] = np.concatenate([poses["pos"][k], poses["body_pos"][k]])
+    quat[0, ids] = np.concatenate([poses["quat"][k], poses["body_quat"][k]])
+    drone_pos = poses["pos"][k][None]
+    if lights is None:
+        led_colors = np.zeros((1, flight.n_drones, 3))
+    else:
+        led_colors = lights[None, min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
+    spheres = {
+        "setpoints": setpoint_spheres(poses["setpoint"][k][None], colors),
+        "lights": light_spheres(drone_pos, led_colors),
+    }
+    return Picture(flight.worlds[k, None], time, pos, quat, spheres, led_colors)
 
 
 def import_viser() -> Any:

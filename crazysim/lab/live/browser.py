@@ -14,12 +14,12 @@ import numpy as np
 
 from crazysim.errors import require
 from crazysim.lab.live.browser_panel import BrowserPanel
-from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, start_guarded_server
+from crazysim.media.browser_scene import BrowserScene
 from crazysim.media.web import FOV, import_viser, require_free_port
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
@@ -94,16 +94,16 @@ class Browser(Viewer[Live]):
         sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), int(worlds[0]))
         shapes = visual_geoms(sim.mj_model, sim.mj_data)
         bodies = SceneBodies(sim, shapes)
-        self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
+        self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind, self._trail)
         self._picture = self._source.take_picture(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self._server = start_guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
         scene.set_up_direction("+z")
-        drone_pos = self._picture.drone_pos
+        drone_pos = np.asarray(sim.data.states.pos, float)[worlds]
         extent = float(np.nanmax(np.ptp(drone_pos, axis=1)[..., :2])) + 2 * WORLD_MARGIN
         spacing = extent if self._spacing is None else self._spacing
-        self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)
+        self._scene = BrowserScene(self._server, shapes, self._picture, spacing)
         camera = self._server.initial_camera
         size = max(np.ptp(self._scene.offsets[:, :2], axis=0).max() + extent, 2.0)
         camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
@@ -121,7 +121,8 @@ class Browser(Viewer[Live]):
 
         @scene.on_click()
         def _(event: Any) -> None:
-            k, body, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
+            origin, direction = event.ray_origin - self._scene.origin, np.asarray(event.ray_direction, float)
+            k, body, point = bodies.pick(self._picture, self._scene.offsets, origin, direction)
             world = int(self._picture.worlds[k])
             if body is not None:
                 live.post(lambda live: live.follow(world, body.kind, body.index))

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.lab.live.browser_scene import BrowserScene
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
-from crazysim.lab.live.picture import Picture, list_quantities
+from crazysim.lab.live.picture import list_quantities
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
 from crazysim.lab.live.viewer import Slider, Widget
+from crazysim.media.browser_scene import BrowserScene
+from crazysim.media.picture import Picture
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
 """Speeds that the panel offers."""
@@ -88,10 +89,13 @@ class BrowserPanel:
             self._text.content = f"**{picture.status}**"
             if picture.selected is not None and self._drone_input.value != picture.selected[1]:
                 self._drone_input.value = picture.selected[1]
-            if picture.followed is not None and self._world_input.value != picture.followed[0]:
-                self._world_input.value = picture.followed[0]
-            if self._body_input is not None and self._body_input.value != picture.followed_name:
-                self._body_input.value = picture.followed_name
+            world, name = self._world_input.value, ""
+            if picture.focus is not None:
+                world, name = int(picture.worlds[picture.focus.shown_index]), picture.focus.name
+            if self._world_input.value != world:
+                self._world_input.value = world
+            if self._body_input is not None and self._body_input.value != name:
+                self._body_input.value = name
         plot_key = (self.plot, picture.selected, len(picture.plot))
         if plot_key != self._plot_key or (self._samples and picture.time < self._samples[-1][0]):
             self._plot_key = plot_key

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from crazysim.lab.live.picture import Picture
+from crazysim.media.picture import Picture
 from crazysim.media.trail import COLORS
 
 MAX_SAMPLES = 400

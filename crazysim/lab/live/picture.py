@@ -1,9 +1,9 @@
-"""Pictures of a live simulation: everything that a viewer draws at one moment, as NumPy arrays."""
+"""Pictures of a live simulation, and the quantities that viewers plot."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -14,62 +14,40 @@ from crazysim.core.data import SimData
 from crazysim.engine.pytree import has_members, scopes
 from crazysim.engine.stage import vmap_drones, vmap_worlds
 from crazysim.lab.live.loop import Live
-from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
+from crazysim.media.picture import Focus, Picture, Spheres, light_spheres, setpoint_spheres
+from crazysim.media.trail import choose_drone_colors
 from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
 from crazysim.sim.sim import Sim
 
-LIGHT_RADIUS = 0.06
-"""Radius of the glow around a lit drone, m."""
 WIND_SCALE = 0.1
 """Length of a wind arrow divided by the wind speed, s."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """Everything that a viewer draws of the worlds that it shows, at one moment."""
-
-    worlds: NDArray
-    """Indices of the worlds that are shown. (n,)"""
-    time: float
-    """Simulated time since the last reset, s."""
-    status: str
-    """Time, speed, pause and recording as text."""
-    pos: NDArray
-    """Positions of all mocap bodies, world frame, m. (n, n_mocap, 3)"""
-    quat: NDArray
-    """Attitudes of all mocap bodies, body to world, xyzw. (n, n_mocap, 4)"""
-    drone_pos: NDArray
-    """Positions of the drones, world frame, m. (n, n_drones, 3)"""
-    setpoint: NDArray
-    """Goals of the loop, or else the positions in the state commands, world frame, m; empty if there is neither.
-    (n, n_drones or 0, 3)"""
-    has_contact: NDArray
-    """True where a drone touches something. (n, n_drones)"""
-    wind: NDArray
-    """Velocity of the air at every drone, world frame, m/s; empty without wind. (n, n_drones or 0, 3)"""
-    lights: NDArray
-    """Colours of the drones' LEDs, 0 to 1; zero for off. (n, n_drones, 3)"""
-    selected: tuple[int, int] | None
-    """World and index of the selected drone; None if no drone is selected."""
-    followed: tuple[int, int] | None
-    """World and mocap id of the body that the camera follows; None if the camera follows no body."""
-    followed_name: str
-    """Name of the followed body; empty if there is none."""
-    widget_lines: tuple[str, ...]
-    """Lines of text that list the buttons and sliders of the loop, for viewers without a panel."""
-    plot: NDArray
-    """Values of the plotted quantity; empty if nothing is plotted. (k,)"""
+TRAIL_PERIOD = 0.05
+"""Time between two samples of a trail, s."""
+CONTACT_COLOR, FOLLOWED_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25)
+"""Colours of marks, rgba."""
 
 
 class PictureSource:
     """Source of the pictures of one viewer."""
 
-    def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
-        self._sim, self._worlds = sim, np.asarray(worlds)
-        self._bodies = {(body.kind, body.index): body for body in bodies.items}
-        self._contacts, self._wind = contacts, wind
+    def __init__(
+        self,
+        sim: Sim,
+        bodies: SceneBodies,
+        worlds: Sequence[int],
+        contacts: bool = False,
+        wind: bool = True,
+        trail: float = 0.0,
+        setpoints: bool = True,
+    ):
+        self._sim, self._bodies, self._worlds = sim, bodies, np.asarray(worlds)
+        self._contacts, self._wind, self._setpoints = contacts, wind, setpoints
         self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air_velocity)))
+        self._colors = choose_drone_colors(sim.n_drones, None)
+        self._trail: deque[NDArray] = deque(maxlen=round(trail / TRAIL_PERIOD + 0.5) if trail > 0 else 0)
+        self._trail_time = np.inf
 
     def take_picture(self, live: Live, plot: str = "") -> Picture:
         """Return a picture of the simulation as it is now.
@@ -82,44 +60,67 @@ class PictureSource:
         data = sim.data
         pos, quat = sim.scene.host_poses(sim.plugins.with_moved_objects(sim.data), worlds)
         drone_pos = np.asarray(data.states.pos, float)[worlds]
-        empty = np.zeros((len(worlds), 0, 3))
-        state, setpoint, wind = data.controls.state, empty, empty
-        if live.goals is not None:
-            setpoint = live.goals[worlds]
-        elif state is not None:
-            setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
+        lights, focus = np.clip(live.lights[worlds], 0.0, 1.0), self._find_focus(live, pos)
+        spheres = {"lights": light_spheres(drone_pos, lights)}
+        state, goals = data.controls.state, live.goals
+        if self._setpoints and (goals is not None or state is not None):
+            setpoint = goals[worlds] if goals is not None else np.asarray(state.staged_cmd, float)[worlds, :, :3]
+            spheres["setpoints"] = setpoint_spheres(setpoint, self._colors)
+        if self._contacts:
+            has_contact = np.asarray(sim.contact_report().any)[worlds]
+            spheres["contacts"] = _marks(drone_pos, has_contact, CONTACT_COLOR, MARK_RADIUS)
+        is_followed = np.arange(len(worlds))[:, None] == (-1 if focus is None else focus.shown_index)
+        mark_pos, radius = (np.zeros(3), MARK_RADIUS) if focus is None else (focus.pos, focus.radius)
+        spheres["followed"] = _marks(np.tile(mark_pos, (len(worlds), 1, 1)), is_followed, FOLLOWED_COLOR, radius)
+        arrows = np.zeros((len(worlds), 0, 2, 3))
         if self._wind and _find_winds(data):
             wind = np.asarray(self._wind_fn(data), float)[worlds]
-        has_contact = (
-            np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drone_pos.shape[:2], bool)
-        )
-        plot_values = np.zeros(0)
+            arrows = np.stack([drone_pos, drone_pos + WIND_SCALE * wind], axis=2)
+        values = np.zeros(0)
         if plot and live.selected is not None:
             quantity_fn = live.quantities.get(plot)
-            plot_values = (
-                read_quantity(data, plot, *live.selected)
-                if quantity_fn is None
-                else np.ravel(np.asarray(quantity_fn(live), float))
-            )
-        followed = live.followed
-        body = None if followed is None else self._bodies.get(followed[1:])
+            values = read_quantity(data, plot, *live.selected) if quantity_fn is None else quantity_fn(live)
         return Picture(
             worlds=worlds,
             time=live.time,
-            status=live.status,
             pos=pos,
             quat=quat,
-            drone_pos=drone_pos,
-            setpoint=setpoint,
-            has_contact=has_contact,
-            wind=wind,
-            lights=np.clip(live.lights[worlds], 0.0, 1.0),
+            spheres=spheres,
+            lights=lights,
+            wind=arrows,
+            trail=self._extend_trail(live.time, pos),
+            focus=focus,
+            status=live.status,
             selected=live.selected,
-            followed=None if body is None or followed is None else (followed[0], body.mocap),
-            followed_name="" if body is None else body.name,
             widget_lines=live.widget_lines,
-            plot=plot_values,
+            plot=np.ravel(np.asarray(values, float)),
         )
+
+    def _find_focus(self, live: Live, pos: NDArray) -> Focus | None:
+        if live.followed is None:
+            return None
+        world, kind, index = live.followed
+        body = next((body for body in self._bodies.items if (body.kind, body.index) == (kind, index)), None)
+        if body is None or world not in self._worlds:
+            return None
+        k = self._worlds.tolist().index(world)
+        return Focus(k, pos[k, body.mocap], self._bodies.mark_radius(body.mocap), body.name)
+
+    def _extend_trail(self, time: float, pos: NDArray) -> NDArray:
+        pos, path = pos[:, self._bodies.trail_mocap_ids], self._trail
+        if not path.maxlen:
+            return pos[None]
+        if time < self._trail_time:  # the first picture, or a jump back in time
+            path.extend([pos] * path.maxlen)
+            self._trail_time = time
+        elif time >= self._trail_time + TRAIL_PERIOD:
+            path.append(pos)
+            self._trail_time = time
+        return np.stack([*path, pos])
+
+
+def _marks(pos: NDArray, is_shown: NDArray, rgba: Sequence[float], radius: float) -> Spheres:
+    return Spheres(pos, is_shown, np.broadcast_to(np.array(rgba), (*is_shown.shape, 4)), radius)
 
 
 def _find_winds(data: SimData) -> list[Wind | WindField]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import rotate
+from crazysim.media.picture import Picture
 from crazysim.scene.visual_geoms import VisualGeom
 from crazysim.sim.sim import Sim
 
@@ -19,6 +20,8 @@ DRONE = "drone"
 """Kind of drones."""
 MARK_RADIUS = 0.12
 """Radius of the sphere that marks a drone, and smallest radius of the spheres that mark other bodies, m."""
+CLICK_SIZE = 0.02
+"""Smallest half size of the box in which a click hits a body, as a fraction of the distance from the camera."""
 MAX_TRAILS = 256
 """Largest number of bodies of a world for which all have trails; with more bodies, only drones have trails."""
 
@@ -100,6 +103,48 @@ class SceneBodies:
             choices = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
             raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {choices}.")
         return match
+
+    def pick(
+        self, picture: Picture, offsets: NDArray, origin: NDArray, direction: NDArray
+    ) -> tuple[int, SceneBody | None, NDArray | None]:
+        """Return what a ray from the camera hits: the index of a shown world, a body, and a point of the floor.
+
+        If the ray hits a body, the point is None; if it hits the floor, the body is None. If it hits nothing, both are
+        None and the index is 0. The point is in the frame of the world, m. (3,)
+
+        Args:
+            picture: Picture that the user has seen.
+            offsets: Origins of the worlds that are shown, m. (n, 3)
+            origin: Origin of the ray, m. (3,)
+            direction: Direction of the ray. (3,)
+        """
+        direction = direction / np.linalg.norm(direction)
+        distances = self._ray_distances(picture.quat, origin - picture.pos - offsets[:, None], direction)
+        if np.isfinite(distances).any():
+            shown_index, mocap = np.unravel_index(distances.argmin(), distances.shape)
+            return int(shown_index), self.items[self.owner[mocap]], None
+        if direction[2] > -1e-6:
+            return 0, None, None
+        point = origin - direction * origin[2] / direction[2]
+        shown_index = int(np.linalg.norm(offsets - point, axis=-1).argmin())
+        return shown_index, None, point - offsets[shown_index]
+
+    def _ray_distances(self, quat: NDArray, start: NDArray, direction: NDArray) -> NDArray:
+        # The distance is infinite if the ray does not enter the box around the body. Boxes of small and distant bodies
+        # are enlarged, so that these bodies are easy to click.
+        distance = np.linalg.norm(start, axis=-1, keepdims=True)
+        is_drone = np.array([self.items[k].kind == DRONE for k in self.owner])
+        min_radius = np.maximum(np.where(is_drone, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * distance)
+        to_body = quat * (-1, -1, -1, 1)
+        local_start = rotate(to_body, start)
+        local_direction = rotate(to_body, np.broadcast_to(direction, start.shape))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            to_low = (np.minimum(self.low, -min_radius) - local_start) / local_direction
+            to_high = (np.maximum(self.high, min_radius) - local_start) / local_direction
+        entry_distance, exit_distance = np.fmin(to_low, to_high).max(-1), np.fmax(to_low, to_high).min(-1)
+        is_hit = (entry_distance > 0) & (entry_distance <= exit_distance) & (self.high > self.low).any(-1)
+        ray_distance = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
+        return np.where(is_hit, ray_distance, np.inf)
 
 
 def _list_drones(sim: Sim) -> list[tuple[str, int]]:

@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import pickle
-import struct
 import subprocess
 import sys
 import threading
@@ -23,9 +22,10 @@ import crazysim
 from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, RenderError, require
 from crazysim.lab.live.loop import Live
-from crazysim.lab.live.picture import Picture, PictureSource, list_quantities
+from crazysim.lab.live.picture import PictureSource, list_quantities
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
+from crazysim.media.picture import Picture
 from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import require_screen
@@ -35,8 +35,6 @@ OPEN_TIMEOUT = 60.0
 """Longest time to wait for the window to open, s."""
 CLOSE_TIMEOUT = 3.0
 """Longest time to wait for the window to close, s."""
-LENGTH_PREFIX = struct.Struct("<Q")
-"""Format of the length, bytes, in front of each message to the process of the window."""
 
 log = logging.getLogger(__name__)
 
@@ -97,14 +95,14 @@ class Window(Viewer[Live]):
         sim.scene.compile_if_edited()
         sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
         bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
-        self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind)
+        self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind, self.trail, self.setpoints)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self._process = process = subprocess.Popen(
             [sys.executable, "-m", "crazysim.lab.live.window_program"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": path},
         )  # fmt: skip
         settings = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        _send_message(process, {"model": serialize_model(sim.mj_model), "bodies": bodies, "settings": settings})
+        _send_message(process, {"model": _serialize_model(sim.mj_model), "bodies": bodies, "settings": settings})
         ready_event = threading.Event()
         threading.Thread(target=self._read_actions, args=(live, process, ready_event), daemon=True).start()
         if not ready_event.wait(OPEN_TIMEOUT) or not self.is_open:
@@ -163,14 +161,12 @@ class Window(Viewer[Live]):
         ready_event.set()
 
 
-def serialize_model(model: mujoco.MjModel) -> bytes:
-    """Return a compiled model as the content of an ``.mjb`` file."""
+def _serialize_model(model: mujoco.MjModel) -> bytes:
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def _send_message(process: subprocess.Popen[bytes], message: object) -> None:
-    content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    process.stdin.write(LENGTH_PREFIX.pack(len(content)) + content)
+    process.stdin.write(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
     process.stdin.flush()

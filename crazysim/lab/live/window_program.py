@@ -5,6 +5,7 @@ It writes the user's actions to its output.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
@@ -19,10 +20,9 @@ import numpy as np
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import RenderError
 from crazysim.lab.live.chart import Chart
-from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
-from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
-from crazysim.lab.live.window import LENGTH_PREFIX
-from crazysim.media.trail import Trail, choose_drone_colors
+from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.media.picture import WIND_COLOR, WIND_RADIUS, Picture
+from crazysim.media.trail import draw_paths
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import SceneWindow
@@ -36,10 +36,6 @@ DOUBLE_CLICK_TIME = 0.35
 """Longest time between the clicks of a double click, s."""
 MAX_CLICK_MOVE = 0.01
 """Largest movement of the cursor between the clicks of a double click, as a fraction of the window's size."""
-SETPOINT_RADIUS = 0.02
-"""Radius of a setpoint's sphere, m."""
-CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
-"""Colours of marks, rgba."""
 
 
 class Inbox:
@@ -52,19 +48,10 @@ class Inbox:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        while (message := read_message(self._stream)) is not None:
-            self.picture = message
+        with contextlib.suppress(EOFError, pickle.UnpicklingError):
+            while True:
+                self.picture = pickle.load(self._stream)
         self.has_ended = True
-
-
-def read_message(stream: BinaryIO) -> Any:
-    """Return the next message of a stream; None at its end."""
-    head = stream.read(LENGTH_PREFIX.size)
-    if len(head) < LENGTH_PREFIX.size:
-        return None
-    (length,) = LENGTH_PREFIX.unpack(head)
-    content = stream.read(length)
-    return pickle.loads(content) if len(content) == length else None
 
 
 class Leds:
@@ -94,8 +81,7 @@ class Program:
     def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
         self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
         self._out = out
-        self._trail_mocap_ids, self._leds = bodies.trail_mocap_ids, Leds(model)
-        self._trail = Trail(settings["trail"]) if settings["trail"] > 0 else None
+        self._leds = Leds(model)
         self._overlays = Overlays(limit=100_000)
         self._camera = mujoco.MjvCamera()
         fixed_camera_id = camera_id(model, settings["camera"])
@@ -120,8 +106,6 @@ class Program:
             if picture is None or (picture is last_picture and now - last_draw_time < REDRAW_TIME):
                 time.sleep(IDLE_TIME)
                 continue
-            if picture is not last_picture and self._trail is not None:
-                self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._trail_mocap_ids])
             if picture is not last_picture:
                 self._chart.add(picture)
             last_picture, last_draw_time = picture, now
@@ -130,11 +114,8 @@ class Program:
 
     def draw(self, picture: Picture) -> None:
         """Draw a picture, and report a double click."""
-        if self._settings["follow"] and picture.followed is not None and picture.followed[0] in picture.worlds:
-            k = picture.worlds.tolist().index(picture.followed[0])
-            point = picture.pos[k, picture.followed[1]]
-            if np.isfinite(point).all():
-                self.window.look_at(point)
+        if self._settings["follow"] and picture.focus is not None and np.isfinite(picture.focus.pos).all():
+            self.window.look_at(picture.focus.pos)
         n, settings = len(picture.worlds), self._settings
         self.window.draw_tiles(
             n, lambda k: self._compose_tile(picture, k), self._camera, settings["width"], settings["height"]
@@ -143,31 +124,20 @@ class Program:
             self._report_click(picture, self.window.pick(n, lambda k: self._compose_tile(picture, k)))
 
     def _compose_tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
-        data, overlays, settings = self._data, self._overlays, self._settings
+        data, overlays = self._data, self._overlays
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
         update_poses(self._model, data)
         overlays.clear()
-        drones = picture.drone_pos[k]
-        colors = choose_drone_colors(len(drones), None)
-        if self._trail is not None:
-            self._trail.draw(overlays, k)
-        if settings["setpoints"] and len(picture.setpoint[k]):
-            overlays.points(picture.setpoint[k], colors, SETPOINT_RADIUS)
-        if picture.has_contact[k].any():
-            overlays.points(drones[picture.has_contact[k]], CONTACT_COLOR, MARK_RADIUS)
-        for pos, wind in zip(drones, picture.wind[k], strict=False):
-            if wind.any():
-                overlays.capsule(pos, pos + WIND_SCALE * wind, 0.006, WIND_COLOR, cylinder=True)
+        draw_paths(overlays, picture.trail[:, k])
+        for spheres in picture.spheres.values():
+            is_shown = spheres.is_shown[k]
+            overlays.points(spheres.pos[k, is_shown], spheres.rgba[k, is_shown], spheres.radius, spheres.emission)
+        for start, end in picture.wind[k]:
+            overlays.capsule(start, end, WIND_RADIUS, WIND_COLOR, cylinder=True)
         self._leds.set_colors(picture.lights[k])
-        is_lit = picture.lights[k].any(-1)
-        if is_lit.any():
-            overlays.points(
-                drones[is_lit], np.insert(picture.lights[k, is_lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0
-            )
-        if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
-            followed_pos, radius = picture.pos[k, picture.followed[1]], self._bodies.mark_radius(picture.followed[1])
-            overlays.points(followed_pos[None], FOLLOWED_COLOR, radius)
-            overlays.label(_ascii(picture.followed_name), followed_pos + [0.0, 0.0, radius])
+        focus = picture.focus
+        if focus is not None and focus.shown_index == k:
+            overlays.label(_ascii(focus.name), focus.pos + [0.0, 0.0, focus.radius])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()
@@ -219,9 +189,7 @@ def main() -> int:
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # output of libraries must not reach the simulation
     stream = sys.stdin.buffer
-    setup = read_message(stream)
-    if setup is None:
-        return 1
+    setup = pickle.load(stream)
     model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": setup["model"]})
     try:
         program = Program(model, setup["bodies"], setup["settings"], out)

@@ -15,9 +15,9 @@ from waiting import wait_for
 from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Browser, Live, Pilot
-from crazysim.lab.live.browser_scene import grid_offsets
 from crazysim.lab.live.picture import PictureSource, list_quantities, read_quantity
 from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.media.browser_scene import grid_offsets
 from crazysim.media.web import FOV
 from crazysim.plugins.vehicles import Cars
 from crazysim.sim import Sim
@@ -330,26 +330,32 @@ def test_a_picture_contains_all_that_viewers_draw():
     live.lights[1] = [[2.0, 0.5, 0.0], [0.0, 0.0, 0.0]]
     sim.scene.compile_if_edited()
     bodies = SceneBodies(sim)
-    source = PictureSource(sim, bodies, [1, 2], contacts=True, wind=True)
+    source = PictureSource(sim, bodies, [1, 2], contacts=True, trail=0.1)
     picture = source.take_picture(live, "states.pos")
-    np.testing.assert_allclose(picture.drone_pos[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
-    np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drone_pos)
+    drone_pos = picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)]
+    np.testing.assert_allclose(drone_pos[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.objects.mocap_ids)], [[[0, 0, 3]]] * 2)
-    np.testing.assert_allclose(picture.setpoint[0, 0], [1, 2, 3])
-    np.testing.assert_allclose(picture.wind, np.broadcast_to([1, 2, 0], (2, 2, 3)))
-    np.testing.assert_array_equal(picture.has_contact, [[False, True], [False, False]])  # one stands on the floor
+    np.testing.assert_allclose(picture.spheres["setpoints"].pos[0, 0], [1, 2, 3])
+    np.testing.assert_allclose(picture.wind[:, :, 0], drone_pos, atol=1e-6)
+    np.testing.assert_allclose(np.diff(picture.wind, axis=2), np.full((2, 2, 1, 3), [0.1, 0.2, 0]), atol=1e-6)
+    contacts = picture.spheres["contacts"].is_shown
+    np.testing.assert_array_equal(contacts, [[False, True], [False, False]])  # one stands on the floor
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(source.take_picture(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
-    assert picture.followed_name == sim.drone_names[0]
+    assert (picture.focus.shown_index, picture.focus.name) == (0, sim.drone_names[0])
+    np.testing.assert_allclose(picture.focus.pos, drone_pos[0, 0], atol=1e-6)
+    assert picture.spheres["followed"].is_shown.tolist() == [[True], [False]]
     np.testing.assert_allclose(picture.lights[0], [[1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    assert picture.spheres["lights"].is_shown.tolist() == [[True, False], [False, False]]
     live.follow(2, "ball", 0)
     picture = source.take_picture(live, "states.pos")
-    assert (picture.followed, picture.followed_name) == ((2, bodies.find("ball", 0).mocap), "ball")
+    assert (picture.focus.shown_index, picture.focus.name) == (1, "ball")
+    np.testing.assert_allclose(picture.focus.pos, [0, 0, 3])
     assert picture.selected == (1, 0)
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)  # of the selected drone
-    live.select(1, 0)
-    assert source.take_picture(live).followed == (1, bodies.find("drone", 0).mocap)
+    live.select(0, 0)
+    assert source.take_picture(live).focus is None, "world 0 is not shown"
     assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(list_quantities(sim))
     np.testing.assert_allclose(read_quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):

@@ -72,8 +72,8 @@ def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(live_and_pilot, 
     assert len(refused) == 5
     assert "expected x y z, m, got 'home'" in refused[0]
     assert "within the arena of 'hover', x and y from -3 to 3 m, z from 0.02 to 3 m, got 4 0 1" in refused[2]
-    source = PictureSource(live.sim, SceneBodies(live.sim), [0, 1], contacts=False, wind=False)
-    np.testing.assert_array_equal(source.take_picture(live).setpoint, pilot.goals)
+    source = PictureSource(live.sim, SceneBodies(live.sim), [0, 1])
+    np.testing.assert_array_equal(source.take_picture(live).spheres["setpoints"].pos, pilot.goals)
     live.selected = None
     pilot.listen(live, ["0 0 1"]).join()
     live.run(0.1)

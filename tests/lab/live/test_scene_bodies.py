@@ -6,7 +6,7 @@ import pytest
 from crazysim import Cars, Hook, Sim
 from crazysim.errors import ConfigError
 from crazysim.lab.live import Live
-from crazysim.lab.live.browser_trails import Trails
+from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -76,25 +76,17 @@ def test_the_followed_body(sim):
         live.follow(0, "drone", 2)
 
 
-class Handle:
-    visible, points = True, None
+def test_trails_follow_bodies_and_restart_after_a_reset(sim, bodies):
+    live, ball = Live(sim), bodies.find("ball", 0)
+    source, k = PictureSource(sim, bodies, [1], trail=0.2), bodies.trail_mocap_ids.tolist().index(ball.mocap)
 
+    def take_trail(step, x):
+        live.step, objects = step, sim.data.objects
+        pos = objects.pos.at[..., np.asarray(objects.mocap_ids).tolist().index(ball.mocap), 0].set(x)
+        sim.data = sim.data.replace(objects=objects.replace(pos=pos))
+        return source.take_picture(live).trail[:, 0, k, 0]
 
-class Scene:
-    """A stand-in for a scene of viser that keeps the trails' segments."""
-
-    def add_line_segments(self, _name, points, colors, **_):
-        self.handle = Handle()
-        self.handle.points, self.handle.colors = points, colors
-        return self.handle
-
-
-def test_trails_follow_bodies_and_restart_after_a_reset():
-    scene = Scene()
-    trails = Trails(scene, np.zeros((2, 3)), np.ones((2, 3)), 0.2)
-    for k in range(5):
-        trails.update(0.06 * k, np.array([[0.1 * k, 0, 0], [0, 0, 1.0]]), True)
-    segments = scene.handle.points.reshape(4, 2, 2, 3)
-    np.testing.assert_allclose(segments[:, 0, :, 0].ravel(), [0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4, 0.4], atol=1e-6)
-    trails.update(0.0, np.array([[9.0, 0, 0], [0, 0, 1.0]]), True)
-    np.testing.assert_allclose(scene.handle.points.reshape(4, 2, 2, 3)[:, 0, :, 0], 9.0)
+    for step in range(5):
+        trail = take_trail(6 * step, 0.1 * step)
+    np.testing.assert_allclose(trail, [0.1, 0.2, 0.3, 0.4, 0.4], atol=1e-6)
+    np.testing.assert_allclose(take_trail(0, 9.0), 9.0)
