@@ -1,13 +1,15 @@
 """Figures of README.md and of docs/results.md: measure them again, and write their tables.
 
     python benchmarks/figures.py --list
+    python benchmarks/figures.py --show validation-firmware controllers
     python benchmarks/figures.py --write [--only loop step] [--device gpu] [--peer-python PATH/OF/python]
 
 ``FIGURES`` has a command for each figure. ``--write`` runs the commands for a device. It stores what they print in
-``docs/results/figures.json``, with machine, versions, date and commit. Then it writes their tables into the page,
-between the comments ``<!-- figure NAME -->`` and ``<!-- end of NAME -->``. Records of other machines stay. On a machine
-without the repository, ``--write --records FILE --commit COMMIT`` writes the records to a file. In the repository,
-``--write --take FILE`` then puts them into the page.
+``docs/results/figures.json``, with machine, versions, date and commit. Then it writes the tables of ``tables.TABLES``
+into the pages, below the lines that end with ``<!-- figure NAME -->``. ``docs/results/tables.json`` has the tables that
+no command of ``FIGURES`` measures, and ``train.py --write`` writes ``docs/results/training.json``. Records of other
+machines stay. On a machine without the repository, ``--write --records FILE --commit COMMIT`` writes the records to a
+file. In the repository, ``--write --take FILE`` then puts them into the page.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,25 +29,32 @@ import tables
 from tables import Line
 
 ROOT = Path(__file__).parents[1]
-RECORDS_FILE = ROOT / "docs" / "results" / "figures.json"
+RESULTS = ROOT / "docs" / "results"
 PAGES = ("README.md", "docs/results.md")
 """Pages with figures."""
 MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
 """Keys of lines that a record holds once for all lines."""
+SHORT_NAMES = {
+    "2 cores of Intel(R) Xeon(R) Processor (AVX2)": "Xeon",
+    "2 cores of AMD EPYC (AVX-512)": "EPYC",
+    "AMD EPYC": "EPYC",
+    "NVIDIA H100 80GB HBM3": "H100",
+    "NVIDIA H200": "H200",
+}
+"""Names of machines in the tables. The page explains them."""
+MOST_NAMES = 4
+"""Figures that a table names at most."""
 VERSUS = "versus_crazyflow.py"
+MARKER = re.compile(r"<!-- figure (\S+) -->$", re.MULTILINE)
 
 
 class Figure(NamedTuple):
-    """A table of the page, and the command that measures it."""
+    """The commands that measure a figure."""
 
     cpu: str = ""
     """Command on two cores, without ``python benchmarks/``; empty if the figure has no command for a CPU."""
     gpu: str = ""
     """Command on GPUs, in the same form."""
-    table: Callable[[list[Line]], str] | None = None
-    """Function that returns the Markdown of a record's lines; None for a figure that the page describes in words."""
-    shown: Callable[[Line], bool] = lambda line: True
-    """Whether the page shows a line. The machine of the record is its entry ``machine``."""
 
     def command(self, device: str) -> str:
         """Return the command for a device."""
@@ -55,6 +64,9 @@ class Figure(NamedTuple):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--list", action="store_true", help="list figures, commands and records")
+    parser.add_argument(
+        "--show", nargs="+", default=[], metavar="NAME", choices=table_names(), help="print tables of stored records"
+    )
     parser.add_argument("--write", action="store_true", help="measure, and write records and pages")
     parser.add_argument(
         "--only", nargs="*", choices=list(FIGURES), default=list(FIGURES), help="figures that --write measures"
@@ -71,6 +83,8 @@ def main() -> None:
     failures: list[str] = []
     if args.list:
         print("\n".join(list_figures()))
+    for name in args.show:
+        print("\n".join(make_table(name, page_records())), end="\n\n")
     if args.write:
         if args.take:
             records = [record for path in args.take for record in json.loads(path.read_text())]
@@ -150,12 +164,12 @@ def run_git(*words: str) -> str:
 
 
 def load_records() -> list[Line]:
-    """Return the stored records."""
-    return json.loads(RECORDS_FILE.read_text())
+    """Return the records of measured figures."""
+    return json.loads((RESULTS / "figures.json").read_text())
 
 
 def records_text(records: Iterable[Line]) -> str:
-    """Return records as the text of ``RECORDS_FILE``."""
+    """Return records as the text of a file."""
     return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
 
 
@@ -164,173 +178,152 @@ def store_records(records: list[Line]) -> None:
     record_by_key = {(record["figure"], record["machine"]): record for record in [*load_records(), *records]}
     order = list(FIGURES)
     sorted_records = sorted(record_by_key.values(), key=lambda x: (order.index(x["figure"]), x["machine"]))
-    RECORDS_FILE.write_text(records_text(sorted_records))
+    (RESULTS / "figures.json").write_text(records_text(sorted_records))
+
+
+def page_records() -> list[Line]:
+    """Return all records: measured figures, other tables, and a record for each row of the trainings."""
+    rows = json.loads((RESULTS / "training.json").read_text())
+    trainings = [
+        {"figure": "training", "lines": [row]} | {name: row[name] for name in ("machine", "date", "commit")}
+        for row in rows
+    ]
+    return [*load_records(), *json.loads((RESULTS / "tables.json").read_text()), *trainings]
 
 
 def write_pages() -> None:
     """Write the tables of all stored records into the pages."""
+    records = page_records()
     for path in PAGES:
         page = ROOT / path
         text = page.read_text()
-        if (written := insert_tables(text, load_records())) != text:
+        if (written := insert_tables(text, records)) != text:
             page.write_text(written)
 
 
 def figure_names(text: str) -> list[str]:
-    """Return the names of the figures whose comments a page has."""
-    return re.findall(r"^<!-- figure (\S+) -->$", text, re.MULTILINE)
+    """Return the names of the tables that a page has."""
+    return MARKER.findall(text)
 
 
 def insert_tables(text: str, records: list[Line]) -> str:
-    """Return a page with the tables of records between its comments."""
+    """Return a page with each table below the line that ends with its comment, after machine, date and commit."""
     for name in figure_names(text):
-        begin, end = f"<!-- figure {name} -->", f"<!-- end of {name} -->"
-        before, _, rest = text.partition(begin)
-        _, _, after = rest.partition(end)
-        text = f"{before}{begin}\n\n{figure_tables(name, records)}\n\n{end}{after}"
+        origin, table = make_table(name, records)
+        replacement = f"{origin} <!-- figure {name} -->\n\n{table}\n"
+        pattern = rf"^.*<!-- figure {name} -->\n\n(?:\|.*\n)*"
+        text = re.sub(pattern, lambda match, new=replacement: new, text, flags=re.MULTILINE)
     return text
 
 
-def figure_tables(name: str, records: list[Line]) -> str:
-    """Return the tables of a figure, below their machines, versions, dates, commits and commands.
-
-    Tables with the same columns become one, with a column for the machine.
-    """
-    if name == "readme":
-        return tables.readme(records)
-    figure = FIGURES[name]
-    assert figure.table is not None
-    origins: dict[str, list[str]] = {}
-    rows: dict[str, list[tuple[str, str]]] = {}
-    for record in (record for record in records if record["figure"] == name):
-        lines = [line for line in record["lines"] if figure.shown(line | {"machine": record["machine"]})]
-        if not lines:
-            continue
-        versions = f"jax {record['jax']}, Python {record['python']}, {record['date']}, commit {record['commit']}"
-        head, rule, *group = figure.table(lines).splitlines()
-        origins.setdefault(f"{head}\n{rule}", []).append(f"{record['machine']} ({versions}, `{record['command']}`)")
-        rows.setdefault(f"{head}\n{rule}", []).extend((machine_text(record["machine"]), row) for row in group)
-    parts = []
-    for head, texts in origins.items():
-        if len(texts) > 1:
-            head_lines = [f"| Machine {head}".replace("\n", "\n| --- ")]
-            lines = head_lines + [f"| {machine} {row}" for machine, row in rows[head]]
-        else:
-            lines = [head, *(row for _, row in rows[head])]
-        parts += ["; ".join(texts) + ":", "\n".join(lines)]
-    return "\n\n".join(parts)
+def table_names() -> list[str]:
+    """Return the names of all tables."""
+    return sorted(tables.TABLES.keys() | {x["figure"] for x in page_records() if "rows" in x})
 
 
-def machine_text(machine: str) -> str:
-    """Return the short name of a machine, such as ``H100``."""
-    return machine.split()[1] if machine.startswith("NVIDIA") else "CPU"
+def make_table(name: str, records: list[Line]) -> tuple[str, str]:
+    """Return the origin of a table as text, and the table."""
+    names = tables.figures_of(name)
+    shown = [x for figure in names for x in records if x["figure"] == figure]
+    machines = {(x["figure"], x["machine"]) for x in shown}
+    # A processor that was also measured without its AVX-512 is shown without.
+    shown = [
+        x
+        for x in shown
+        if "AVX-512" not in x["machine"] or (x["figure"], x["machine"].replace("AVX-512", "AVX2")) not in machines
+    ]
+    if "rows" in shown[0]:
+        return origin_text(shown), tables.markdown_table(shown[0]["head"], shown[0]["rows"])
+    lines = [
+        line | {"machine": SHORT_NAMES.get(x["machine"], x["machine"]), "name": x["figure"]}
+        for x in shown
+        for line in x["lines"]
+    ]
+    return origin_text(shown), tables.TABLES[name][1](lines)
 
 
-def is_avx2(line: Line) -> bool:
-    """Whether a line is from a GPU, or from a CPU without its AVX-512."""
-    return "(AVX-512)" not in line["machine"]
-
-
-def is_gpu(line: Line) -> bool:
-    """Whether a line is from a GPU."""
-    return "NVIDIA" in line["machine"]
-
-
-def is_large(line: Line) -> bool:
-    """Whether a line of a comparison has the most worlds of its device, and one integrator."""
-    largest = 262144 if is_gpu(line) else 16384
-    return is_avx2(line) and line["n_worlds"] == largest and line["integrator"] == "euler"
+def origin_text(records: list[Line]) -> str:
+    """Return names, machines, dates and commits of records, and the commands of tables without a figure."""
+    machines_by_source: dict[str, dict[str, None]] = {}
+    for x in records:
+        machine = SHORT_NAMES.get(x["machine"]) or x["machine"]
+        about = [
+            x["date"],
+            f"commit {x['commit']}" if "commit" in x else "",
+            f"`{x['command']}`" if "rows" in x and "command" in x else "",
+        ]
+        machines_by_source.setdefault(", ".join(filter(None, about)), {})[machine] = None
+    names = dict.fromkeys(f"`{x['figure']}`" for x in records)
+    origins = [f"{', '.join(machines)}, {about}" for about, machines in machines_by_source.items()]
+    return (f"{', '.join(names)}: " if len(names) <= MOST_NAMES else "") + "; ".join(origins)
 
 
 FIGURES: dict[str, Figure] = {
-    "loop": Figure(f"{VERSUS} --only loop --repeats 9", "loop.py", tables.loops, is_avx2),
-    "step": Figure(
-        gpu="step.py --controllers auto crazyflow --worlds 1024 16384 262144 4194304 --repeats 5", table=tables.rates
-    ),
-    "step-randomised": Figure(
-        gpu="step.py --controllers auto --worlds 4194304 --integrators euler --randomised", table=tables.rates
-    ),
-    "limits": Figure(gpu="limits.py", table=tables.limits),
+    "loop": Figure(f"{VERSUS} --only loop --repeats 9", "loop.py"),
+    "step": Figure(gpu="step.py --controllers auto crazyflow --worlds 1024 16384 262144 4194304 --repeats 5"),
+    "step-randomised": Figure(gpu="step.py --controllers auto --worlds 4194304 --integrators euler --randomised"),
+    "limits": Figure(gpu="limits.py"),
     "versus": Figure(
         f"{VERSUS} --only step --repeats 5",
         f"{VERSUS} --only step --worlds 1024 16384 262144 --integrators euler --repeats 5",
-        tables.versus,
-        is_large,
     ),
-    "gradient-versus": Figure(f"{VERSUS} --only gradient --repeats 9", "", tables.versus, is_avx2),
-    "gradient": Figure(
-        "gradient.py --worlds 1024",
-        "gradient.py --worlds 1024 16384 131072",
-        tables.gradients,
-        lambda line: line["n_worlds"] != 16384,
-    ),
-    "coupled": Figure(gpu="coupled.py", table=tables.coupled),
-    "envs": Figure("envs.py --actions random policy", "envs.py --actions random policy", tables.env_rates),
-    "envs-training": Figure(gpu="envs.py --actions training --worlds 4096 65536 262144", table=tables.env_rates),
+    "gradient-versus": Figure(f"{VERSUS} --only gradient --repeats 9"),
+    "gradient": Figure("gradient.py --worlds 1024", "gradient.py --worlds 1024 16384 131072"),
+    "coupled": Figure(gpu="coupled.py"),
+    "envs": Figure("envs.py --actions random policy", "envs.py --actions random policy"),
+    "envs-training": Figure(gpu="envs.py --actions training --worlds 4096 65536 262144"),
     "envs-depth": Figure(gpu="envs.py --tasks avoid --worlds 4096 --depth 16 12 --actions policy"),
     "queries": Figure(
         f"{VERSUS} --only contacts depth swarm_build gym --repeats 3",
         f"{VERSUS} --only contacts depth gym --repeats 3",
-        tables.queries,
     ),
-    "memory": Figure(f"{VERSUS} --only memory", "", tables.queries),
-    "depth": Figure("depth.py --poles 30 1000", "depth.py --worlds 16384", tables.depths, is_avx2),
+    "memory": Figure(f"{VERSUS} --only memory"),
+    "depth": Figure("depth.py --poles 30 1000", "depth.py --worlds 16384"),
     "depth-small": Figure(gpu="depth.py --worlds 4096 --size 16 12 --poles 30"),
-    "sight": Figure(gpu="sight.py", table=tables.sight),
+    "sight": Figure(gpu="sight.py"),
     "range-finder": Figure(
         "depth.py --range-finder --worlds 1024 --poles 0 4 30 100 1000",
         "depth.py --range-finder --worlds 16384 --poles 0 30 1000",
-        tables.range_finders,
-        lambda line: line["n_poles"] in (0, 30, 1000),
     ),
-    "plugins": Figure("plugins.py --repeats 7", "plugins.py --worlds 1048576 --repeats 7", tables.costs, is_gpu),
+    "plugins": Figure("plugins.py --repeats 7", "plugins.py --worlds 1048576 --repeats 7"),
     "randomize": Figure(
         "envs.py --randomize --actions random policy --worlds 1024",
         "envs.py --randomize --actions random policy --worlds 4096 1048576",
-        tables.env_rates,
     ),
     "loads": Figure(
         "flight_stack.py --cases rod cable offset",
         "flight_stack.py --worlds 4194304 --cases rod cable offset",
-        tables.costs,
     ),
-    "path-errors": Figure("vehicles.py --errors", "", tables.path_errors),
-    "vehicles": Figure(gpu="vehicles.py", table=tables.vehicles),
-    "fleets": Figure("fleets.py", "fleets.py", tables.fleets),
-    "controllers": Figure(
-        "controllers.py --worlds 0",
-        "",
-        tables.control,
-        lambda line: line["controller"] == "auto" or line["drone"] == "cf21B_500",
-    ),
+    "path-errors": Figure("vehicles.py --errors"),
+    "vehicles": Figure(gpu="vehicles.py"),
+    "fleets": Figure("fleets.py", "fleets.py"),
+    "controllers": Figure("controllers.py --worlds 0"),
     "controllers-rates": Figure(
         "controllers.py --drones cf21B_500 --attitudes 1 --repeats 5",
         "controllers.py --worlds 1048576 --drones cf21B_500 --attitudes 1",
-        tables.control_rates,
     ),
     "follow": Figure(
         "flight_stack.py --cases follow starts slots",
         "flight_stack.py --worlds 4194304 --cases follow starts slots",
-        tables.costs,
     ),
-    "mppi": Figure("mppi.py", "mppi.py", tables.commands),
-    "live": Figure("live.py --only max recorded jitter", "", tables.live),
-    "mocap": Figure("mocap.py", "", tables.mocap),
-    "first-results": Figure("first_results.py --repeat 1", "", tables.first_results),
-    "devices": Figure(gpu="devices.py --devices 1 2 4 --processes 12 --hosts 2", table=tables.devices),
-    "trainers": Figure(gpu="trainers.py --worlds 1024 65536 --seeds 3", table=tables.trainers),
-    "validation-closed": Figure("validation.py closed", "", tables.validation),
-    "validation-mujoco": Figure("validation.py mujoco", "", tables.validation),
-    "validation-firmware": Figure("validation.py firmware", "", tables.validation_by(": ")),
-    "validation-crazyflow": Figure("validation.py crazyflow", "", tables.validation),
-    "validation-rotorpy": Figure("validation.py rotorpy", "", tables.validation),
-    "validation-commonroad": Figure("validation.py commonroad", "", tables.validation),
-    "validation-idsia": Figure("validation.py idsia", "", tables.validation_by(", after ")),
+    "mppi": Figure("mppi.py", "mppi.py"),
+    "live": Figure("live.py --only max recorded jitter"),
+    "mocap": Figure("mocap.py"),
+    "first-results": Figure("first_results.py --repeat 1"),
+    "devices": Figure(gpu="devices.py --devices 1 2 4 --processes 12 --hosts 2"),
+    "trainers": Figure(gpu="trainers.py --worlds 1024 65536 --seeds 3"),
+    "validation-closed": Figure("validation.py closed"),
+    "validation-mujoco": Figure("validation.py mujoco"),
+    "validation-firmware": Figure("validation.py firmware"),
+    "validation-crazyflow": Figure("validation.py crazyflow"),
+    "validation-rotorpy": Figure("validation.py rotorpy"),
+    "validation-commonroad": Figure("validation.py commonroad"),
+    "validation-idsia": Figure("validation.py idsia"),
     "validation-nanobench": Figure("validation.py nanobench"),
     "validation-filter": Figure("validation.py filter"),
-    "validation-raptor": Figure("validation.py raptor", "", tables.validation),
-    "validation-l2f": Figure("validation.py l2f", "", tables.validation),
-    "validation-sim2sim": Figure("validation.py sim2sim", "", tables.transfers),
+    "validation-raptor": Figure("validation.py raptor"),
+    "validation-l2f": Figure("validation.py l2f"),
+    "validation-sim2sim": Figure("validation.py sim2sim"),
 }
 
 

@@ -1,4 +1,7 @@
-"""Markdown tables of the JSON lines of benchmarks, as ``figures.py`` writes them into the pages."""
+"""Markdown tables of the JSON lines of benchmarks, as ``figures.py`` writes them into the pages.
+
+A line has the name of its figure and its machine, such as ``H100``, besides what the benchmark printed.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,16 @@ from typing import Any
 from measure import round_digits
 
 Line = dict[str, Any]
-"""JSON line of a benchmark, or dict of a figure: its name, its machine, its lines, ..."""
+"""JSON line of a benchmark, or record of a figure: its name, its machine, its lines, ..."""
 
 
 def pivot(
-    lines: list[Line], row: Callable[..., str], column: Callable[..., str], value: Callable[..., str], corner: str
+    lines: list[Line],
+    row: Callable[..., str],
+    column: Callable[..., str],
+    value: Callable[..., str],
+    corner: str,
+    rows: Iterable[str] | None = None,
 ) -> str:
     """Return a Markdown table with a cell for each line.
 
@@ -22,10 +30,11 @@ def pivot(
         column: Function from a line to the name of its column.
         value: Function from a line to the text of its cell.
         corner: Heading of the names of rows.
+        rows: Names of all rows in order; by default, that of the lines.
     """
     cells = {(row(line), column(line)): value(line) for line in lines}
     columns = list(dict.fromkeys(name for _, name in cells))
-    rows = dict.fromkeys(name for name, _ in cells)
+    rows = dict.fromkeys(name for name, _ in cells) if rows is None else rows
     return markdown_table([corner, *columns], [[name, *(cells.get((name, x), "") for x in columns)] for name in rows])
 
 
@@ -74,6 +83,10 @@ def duration_text(seconds: float) -> str:
     return f"{round_digits(seconds * factor):g} {unit}"
 
 
+def machine_of(line: Line) -> str:
+    return line["machine"]
+
+
 def loops(lines: list[Line]) -> str:
     """Return times of an iteration, followed by the ratio of Crazyflow's time to ours if it was measured."""
 
@@ -85,55 +98,47 @@ def loops(lines: list[Line]) -> str:
     names = {"loop/jax": "one compiled addition, with its result in NumPy", "loop/mj_step": "C MuJoCo, one box"}
 
     def row_of(line: Line) -> str:
-        return names[line["benchmark"]] if line["benchmark"] in names else case_text(line).replace(", Euler", "")
+        case = names[line["benchmark"]] if line["benchmark"] in names else case_text(line).replace(", Euler", "")
+        return f"{line['machine']}: {case}"
 
     return pivot(lines, row_of, worlds_text, time_of, "Commands, worlds")
 
 
-def versus(lines: list[Line]) -> str:
-    """Return rates of crazysim and Crazyflow, their ratio, and the times of compilation."""
-    return columns(
-        Commands=case_text,
-        Worlds=worlds_text,
-        crazysim=lambda x: si_text(x["crazysim_steps_per_s"]),
-        Crazyflow=lambda x: si_text(x["crazyflow_steps_per_s"]),
-        Ratio=lambda x: f"{round_digits(x['ratio'], 2):g}",
-        Compilation=lambda x: f"{x['crazysim_compile_s']:.2g} s, Crazyflow {x['crazyflow_compile_s']:.2g} s",
-    )(lines)
-
-
 def rates(lines: list[Line]) -> str:
-    """Return steps per second by case and number of worlds."""
-    return pivot(lines, case_text, worlds_text, lambda x: si_text(x["steps_per_s"]), "Commands, worlds")
-
-
-def gradients(lines: list[Line]) -> str:
-    """Return rates of gradients, and the ratios of their times to the times of the steps alone."""
-    return columns(
-        Commands=lambda x: LEVELS[x["control"]],
-        Worlds=worlds_text,
-        Steps_per_second=lambda x: si_text(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
-        Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
-        Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
-        First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
-    )(lines)
-
-
-def env_rates(lines: list[Line]) -> str:
-    """Return environment steps per second by task and actions, and number of worlds."""
-    names = {"random": "random actions", "policy": "a 64 x 64 policy", "bfloat16": "the same in bfloat16",
-             "training": "iterations of PPO"}  # fmt: skip
+    """Return steps per second of the default controller by number of worlds, and the shares of the highest rates."""
+    lines = [
+        x for x in lines if "control" in x and (x["control"] == "rotor_vel" or x.get("controller", "auto") == "auto")
+    ]
 
     def row_of(line: Line) -> str:
-        image = f", a depth image of {line['depth'][0]} x {line['depth'][1]}" if line["depth"] else ""
-        randomized = ", `Randomize.crazyflie()`" if line["drones"] == "randomized" else ""
-        return f"`{line['task']}`, {names[line['actions']]}{image}{randomized}"
+        case = f"{LEVELS[line['control']]}, {INTEGRATORS[line['integrator']]}"
+        return case + ", every parameter differs" * line.get("randomised", False)
 
-    return pivot(lines, row_of, worlds_text, lambda x: si_text(x["env_steps_per_s"]), "Environment steps/s, worlds")
+    return pivot(
+        lines,
+        row_of,
+        lambda x: "share of the limit" if x["name"] == "limits" else worlds_text(x),
+        lambda x: f"{1 / x['ratio']:.0%}" if x["name"] == "limits" else si_text(x["steps_per_s"]),
+        "Commands, worlds",
+    )
 
 
-def queries(lines: list[Line]) -> str:
-    """Return times of queries, environments and constructions of both programs."""
+def versus(lines: list[Line]) -> str:
+    """Return rates, times and memory of crazysim and Crazyflow, their ratio, and the times of compilation.
+
+    Of the steps it has the most worlds of each machine, with the Euler method.
+    """
+    steps = "versus_crazyflow/step"
+    largest = {
+        x["machine"]: x["n_worlds"]
+        for x in sorted(lines, key=lambda x: x.get("n_worlds", 0))
+        if x["benchmark"] == steps
+    }
+    lines = [
+        x
+        for x in lines
+        if x["benchmark"] != steps or (x["n_worlds"] == largest[x["machine"]] and x["integrator"] == "euler")
+    ]
     names = {
         "contacts": "contacts after a step, 4,096 worlds of 4 drones, 8 objects",
         "depth": "64 x 64 depth of 1,024 worlds, 8 objects",
@@ -143,18 +148,63 @@ def queries(lines: list[Line]) -> str:
 
     def row_of(line: Line) -> list[str]:
         name = line["benchmark"].partition("/")[2]
+        ratio = line["ratio"]
         if name == "memory":
-            key, label = "bytes_per_world", f"memory of a world, drones: {line['n_drones']}"
-            ours, theirs = (f"{round_digits(line[f'{x}_{key}'] / 1000):g} kB" for x in ("crazysim", "crazyflow"))
-            return [label, ours, theirs, f"{round_digits(1 / line['ratio'], 2):g}"]
-        return [
-            names[name],
-            duration_text(line["crazysim_s"]),
-            duration_text(line["crazyflow_s"]),
-            f"{round_digits(line['ratio'], 2):g}",
-        ]
+            label, ratio = f"memory of a world after a contact query, drones: {line['n_drones']}", 1 / ratio
+            values = [f"{round_digits(line[f'{x}_bytes_per_world'] / 1000):g} kB" for x in ("crazysim", "crazyflow")]
+        elif name in names:
+            label = names[name]
+            values = [duration_text(line[f"{x}_s"]) for x in ("crazysim", "crazyflow")]
+        else:
+            prefix = "gradient of 100 steps, " if name == "gradient" else ""
+            label = f"{prefix}{case_text(line).replace(', Euler', '')}, {worlds_text(line)} worlds"
+            values = [si_text(line[f"{x}_steps_per_s"]) for x in ("crazysim", "crazyflow")]
+        seconds = [f"{line[f'{x}_compile_s']:.2g} s" for x in ("crazysim", "crazyflow") if name in ("step", "gradient")]
+        return [line["machine"], label, *values, f"{round_digits(ratio, 2):g}", ", ".join(seconds)]
 
-    return markdown_table(["", "crazysim", "Crazyflow", "Crazyflow over crazysim"], [row_of(line) for line in lines])
+    return markdown_table(
+        ["Machine", "Steps per second, time or memory", "crazysim", "Crazyflow", "Ratio", "Compilation"],
+        [row_of(line) for line in lines],
+    )
+
+
+def gradients(lines: list[Line]) -> str:
+    """Return rates of gradients, and the ratios of their times to the times of the steps alone."""
+    return columns(
+        Machine=machine_of,
+        Commands=lambda x: LEVELS[x["control"]],
+        Worlds=worlds_text,
+        Steps_per_second=lambda x: si_text(x["n_worlds"] * x["n_steps"] / x["gradient_s"]),
+        Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
+        Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
+        First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
+    )([line for line in lines if line["n_worlds"] != 16384])
+
+
+def env_rates(lines: list[Line]) -> str:
+    """Return environment steps per second by task and actions, and ratios with and without randomised drones."""
+    names = {"random": "random actions", "policy": "a 64 x 64 policy", "training": "iterations of PPO"}
+
+    def row_of(line: Line) -> str:
+        image = f", a depth image of {line['depth'][0]} x {line['depth'][1]}" if line["depth"] else ""
+        randomized = ": `Randomize.crazyflie()` over none" if "without" in line else ""
+        return f"{line['machine']}: `{line['task']}`, {names[line['actions']]}{image}{randomized}"
+
+    key = ("name", "machine", "actions", "n_worlds")
+    plain = {tuple(x[k] for k in key): x["env_steps_per_s"] for x in lines if x["drones"] != "randomized"}
+    shown = [x for x in lines if x["name"] != "randomize"] + [
+        x | {"without": plain[tuple(x[k] for k in key)]} for x in lines if x["drones"] == "randomized"
+    ]
+    shown = sorted(shown, key=lambda x: x["n_worlds"])
+    order = {row_of(x): None for x in sorted(shown, key=lambda x: ("without" in x, x["machine"] != "Xeon"))}
+    return pivot(
+        shown,
+        row_of,
+        worlds_text,
+        lambda x: f"{x['env_steps_per_s'] / x['without']:.2f}" if "without" in x else si_text(x["env_steps_per_s"]),
+        "Environment steps/s, worlds",
+        list(order),
+    )
 
 
 def poles_text(line: Line) -> str:
@@ -162,61 +212,35 @@ def poles_text(line: Line) -> str:
     return f"{line['n_poles']:,} {'movable' if line['movable'] else 'fixed'} poles" if line["n_poles"] else "none"
 
 
-depths = columns(
-    Poles=poles_text,
-    Image=lambda x: f"{x['width']} x {x['height']}, {x['n_worlds']:,} worlds",
-    Rays_per_second=lambda x: si_text(x["rays_per_s"]),
-    First_image=lambda x: duration_text(x["first_s"]),
-)
-"""Table of ``depth.py``."""
-sight = columns(
-    Case=lambda x: {
-        "policy": "`forest` with its convolution, environment steps a second",
-        "lidar": "a lidar at 10 Hz, real-time factor of each world",
-    }[x["case"]],
-    Image=lambda x: f"{x['image'][0]} x {x['image'][1]}, {x['n_worlds']:,} worlds",
-    Rate=lambda x: si_text(x["env_steps_per_s"] if x["case"] == "policy" else x["realtime"]),
-    Rays_per_second=lambda x: si_text(x["rays_per_s"]),
-    First_call=lambda x: duration_text(x["first_s"]),
-)
-"""Table of ``sight.py``."""
-range_finders = columns(
-    Poles=poles_text,
-    Worlds=worlds_text,
-    One_step=lambda x: duration_text(1e-6 * x["step_us"]),
-    First_step=lambda x: duration_text(x["first_s"]),
-)
-"""Table of ``depth.py --range-finder``."""
+def depths(lines: list[Line]) -> str:
+    """Return rates of depth images and times of steps with range finders, each with the time of the first."""
+    lines = [x for x in lines if x["n_poles"] in (0, 30, 1000)]
+    heads = {"depth": "64 x 64 depth, rays/s", "range_finder": "`RangeFinder`, one step"}
+
+    def cell(line: Line) -> str:
+        rays = si_text(line["rays_per_s"]) if "rays_per_s" in line else duration_text(1e-6 * line["step_us"])
+        return f"{rays}, {duration_text(line['first_s'])}"
+
+    return pivot(
+        sorted(lines, key=lambda x: (x["n_poles"], x["machine"] == "H100")),
+        poles_text,
+        lambda x: f"{heads[x['benchmark']]}: {x['machine']}, {worlds_text(x)} worlds",
+        cell,
+        "Poles",
+    )
 
 
 def costs(lines: list[Line]) -> str:
-    """Return the times of cases divided by the times of their references, and the rates of the cases."""
-    return columns(
-        Case=lambda x: f"`{x['case']}`",
-        Time_over_reference=lambda x: f"{x['ratio']:.3g}",
-        Reference=lambda x: f"`{x['reference']}`",
-        Steps_per_second=lambda x: si_text(x["steps_per_s"]),
-        First_call=lambda x: duration_text(x["first_s"]),
-    )(lines)
+    """Return the times of cases divided by the times of their references, rates of the cases, and first calls."""
+    return pivot(
+        lines,
+        lambda x: f"`{x['case']}` over `{x['reference']}`",
+        machine_of,
+        lambda x: f"{x['ratio']:.3g}, {si_text(x['steps_per_s'])}, {duration_text(x['first_s'])}",
+        "Case: time over reference, steps per second, first call",
+    )
 
 
-coupled = columns(
-    Drones_per_world=lambda x: str(x["n_drones"]),
-    with_downwash=lambda x: si_text(x["steps_per_s"]["downwash"]),
-    without=lambda x: si_text(x["steps_per_s"]["uncoupled"]),
-)
-"""Table of ``coupled.py``."""
-fleets = columns(
-    Fleet=lambda x: {
-        "cars": "four drones and two cars, over the drones alone",
-        "airframes": "two airframes, over one with parameters per drone",
-    }[x["case"]],
-    Worlds=worlds_text,
-    Rate_of_the_drones=lambda x: f"{round_digits(x['ratio'], 2):g}",
-)
-"""Table of ``fleets.py``."""
-vehicles = columns(Case=lambda x: f"`{x['case']}`", Steps_per_second=lambda x: si_text(x["steps_per_s"]))
-"""Table of ``vehicles.py``."""
 path_errors = columns(
     Controller=lambda x: f"`{x['controller']}`",
     **{
@@ -225,45 +249,53 @@ path_errors = columns(
     },
 )
 """Largest errors of each controller with two models of cars, one for each speed of ``vehicles.py --errors``."""
-commands = columns(
-    Samples=lambda x: f"{x['samples']:,}",
-    Commands_per_second=lambda x: si_text(x["commands_per_s"]),
-    Compilation=lambda x: duration_text(x["compile_s"]),
-)
-"""Table of ``mppi.py``: commands that sampling MPC computes per second, by number of sampled rollouts."""
-live = columns(
-    Case=lambda x: f"`{x['case']}`, {x['n_drones']} drones",
-    Times_real_time=lambda x: f"{x['factor']:g}",
-    Late_by_at_most_in_999_of_1000_steps=lambda x: f"{x['lateness_999_ms']:g} ms",
-    worst=lambda x: f"{x['worst_ms']:g} ms",
-)
-"""Table of ``live.py``."""
-mocap = columns(
-    Objects=lambda x: f"{x['n_objects']} at {x['freq']:g} Hz",
-    Rules_of_a_frame=lambda x: f"{x['frame_ms']:g} ms",
-    Update_of_the_simulation=lambda x: f"{x['update_ms']:g} ms",
-    Lost_frames=lambda x: str(x["lost"]),
-)
-"""Table of ``mocap.py``. The rules of a frame decide which measured poses are used."""
 
 
-def first_results(lines: list[Line]) -> str:
-    """Return times to the first results without and with programs in the cache."""
-    names = {
+def further(lines: list[Line]) -> str:
+    """Return machine, what is measured, and the figure, for measurements with few lines."""
+    images = {"policy": "`forest` with its convolution, 4,096 worlds", "lidar": "a lidar of 16 x 360 rays at 10 Hz"}
+    fleet = {
+        "cars": "four drones and two cars, over the drones alone",
+        "airframes": "two airframes, over one with parameters per drone",
+    }
+    first = {
         "step": "step",
         "gradient": "gradient of 100 steps, 64 worlds of 2 drones",
         "contacts": "step and `contacts()`, 64 worlds of 2 drones",
         "gymnasium": "Gymnasium: make, reset, step",
         "render": "`render`",
     }
-    heads = {"off": "`CRAZYSIM_CACHE=off`", "on": "second run"}
-    return pivot(
-        lines,
-        lambda x: names[x["case"]],
-        lambda x: heads[x["cache"]],
-        lambda x: f"{x['wall_s']:.1f} s",
-        "First result",
-    )
+
+    def row_of(x: Line) -> tuple[str, str]:
+        name = x["name"]
+        if name == "coupled":
+            rates = (si_text(x["steps_per_s"][key]) for key in ("downwash", "uncoupled"))
+            return f"{x['n_drones']} drones in a world, with and without downwash", f"{', '.join(rates)} steps/s"
+        if name == "sight":
+            is_policy = x["case"] == "policy"
+            rate = f"{si_text(x['env_steps_per_s'])} steps/s" if is_policy else f"{x['realtime']:g} times real time"
+            return images[x["case"]], f"{rate}, {si_text(x['rays_per_s'])} rays/s, first {duration_text(x['first_s'])}"
+        if name == "vehicles":
+            return "one car in a world, steps/s", f"`{x['case']}` {si_text(x['steps_per_s'])}"
+        if name == "fleets":
+            return f"rate of the drones: {fleet[x['case']]}", f"{round_digits(x['ratio'], 2):g}"
+        if name == "mppi":
+            compilation = duration_text(x["compile_s"])
+            return f"MPPI, {x['samples']:,} samples", f"{si_text(x['commands_per_s'])} commands/s, first {compilation}"
+        if name == "live":
+            late = f"late by {x['lateness_999_ms']:g} ms in 999 of 1000 steps, {x['worst_ms']:g} ms at worst"
+            return f"live, {x['n_drones']} drones, `{x['case']}`", f"{x['factor']:g} times real time, {late}"
+        if name == "mocap":
+            figures = f"{x['frame_ms']:g} ms a frame, {x['update_ms']:g} ms an update, {x['lost']} lost"
+            return f"motion capture, {x['n_objects']} objects at {x['freq']:g} Hz", figures
+        seconds = f"{x['wall_s']:.1f} s" + (" with `CRAZYSIM_CACHE=off`" if x["cache"] == "off" else " in a second run")
+        return f"first result: {first[x['case']]}", seconds
+
+    cells: dict[tuple[str, str], list[str]] = {}
+    for line in lines:
+        text, figure = row_of(line)
+        cells.setdefault((line["machine"], text), []).append(figure)
+    return markdown_table(["Machine", "", ""], [[*key, ", ".join(figures)] for key, figures in cells.items()])
 
 
 def control(lines: list[Line]) -> str:
@@ -304,20 +336,25 @@ def control(lines: list[Line]) -> str:
         "Attitude",
         "Rate",
     )
-    return markdown_table(head, [row_of(line) for line in lines if "drone" in line])
+    auto = [x for x in lines if x["controller"] == "auto"]
+    largest = {key: max(x[key] for x in auto if key in x) for key in auto[0] if isinstance(auto[0][key], float)}
+    worst = largest | {"controller": "auto", "home": min(x["home"] for x in auto)}
+    rows = [row_of(worst | {"drone": f"worst of {len(auto)}"})]
+    rows[0][1] = rows[0][1].strip("`")
+    return markdown_table(head, rows + [row_of(x) for x in lines if x["drone"] == "cf21B_500"])
 
 
 def control_rates(lines: list[Line]) -> str:
     """Return the ratios of the rates of the controllers to the rate of ``crazyflow``."""
-    rate_by_controller = {line["controller"]: line["steps_per_s"] for line in lines if "steps_per_s" in line}
-    cells = [f"{rate / rate_by_controller['crazyflow']:.2f} ({si_text(rate)})" for rate in rate_by_controller.values()]
-    return markdown_table([f'`"{name}"`' for name in rate_by_controller], [cells])
-
-
-def limits(lines: list[Line]) -> str:
-    """Return the measured rates as fractions of the highest possible rates."""
-    lines = [line for line in lines if "ratio" in line]
-    return pivot(lines, case_text, worlds_text, lambda x: f"{1 / x['ratio']:.0%}", "Commands, worlds")
+    lines = [x for x in lines if "steps_per_s" in x]
+    base = {x["machine"]: x["steps_per_s"] for x in lines if x["controller"] == "crazyflow"}
+    return pivot(
+        lines,
+        machine_of,
+        lambda x: f'`"{x["controller"]}"`',
+        lambda x: f"{x['steps_per_s'] / base[x['machine']]:.2f} ({si_text(x['steps_per_s'])})",
+        "Machine",
+    )
 
 
 def trainers(lines: list[Line]) -> str:
@@ -350,14 +387,77 @@ def validation(lines: list[Line]) -> str:
     return markdown_table(cells, zip(*cells.values(), strict=True))
 
 
-def validation_by(separator: str) -> Callable[[list[Line]], str]:
-    """Return a function that makes a table with a column for each end of the quantities, after a separator."""
-    return lambda lines: pivot(
+def within(line: Line) -> float | None:
+    """Return a figure over the end of its range, or its place in it; at most 1 is within, None has no range."""
+    text = line.get("passes", "")
+    if text.startswith("at most "):
+        return line["figure"] / float(text.removeprefix("at most "))
+    if not text:
+        return None
+    low, high = map(float, text.split(" to "))
+    return abs(2 * line["figure"] - low - high) / (high - low)
+
+
+def summary(lines: list[Line]) -> str:
+    """Return for each section of ``validation.py`` the figures within their range, and the one closest to its end."""
+    rows = []
+    for name in dict.fromkeys(line["name"] for line in lines):
+        ranged = [(share, x) for x in lines if x["name"] == name and (share := within(x)) is not None]
+        if ranged:
+            _, last = max(ranged, key=lambda pair: pair[0])
+            count = f"{sum(share <= 1 for share, _ in ranged)} of {len(ranged)}"
+            rows.append([f"`{name}`", count, last["quantity"], last["reference"], figure_text(last), last["passes"]])
+    return markdown_table(["Section", "Within", "Closest to its range", "Reference", "Figure", "Passes"], rows)
+
+
+def unranged(lines: list[Line]) -> str:
+    """Return the figures without a range."""
+    return validation([line for line in lines if within(line) is None])
+
+
+def firmware(lines: list[Line]) -> str:
+    """Return the differences from the firmware, with a column for real numbers and for integers."""
+
+    def names(line: Line) -> tuple[str, str]:
+        case, _, output = line["quantity"].rpartition(": ")
+        if output != "motors":
+            return case, output
+        case, _, numbers = case.rpartition(", ")
+        return case, f"{output}, {numbers}"
+
+    return pivot(lines, lambda x: names(x)[0], lambda x: names(x)[1], figure_text, "Quantity")
+
+
+def predictions(lines: list[Line]) -> str:
+    """Return the errors of predictions by their time."""
+    return pivot(
         lines,
-        lambda x: x["quantity"].rpartition(separator)[0],
-        lambda x: x["quantity"].rpartition(separator)[2],
+        lambda x: x["quantity"].rpartition(", after ")[0],
+        lambda x: x["quantity"].rpartition(", after ")[2],
         figure_text,
         "Quantity",
+    )
+
+
+def latencies(lines: list[Line]) -> str:
+    """Return the longest latency with which RAPTOR holds all drones, and the share with each latency."""
+    return pivot(
+        lines,
+        lambda x: x["quantity"].partition(",")[0],
+        lambda x: x["quantity"].partition(", ")[2].partition(":")[0],
+        lambda x: f"{figure_text(x)} ({x['remark'].rpartition(': ')[2]})",
+        "Drone",
+    )
+
+
+def held_shares(lines: list[Line]) -> str:
+    """Return the shares of the quadrotors that RAPTOR holds here and in l2f."""
+    return pivot(
+        lines,
+        lambda x: x["quantity"].partition(", ")[2].partition(":")[0],
+        lambda x: x["quantity"].partition(", ")[0],
+        lambda x: f"{figure_text(x)} ({x['remark']})",
+        "Latency",
     )
 
 
@@ -372,18 +472,41 @@ def transfers(lines: list[Line]) -> str:
     )
 
 
-def readme(records: list[Line]) -> str:
-    """Return the table of README.md: two cores without AVX-512, and one H100."""
-    kinds = {"cpu": "AVX2", "gpu": "H100"}
+def training(lines: list[Line]) -> str:
+    """Return the table of ``train.py``."""
+    names = {"ppo": "PPO", "apg": "analytic gradients", "dagger": "teacher by PPO, student by DAgger"}
+
+    def seeds_text(line: Line) -> str:
+        seeds = line["seeds"]
+        is_range = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
+        diverged = f"; diverged: {', '.join(map(str, line['diverged']))}" if "diverged" in line else ""
+        return (f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds))) + diverged
+
+    def time_text(line: Line) -> str:
+        text = f"{round_digits(line['seconds'], 2):g} s"
+        text += f" for {line['together']} seeds" if line.get("together", 1) != 1 else ""
+        return text + (f", {line['parallel']} at a time" if line["parallel"] != 1 else "")
+
+    return columns(
+        Task=lambda x: f"`{x['task']}`",
+        Algorithm_and_environment_steps=lambda x: (
+            f"{names[x['algorithm']]}, {round_digits(x['env_steps'] / 1e6, 2):g} M"
+        ),
+        Seeds=seeds_text,
+        Least=lambda x: f"{x['least']:.1%}",
+        Median=lambda x: f"{x['median']:.1%}",
+        Mean_error=lambda x: "" if x["error"] is None else f"{round_digits(x['error'], 2):g} {x['unit']}",
+        Time=time_text,
+    )(lines)
+
+
+def readme(lines: list[Line]) -> str:
+    """Return the table of README.md."""
+    machines = {"cpu": "Xeon", "gpu": "H100"}
     head = ["", "two cores of an Intel Xeon (AVX2)", "one NVIDIA H100"]
 
     def lines_of(name: str, device: str, **case: Any) -> list[Line]:
-        lines = [
-            line
-            for record in records
-            if record["figure"] == name and kinds[device] in record["machine"]
-            for line in record["lines"]
-        ]
+        case |= {"name": name, "machine": machines[device]}
         return [line for line in lines if all(line.get(key) == value for key, value in case.items())]
 
     def range_text(values: Iterable[float]) -> str:
@@ -456,11 +579,41 @@ def devices(lines: list[Line]) -> str:
         ratios = [f"{line['ratio']:.3g}" for (n_hosts, n), line in sorted(case.items()) if n_hosts == 1 and n > 1]
         facts = [", ".join(ratios), exchanged, memory, duration_text(last["compile_s"])]
         rows.append([f"{name}, {last['unit']} a second", worlds, *rates, *facts])
-    text = markdown_table(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
-    for line in lines:
-        if "difference" in line:
-            text += (
-                f"\n\nThree iterations of PPO moved the weights by {line['moved']:.3g} (Euclidean norm); those on "
-                f"{line['n_devices']} devices differ from those on {line['compared_with']} by {line['difference']:.2g}."
-            )
-    return text
+    return markdown_table(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
+
+
+SECTIONS = ("closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "l2f")
+TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
+    "readme": (("loop", "step", "versus", "gradient-versus", "queries", "envs"), readme),
+    "loop": (("loop",), loops),
+    "step": (("step", "step-randomised", "limits"), rates),
+    "versus": (("versus", "gradient-versus", "queries", "memory"), versus),
+    "gradient": (("gradient",), gradients),
+    "envs": (("envs", "envs-training", "envs-depth", "randomize"), env_rates),
+    "depth": (("depth", "range-finder"), depths),
+    "plugins": (("plugins", "loads", "follow"), costs),
+    "controllers-rates": (("controllers-rates",), control_rates),
+    "further": (("coupled", "sight", "vehicles", "fleets", "mppi", "live", "mocap", "first-results"), further),
+    "devices": (("devices",), devices),
+    "training": (("training",), training),
+    "trainers": (("trainers",), trainers),
+    "controllers": (("controllers",), control),
+    "validation-raptor": (("validation-raptor",), latencies),
+    "validation": (tuple(f"validation-{name}" for name in (*SECTIONS, "sim2sim")), summary),
+    "other-models": (("validation-rotorpy", "validation-commonroad"), unranged),
+    "path-errors": (("path-errors",), path_errors),
+    "validation-idsia": (("validation-idsia",), predictions),
+    "validation-sim2sim": (("validation-sim2sim",), transfers),
+    **{f"validation-{name}": ((f"validation-{name}",), validation) for name in SECTIONS if name != "idsia"},
+    "validation-firmware": (("validation-firmware",), firmware),
+    "validation-l2f": (("validation-l2f",), held_shares),
+}
+"""Figures of each table, and the function that makes it of their lines.
+
+Any other table is one of ``docs/results/tables.json``.
+"""
+
+
+def figures_of(name: str) -> tuple[str, ...]:
+    """Return the figures of a table."""
+    return TABLES[name][0] if name in TABLES else (name,)

@@ -38,6 +38,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import figures
 import numpy as np
 from measure import describe_machine, round_digits, run_in_process
 
@@ -52,9 +53,6 @@ from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
 PACKAGE = Path(crazysim.__file__).parent
 TABLE = Path(__file__).parents[1] / "docs" / "results" / "training.json"
 """The committed table, a row for each task."""
-PAGE = TABLE.parents[1] / "results.md"
-"""The page that shows the table, between two comments."""
-TABLE_START, TABLE_END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
 N_STARTS = 1000
 """Held-out starts of an evaluation of ``crazysim train``."""
 PRINTED_ENTRIES = ("task", "seed", "success", "diverged", "crashed", "error", "seconds")
@@ -305,42 +303,7 @@ def write_table(rows: list[dict[str, Any]]) -> None:
     rows_by_task = {row["task"]: row for row in [*json.loads(TABLE.read_text()), *rows]}
     rows = [rows_by_task[task] for task in [*TASKS, *sorted(rows_by_task.keys() - TASKS)] if task in rows_by_task]
     TABLE.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
-    page = PAGE.read_text()
-    page_start, page_end = page[: page.index(TABLE_START)], page[page.index(TABLE_END) :]
-    PAGE.write_text(f"{page_start}{TABLE_START}\n\n{table_markdown(rows)}\n\n{page_end}")
-
-
-def table_markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the table as the page shows it."""
-    names = {"ppo": "PPO", "apg": "analytic gradients", "dagger": "teacher by PPO, student by DAgger"}
-    lines = [
-        "| Task | Algorithm, environment steps | Seeds | Least | Median | Mean error | Time | Commit, date | Machine |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in rows:
-        seeds = row["seeds"]
-        is_range = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
-        diverged = f"; diverged: {', '.join(map(str, row['diverged']))}" if "diverged" in row else ""
-        cells = (
-            f"`{row['task']}`",
-            f"{names[row['algorithm']]}, {round_digits(row['env_steps'] / 1e6, 2):g} M",
-            (f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds))) + diverged,
-            f"{row['least']:.1%}",
-            f"{row['median']:.1%}",
-            "" if row["error"] is None else f"{round_digits(row['error'], 2):g} {row['unit']}",
-            time_text(row),
-            f"{row['commit']}, {row['date']}",
-            f"{row['machine']}, jax {row['jax']}",
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def time_text(row: dict[str, Any]) -> str:
-    """Return the training time in a row as text, with the number of seeds and processes that ran at the same time."""
-    text = f"{round_digits(row['seconds'], 2):g} s"
-    text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
-    return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")
+    figures.write_pages()
 
 
 def check_success(runs: list[dict[str, Any]]) -> list[str]:

@@ -244,13 +244,19 @@ def write_results(train, out, successes, **changes):
 
 @pytest.fixture
 def train(benchmarks, monkeypatch, tmp_path):
-    """Return the script of trainings with copies of its committed table and page; the table has no rows."""
+    """Return the script of trainings with copies of the committed data and of the page; the table has no rows."""
     train = importlib.import_module("train")
-    page = tmp_path / train.PAGE.name
-    page.write_text(train.PAGE.read_text())
+    for path in (
+        train.TABLE.parent / "figures.json",
+        train.TABLE.parent / "tables.json",
+        train.TABLE.parents[1] / "results.md",
+    ):
+        (tmp_path / path.name).write_text(path.read_text())
     (tmp_path / train.TABLE.name).write_text("[]")
-    monkeypatch.setattr(train, "PAGE", page)
     monkeypatch.setattr(train, "TABLE", tmp_path / train.TABLE.name)
+    monkeypatch.setattr(train.figures, "ROOT", tmp_path)
+    monkeypatch.setattr(train.figures, "RESULTS", tmp_path)
+    monkeypatch.setattr(train.figures, "PAGES", ["results.md"])
     return train
 
 
@@ -273,19 +279,16 @@ def test_the_table_gets_the_tasks_whose_seeds_are_all_finished(run, train, tmp_p
              "date": "2026-11-25", "machine": "another", "jax": "0.11.2"}  # fmt: skip
     train.TABLE.write_text(json.dumps([other]))
     write_results(train, tmp_path, (0.99, 1.0, 0.995), together=3)
-    before = train.PAGE.read_text()
+    before = (tmp_path / "results.md").read_text()
     run("train.py", "--only-plot", "--tasks", "hover", "--seeds", "0:4", "--out", tmp_path, "--write")
     assert json.loads(train.TABLE.read_text()) == [other]
     (row,) = run("train.py", "--tasks", "hover", "--seeds", "0,1,2", "--out", tmp_path, "--write")[1:]
     assert json.loads(train.TABLE.read_text()) == [row, other]
-    page, end = train.PAGE.read_text(), train.TABLE_END
-    assert (
-        "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s for 3 seeds | abc1234, 2026-11-26 | a machine"
-        in page
-    )
-    assert "| `track` | analytic gradients, 0.26 M | 3, 7 | 100.0% | 100.0% |  | 5 s, 12 at a time | 0000000" in page
-    assert page[page.index(end) :] == before[before.index(end) :]
-    assert page[: page.index(train.TABLE_START)] == before[: before.index(train.TABLE_START)]
+    page, marker = (tmp_path / "results.md").read_text(), "<!-- figure training -->"
+    assert "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s for 3 seeds |" in page
+    assert "| `track` | analytic gradients, 0.26 M | 3, 7 | 100.0% | 100.0% |  | 5 s, 12 at a time |" in page
+    assert f"`training`: a machine, 2026-11-26, commit abc1234; another, 2026-11-25, commit 0000000 {marker}" in page
+    assert page.partition(marker)[2].partition("\n\n###")[2] == before.partition(marker)[2].partition("\n\n###")[2]
 
 
 def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, train, tmp_path, capsys):
@@ -308,12 +311,6 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
     assert kept["least"] == 1.0
 
 
-def test_the_page_shows_the_committed_table(benchmarks):
-    train = importlib.import_module("train")
-    shown = train.PAGE.read_text().partition(train.TABLE_START)[2].partition(train.TABLE_END)[0]
-    assert shown.strip() == train.table_markdown(json.loads(train.TABLE.read_text()))
-
-
 def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_path):
     """Its last stored policy may succeed, but its training did not end."""
     curve = [{"iteration": 20, "success": 0.97, "crashed": 0.0, "error": 0.01, "env_steps": 10, "seconds": 1.0,
@@ -332,7 +329,7 @@ def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_
     }
     row = train.make_row([train.read_result(tmp_path, x) | run_info | {"seed": i} for i, x in enumerate((None, 33))])
     assert (row["least"], row["diverged"]) == (0.0, [1])
-    assert "| 0, 1; diverged: 1 | 0.0% |" in train.table_markdown([row])
+    assert "| 0, 1; diverged: 1 | 0.0% |" in train.figures.tables.training([row])
 
 
 @pytest.mark.long("trains in a process of its own")

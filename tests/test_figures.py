@@ -28,15 +28,19 @@ def figures(monkeypatch):
 def repository(figures, monkeypatch, tmp_path):
     (tmp_path / "benchmarks").mkdir()
     (tmp_path / "benchmarks" / "speed.py").write_text("print(1)\n")
-    (tmp_path / "page.md").write_text("Before.\n\n<!-- figure speed -->\n\n<!-- end of speed -->\n\nAfter.\n")
-    (tmp_path / "README.md").write_text("Nothing.\n")
-    (tmp_path / "figures.json").write_text("[]\n")
-    table = figures.tables.columns(Case=lambda x: x["case"], Rate=lambda x: figures.tables.si_text(x["rate"]))
-    figure = figures.Figure(cpu="speed.py --fast", table=table)
+    (tmp_path / "page.md").write_text("Before.\n\n<!-- figure speed -->\n\n| old |\n\nAfter.\n")
+    for name in ("figures", "tables", "training"):
+        (tmp_path / f"{name}.json").write_text("[]\n")
+    table = figures.tables.columns(
+        Machine=figures.tables.machine_of,
+        Case=lambda x: x["case"],
+        Rate=lambda x: figures.tables.si_text(x["rate"]),
+    )
     monkeypatch.setattr(figures, "ROOT", tmp_path)
-    monkeypatch.setattr(figures, "RECORDS_FILE", tmp_path / "figures.json")
-    monkeypatch.setattr(figures, "FIGURES", {"speed": figure})
+    monkeypatch.setattr(figures, "RESULTS", tmp_path)
+    monkeypatch.setattr(figures, "FIGURES", {"speed": figures.Figure(cpu="speed.py --fast")})
     monkeypatch.setattr(figures, "PAGES", ["page.md"])
+    monkeypatch.setattr(figures.tables, "TABLES", {"speed": (("speed",), table)})
     figures.run_git("init", "-q")
     commit_all(figures)
     return figures
@@ -54,18 +58,27 @@ def record(figures, commit, processor="EPYC", rate=2e9):
     return figures.make_record("speed", "speed.py --fast", commit, [{"case": "hover", "rate": rate} | about])
 
 
-def test_each_figure_has_a_script_records_and_a_place(figures):
+def test_each_figure_has_a_script_records_and_a_table(figures):
     for name, figure in figures.FIGURES.items():
         assert figure.cpu or figure.gpu, name
         for command in filter(None, (figure.cpu, figure.gpu)):
             assert (ROOT / "benchmarks" / command.split()[0]).exists(), name
     assert {record["figure"] for record in figures.load_records()} == set(figures.FIGURES)
-    places = [name for page in PAGES for name in figures.figure_names(page.read_text())]
-    assert sorted(places) == sorted(["readme", *(name for name, figure in figures.FIGURES.items() if figure.table)])
+    in_tables = {name for names, _ in figures.tables.TABLES.values() for name in names}
+    assert set(figures.FIGURES) - in_tables == {"depth-small"}
+
+
+def test_the_page_shows_or_names_each_table(figures):
+    page = (ROOT / "docs/results.md").read_text()
+    shown = figures.figure_names(page)
+    assert len(shown) == len(set(shown))
+    named = {name for table in shown for name in figures.tables.figures_of(table)}
+    for name in figures.table_names():
+        assert name in {*shown, *named, "readme"} or f"`{name}`" in page, name
 
 
 def test_pages_show_the_records(figures):
-    records = figures.load_records()
+    records = figures.page_records()
     for page in PAGES:
         text = page.read_text()
         assert figures.insert_tables(text, records) == text, (
@@ -79,24 +92,24 @@ def test_a_written_table_keeps_the_rows_of_other_machines(repository):
     repository.store_records([record(repository, commit, rate=4e6)])
     repository.write_pages()
     text = (repository.ROOT / "page.md").read_text()
-    assert text.startswith(
-        "Before.\n\n<!-- figure speed -->\n\n2 cores of EPYC (AVX2) (jax 0.10.1, Python 3.11.7, 2026-11-26"
+    origin = f"`speed`: 2 cores of EPYC (AVX2), 2 cores of Xeon (AVX2), 2026-11-26, commit {commit}"
+    assert text.startswith(f"Before.\n\n{origin} <!-- figure speed -->\n\n| Machine |")
+    assert text.endswith(
+        "| 2 cores of EPYC (AVX2) | hover | 4 M |\n| 2 cores of Xeon (AVX2) | hover | 3 G |\n\nAfter.\n"
     )
-    assert text.endswith("| CPU | hover | 3 G |\n\n<!-- end of speed -->\n\nAfter.\n")
-    assert "| Machine | Case | Rate |\n| --- | --- | --- |\n| CPU | hover | 4 M |" in text
 
 
 def test_figures_are_measured_and_written_by_one_command(repository, monkeypatch, tmp_path, capsys):
     (repository.ROOT / "benchmarks" / "speed.py").write_text(SCRIPT)
     monkeypatch.setattr(sys, "argv", ["figures.py", "--write", "--commit", "abc"])
     repository.main()
-    (row,) = json.loads((repository.ROOT / "figures.json").read_text())
+    (row,) = json.loads((repository.RESULTS / "figures.json").read_text())
     assert (row["commit"], row["lines"]) == ("abc", [{"case": "--fast", "rate": 5e3}])
     assert "| --fast | 5 k |" in (repository.ROOT / "page.md").read_text()
     (repository.ROOT / "benchmarks" / "speed.py").write_text("raise SystemExit(3)\n")
     with pytest.raises(SystemExit, match=r"speed: speed\.py --fast failed with status 3"):
         repository.main()
-    assert json.loads((repository.ROOT / "figures.json").read_text()) == [row]
+    assert json.loads((repository.RESULTS / "figures.json").read_text()) == [row]
     other = tmp_path / "other.json"
     other.write_text(repository.records_text([row | {"machine": "another", "lines": [{"case": "there", "rate": 7.0}]}]))
     monkeypatch.setattr(sys, "argv", ["figures.py", "--write", "--take", str(other)])
