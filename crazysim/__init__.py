@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from crazysim.lab.control.mppi import MPPI
     from crazysim.lab.plugins.radar import Radar
     from crazysim.lab.plugins.rotor_jet import RotorJet
+    from crazysim.lab.scene.splats import SplatScene
     from crazysim.lab.vehicles.cars import Bicycles, Cars
     from crazysim.plugins.bodies import FreeBodies
     from crazysim.plugins.contacts.contact_log import ContactLog
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
     from crazysim.plugins.payloads import Hook, SharedLoad, SlungLoad
     from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
     from crazysim.plugins.sensors import IMU, Camera, Lidar, MotionCapture, RangeFinder, Sensor
-    from crazysim.scene.splats import SplatScene
 
 __all__ = [
     "ESKF",

@@ -37,7 +37,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.payloads": "Hook SharedLoad SlungLoad",
         "crazysim.plugins.scenery": "Clutter Forest Gates Pillars Rooms",
         "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture RangeFinder Sensor",
-        "crazysim.scene.splats": "SplatScene",
+        "crazysim.lab.scene.splats": "SplatScene",
     },
     "crazysim.control": {
         "crazysim.control.auto": "Auto",
@@ -109,6 +109,10 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.vehicles.path_lqr": "PathLQR",
         "crazysim.lab.vehicles.single_track": "single_track",
     },
+    "crazysim.scene": {
+        "crazysim.lab.scene.maps": "map_spec",
+        "crazysim.lab.scene.splat_images": "build_splat_fn",
+    },
     "crazysim.sim.export": {"crazysim.lab.export.casadi": "to_casadi"},
     # Modules of Crazyflow.
     "crazysim.dynamics.utils": {},
@@ -144,11 +148,11 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim.sim.sensors": {},
     "crazysim.sim.sensors.depth": {"crazysim.sim.crazyflow": "render_depth"},
     "crazysim.sim.sensors.splat": {
-        "crazysim.sim.crazyflow_splats": "build_render_splat_fn build_render_splat_rgbd_fn camera_intrinsics "
+        "crazysim.lab.scene.crazyflow_splats": "build_render_splat_fn build_render_splat_rgbd_fn camera_intrinsics "
         "render_splat_rgb render_splat_rgbd viewmats",
     },
     "crazysim.sim.sharding": {"crazysim.engine.sharding": "shard shardings_of world_mesh"},
-    "crazysim.sim.splat": {"crazysim.sim.crazyflow_splats": "attach_splats"},
+    "crazysim.sim.splat": {"crazysim.lab.scene.crazyflow_splats": "attach_splats"},
     "crazysim.utils": {
         "crazysim.core.data": "grid_2d",
         "crazysim.engine.cache": "enable_cache",

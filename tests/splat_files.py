@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim.scene.splats import Gaussians
+from crazysim.lab.scene.splats import Gaussians
 
 
 def write_splats(path, n=30, n_colors=16, seed=0, **changes):

@@ -7,7 +7,7 @@ import copy
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import mujoco
@@ -21,19 +21,24 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError, expect, require, short_repr
-from crazysim.scene import build, collision, contact_report, depth, mjx, splat_images
+from crazysim.scene import build, collision, contact_report, depth, mjx
 from crazysim.scene.collision import CollisionModel
-from crazysim.scene.maps import MAP_RGBA, MapSource, map_spec
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.object_poses import ListPlugins
 from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
 from crazysim.scene.ray_casting import RayKernels
 from crazysim.scene.renderer import SceneRenderer
-from crazysim.scene.splats import SplatScene
 from crazysim.scene.sync import host_poses, poses_of, sync_one_world, with_data_poses
+
+if TYPE_CHECKING:
+    from crazysim.lab.scene.maps import MapSource
+    from crazysim.lab.scene.splat_images import Renderer, SplatFn
+    from crazysim.lab.scene.splats import SplatScene
 
 LARGE_SWARM = 64
 """Smallest number of drones per world for which MJX checks two pairs per drone instead of all pairs."""
+BYTES_PER_SPLAT_PIXEL = 20
+"""Lower bound of the memory of a pixel of splats, bytes: colour, depth and coverage."""
 
 
 class Scene:
@@ -154,7 +159,7 @@ class Scene:
         quat: ArrayLike = IDENTITY_QUAT,
         scale: float | None = None,
         min_points: int = 1,
-        rgba: ArrayLike = MAP_RGBA,
+        rgba: ArrayLike = (0.62, 0.60, 0.57, 1.0),
     ) -> Handle:
         """Add a point cloud or a triangle mesh as one object of boxes that do not move, and return its handle.
 
@@ -176,6 +181,8 @@ class Scene:
             ConfigError: If the file does not exist, has no points or non-finite points, or has no plausible scale; or
                 if there are too many boxes.
         """
+        from crazysim.scene import map_spec
+
         spec = map_spec(source, resolution, pos, quat, scale, min_points, rgba)
         if name is None:
             name = Path(source).stem if isinstance(source, (str, Path)) else "map"
@@ -377,8 +384,8 @@ class Scene:
         height: int = 64,
         background: ArrayLike = (1.0, 1.0, 1.0),
         min_coverage: float = 0.5,
-        renderer: splat_images.Renderer = "auto",
-    ) -> splat_images.SplatFn:
+        renderer: Renderer = "auto",
+    ) -> SplatFn:
         """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure: images of Gaussian splats in all worlds.
 
         The Gaussians are ``SplatScene.gaussians``. Images have gradients with respect to them and to the poses in
@@ -396,12 +403,14 @@ class Scene:
             ImportError: If ``renderer="splax"`` and splax is not installed.
             ConfigError: If ``renderer="splax"`` and the simulation is not on a GPU.
         """
+        from crazysim.scene import build_splat_fn
+
         objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
         names = [camera] if isinstance(camera, (str, int, np.integer)) else list(camera)
         cameras = [match for name in names for match in depth.find_cameras(self.mj_model, name, objects)]
         width, height = check_image_size(width, height)
-        self._check_image_memory(len(cameras), (width, height), splat_images.BYTES_PER_PIXEL)
-        return splat_images.build_splat_fn(
+        self._check_image_memory(len(cameras), (width, height), BYTES_PER_SPLAT_PIXEL)
+        return build_splat_fn(
             self.visual_model, cameras, width, height, background, min_coverage, renderer, self.device.platform,
             self.plugins,
         )  # fmt: skip

@@ -13,8 +13,8 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, require
-from crazysim.scene.splat_images import SplatImage, view_matrices
-from crazysim.scene.splats import SplatScene
+from crazysim.lab.scene.splat_images import SplatImage, view_matrices
+from crazysim.lab.scene.splats import SplatScene
 from crazysim.sim.sim import Sim
 
 Color = tuple[float, float, float]

@@ -18,11 +18,11 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError, not_installed, require
+from crazysim.lab.scene.splats import Gaussians, spherical_harmonics
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import CarriedCamera, camera_pose
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
-from crazysim.scene.splats import Gaussians, spherical_harmonics
 from crazysim.tables import range_between, read_number, read_numbers
 
 MIN_DEPTH = 0.01
@@ -43,8 +43,6 @@ BLOCK_SIZE = 32
 """Number of Gaussians that are drawn at a time."""
 MAX_ALPHAS = 1 << 24
 """Largest number of alphas that are computed at a time: pixels of all images times ``BLOCK_SIZE``."""
-BYTES_PER_PIXEL = 20
-"""Lower bound of the memory of a pixel, bytes: colour, depth and coverage."""
 RENDERERS = ("auto", "splax", "plain")
 """Renderers of splats."""
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, ContactLog, Sim
-from crazysim.scene.map_files import read_map
-from crazysim.scene.voxels import merge_voxels, voxels_of_points, voxels_of_triangles
+from crazysim.lab.scene.map_files import read_map
+from crazysim.lab.scene.voxels import merge_voxels, voxels_of_points, voxels_of_triangles
 from crazysim.sim import use_box_collision
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0], [0, 0, 3]], float)
@@ -171,7 +171,7 @@ def test_triangles_have_the_voxels_that_they_meet(rng, monkeypatch):
     """Each point of a triangle is in a voxel, and each voxel is at most 3 cm from a sampled point."""
     corners, resolution = rng.uniform(-1, 1, (3, 3, 3)), 0.1
     voxels = voxels_of_triangles(corners, resolution)
-    monkeypatch.setattr("crazysim.scene.voxels.MAX_CANDIDATES", 1000)
+    monkeypatch.setattr("crazysim.lab.scene.voxels.MAX_CANDIDATES", 1000)
     np.testing.assert_array_equal(voxels_of_triangles(corners, resolution), voxels)
     weights = rng.dirichlet([1, 1, 1], 8000)
     points = np.einsum("nk,tkc->tnc", weights, corners).reshape(-1, 3)

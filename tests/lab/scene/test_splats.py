@@ -12,8 +12,8 @@ import pytest
 from splat_files import make_splat, spot_alpha, write_splats
 
 from crazysim import ConfigError, Sim
-from crazysim.scene import splat_images
-from crazysim.scene.splats import Gaussians, SplatScene
+from crazysim.lab.scene import splat_images
+from crazysim.lab.scene.splats import Gaussians, SplatScene
 
 SIZE = {"width": 24, "height": 16}
 

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import as_rgba, positive_integer
 from crazysim.engine.cache import announce_if_slow
 from crazysim.errors import ConfigError, require, short_repr
-from crazysim.scene.map_files import MapFile, read_map
+from crazysim.lab.scene.map_files import MapFile, read_map
+from crazysim.lab.scene.voxels import count_candidates, merge_voxels, voxels_of_points, voxels_of_triangles
 from crazysim.scene.primitives import DRONE_TOUCH_BITS
-from crazysim.scene.voxels import count_candidates, merge_voxels, voxels_of_points, voxels_of_triangles
 from crazysim.tables import LENGTH, range_between, read_number, read_numbers
 
 MapSource = str | Path | ArrayLike
@@ -29,8 +29,6 @@ MAX_UNSCALED_VOXELS = 2_000_000
 millimetres."""
 MAX_BOXES = 10_000
 """Largest number of boxes of a map."""
-MAP_RGBA = (0.62, 0.60, 0.57, 1.0)
-"""Default colour of maps, RGBA."""
 
 
 def map_spec(

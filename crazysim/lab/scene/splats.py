@@ -15,8 +15,8 @@ from crazysim import rotation
 from crazysim.arguments import check_arguments
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import ConfigError, require
-from crazysim.scene.map_files import MAX_FILE_BYTES, read_ply
-from crazysim.scene.maps import read_frame
+from crazysim.lab.scene.map_files import MAX_FILE_BYTES, read_ply
+from crazysim.lab.scene.maps import read_frame
 from crazysim.scene.objects import IDENTITY_QUAT
 from crazysim.storage import read_bytes, wrap_read_errors
 from crazysim.tables import range_between, read_number
