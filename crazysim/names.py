@@ -96,6 +96,15 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
     },
+    "crazysim.trajectories": {
+        "crazysim.lab.trajectory_files.csv": "load_csv save_csv save_samples",
+        "crazysim.lab.trajectory_files.polynomials": "pack_compressed",
+    },
+    "crazysim.trajectories.files": {
+        "crazysim.lab.trajectory_files.csv": "load_csv save_csv save_samples",
+        "crazysim.lab.trajectory_files.polynomials": "load_memory pack_compressed pack_poly4d save_memory "
+        "unpack_compressed unpack_poly4d",
+    },
     "crazysim.plugins.vehicles": {
         "crazysim.lab.vehicles.car_params": "CarParams",
         "crazysim.lab.vehicles.car_state": "CarState ackermann",

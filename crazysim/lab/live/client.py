@@ -8,9 +8,9 @@ from pathlib import Path
 from crazysim.errors import ConfigError, require
 from crazysim.lab.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.lab.show_files.show_trajectory import format_trajectory
+from crazysim.lab.trajectory_files.checks import MAX_FILE_BYTES
 from crazysim.storage import Closeable, read_bytes
 from crazysim.trajectories import Trajectory
-from crazysim.trajectories.files.checks import MAX_FILE_BYTES
 
 
 class _Client(Closeable):

@@ -10,8 +10,8 @@ from crazysim.lab.live.framing import Message, ShowFile
 from crazysim.lab.show_files import Show
 from crazysim.lab.show_files.show_trajectory import parse_trajectory
 from crazysim.lab.show_files.skyc import parse_show
+from crazysim.lab.trajectory_files import checks
 from crazysim.trajectories import Trajectory
-from crazysim.trajectories.files import checks
 
 MAX_HEIGHT = 100.0
 """Greatest height of a take-off, m."""

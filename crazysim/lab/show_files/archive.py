@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from crazysim.errors import require, short_repr
+from crazysim.lab.trajectory_files import checks
 from crazysim.storage import ZipReader, wrap_read_errors, write_file
-from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
 """Largest number of files in an archive: four for each of 5,000 drones, Skybrush's limit, and 100 for the show."""

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import require, short_repr
+from crazysim.lab.trajectory_files import checks
+from crazysim.lab.trajectory_files.pieces import require_no_jumps, split_pieces, trajectory_pieces
 from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
-from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
 from crazysim.trajectories.splines import trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 

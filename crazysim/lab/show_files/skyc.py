@@ -22,8 +22,8 @@ from crazysim.lab.show_files.led import MAX_REPEATED_COMMANDS, decode_lights, en
 from crazysim.lab.show_files.lights import Lights
 from crazysim.lab.show_files.show import Cue, ParameterChange, Show
 from crazysim.lab.show_files.show_trajectory import format_trajectory, parse_trajectory
+from crazysim.lab.trajectory_files import checks
 from crazysim.storage import read_bytes
-from crazysim.trajectories.files import checks
 from crazysim.trajectories.trajectory import Trajectory
 
 MAX_DRONES = 5000

@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.show_files import Show, load_show, save_show
 from crazysim.lab.show_files.archive import Archive
 from crazysim.lab.show_files.skyc import parse_show
-from crazysim.trajectories.files.pieces import trajectory_pieces
+from crazysim.lab.trajectory_files.pieces import trajectory_pieces
 
 
 def evaluate_positions(trajectory, t):

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import require
 from crazysim.lab.live.host_trajectory import HostTrajectory
+from crazysim.lab.trajectory_files.csv import parse_table
+from crazysim.lab.trajectory_files.polynomials import check_rows
 from crazysim.storage import MAX_TEXT_BYTES, read_text
-from crazysim.trajectories.files.csv import parse_table
-from crazysim.trajectories.files.polynomials import check_rows
 
 
 class Polynomial:

@@ -11,7 +11,7 @@ from crazysim.errors import ConfigError, require
 from crazysim.lab.live.attitude import decompress_quat
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.trajectories.files.polynomials import read_compressed, read_poly4d
+from crazysim.lab.trajectory_files.polynomials import read_compressed, read_poly4d
 
 PIECE_SIZE = 132
 """Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""

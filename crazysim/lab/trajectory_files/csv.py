@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import require, short_repr
+from crazysim.lab.trajectory_files import checks
+from crazysim.lab.trajectory_files.polynomials import check_rows, trajectory_rows
 from crazysim.storage import read_text, write_file
 from crazysim.tables import MAX_NUMBER, read_floats
-from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.polynomials import check_rows, trajectory_rows
 from crazysim.trajectories.interpolation import unit_coefficients
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces
 from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory

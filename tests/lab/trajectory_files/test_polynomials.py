@@ -10,6 +10,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files.show_trajectory import format_trajectory
+from crazysim.lab.trajectory_files.csv import POLYNOMIAL_HEADER
+from crazysim.lab.trajectory_files.pieces import trajectory_pieces
 from crazysim.trajectories import Trajectory, line
 from crazysim.trajectories.files import (
     load_csv,
@@ -22,8 +24,6 @@ from crazysim.trajectories.files import (
     unpack_compressed,
     unpack_poly4d,
 )
-from crazysim.trajectories.files.csv import POLYNOMIAL_HEADER
-from crazysim.trajectories.files.pieces import trajectory_pieces
 
 FIGURE_EIGHT = (
     "1.050000,0.0,-0.0,0.0,-0.0,0.830443,-0.276140,-0.384219,0.180493,-0.0,0.0,-0.0,0.0,-1.356107,0.688430,0.587426,"

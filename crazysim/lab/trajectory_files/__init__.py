@@ -1,0 +1,1 @@
+"""Files of trajectories: CSV, and the Crazyflie's trajectory memory."""
