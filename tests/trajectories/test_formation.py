@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazysim.errors import ConfigError
 from crazysim.trajectories import formation
 
 SHAPES = {"line": formation.line, "grid": formation.grid, "circle": formation.circle}
@@ -48,25 +47,3 @@ def test_matched_targets_keep_straight_flights_clear(n, seed):
     assert sorted(map(tuple, targets)) == sorted(map(tuple, b))
     closest = min(distances(a + u * (targets - a)).min() for u in np.linspace(0, 1, 101))
     assert closest >= min(distances(a).min(), distances(b).min()) / np.sqrt(2) - 1e-9
-
-
-def test_matching_refuses_different_numbers():
-    with pytest.raises(ConfigError, match="as many finite starts as targets"):
-        formation.matched(np.zeros((2, 3)), np.zeros((3, 3)))
-    with pytest.raises(ConfigError, match="of a size up to"):
-        formation.matched(np.zeros((2, 3)), np.full((2, 3), 1e300))
-
-
-@pytest.mark.parametrize("make", SHAPES.values())
-def test_law_09_wrong_settings_are_refused(make):
-    for wrong, message in (
-        ({"n": 0}, "positive whole number"),
-        ({"n": 2.5}, "positive whole number"),
-        ({"n": 2, "spacing": 0.0}, "spacing as a positive"),
-        ({"n": 2, "center": (0.0, 0.0)}, "center as 3 finite numbers"),
-        ({"n": 2, "yaw": np.nan}, "yaw as a finite"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            make(**wrong)
-    with pytest.raises(ConfigError, match="spacing or radius, got both"):
-        formation.circle(3, spacing=1.0, radius=1.0)

@@ -1,11 +1,10 @@
 """Limits and their check: peaks against dense samples, circles by hand, reports and errors."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazysim import ConfigError, load_airframe
+from crazysim import load_airframe
 from crazysim.trajectories import Limits, Trajectory, check, circle, line, spline
 from crazysim.trajectories.peaks import QUANTITIES, find_peaks
 from crazysim.trajectories.piece_table import PieceTable
@@ -132,13 +131,6 @@ def test_an_airframe_limits_the_thrust():
     np.testing.assert_allclose(violation.value, 1 + 10 / 9.81, rtol=1e-6)
 
 
-def test_a_stack_is_checked_as_a_list():
-    flights = [fly_straight([0, k, 1], [1, k, 1], 1.0) for k in range(3)]
-    stacked, listed = check(Trajectory.stack(flights), Limits()), check(flights, Limits())
-    assert str(stacked) == str(listed)
-    assert len(stacked.closest) == 3
-
-
 def test_the_floor_is_at_zero_unless_it_is_set():
     descent = line([0, 0, 1], [1, 0, -1], duration=4.0)
     (violation,) = check(descent, Limits(height=2.0), "cf21B_500").violations
@@ -147,25 +139,3 @@ def test_the_floor_is_at_zero_unless_it_is_set():
     assert check(descent, Limits(floor=-1.0)).ok
     assert check(descent, Limits(floor=None)).ok
     assert check(line([0, 0, 0], [1, 0, 0], duration=1.0), Limits()).ok
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: Limits(speed=0.0), "expected speed of Limits"),
-        (lambda: Limits(acceleration=-1.0), "expected acceleration of Limits"),
-        (lambda: Limits(jerk=np.nan), "expected jerk of Limits"),
-        (lambda: Limits(body_rate="fast"), "expected body_rate of Limits"),
-        (lambda: Limits(thrust=1.0), "cannot hover"),
-        (lambda: Limits(min_thrust=1.0), "less than 1 weight"),
-        (lambda: Limits(floor=np.nan), "expected floor of Limits to be finite"),
-        (lambda: Limits(floor=1.0, height=1.0), "a floor below the height of 1.0 m"),
-        (lambda: check([], Limits()), "at least one"),
-        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), names=["a", "b"]), "1 names"),
-        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=0.0), "tolerance"),
-        (lambda: check(fly_straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=np.nan), "tolerance"),
-    ],
-)
-def test_law_09_wrong_limits_are_errors(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()

@@ -2,11 +2,9 @@
 
 import jax
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazysim import ConfigError
 from crazysim.trajectories import Trajectory, spline
 from crazysim.trajectories.piece_table import PieceTable
 
@@ -44,35 +42,3 @@ def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
     np.testing.assert_allclose(EARLY_TABLE.evaluate(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
     assert EARLY_TABLE.start[EARLY_TABLE.first_pieces].tolist() == [0.0, 0.0, 0.0]
     assert np.all(np.diff(EARLY_TABLE._keys) > 0)
-
-
-def test_a_batch_is_evaluated_as_one_by_one():
-    drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
-    batch = TABLE.evaluate(drones, times, 1)
-    one_by_one = [TABLE.evaluate(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
-    np.testing.assert_array_equal(batch, one_by_one)
-
-
-def test_padding_adds_no_pieces():
-    padded = TRAJECTORIES[0].padded(9, 7)
-    assert len(PieceTable.create([padded]).start) == 3
-
-
-def test_the_default_duration_ends_with_the_last_drone():
-    ends = [float(t.duration) + s for t, s in zip(TRAJECTORIES, STARTS, strict=True)]
-    assert PieceTable.create(TRAJECTORIES, STARTS).duration == max(ends)
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (([],), "at least one"),
-        ((TRAJECTORIES, [0.0, 1.0]), "each of 3 drones"),
-        ((TRAJECTORIES, np.nan), "finite start"),
-        ((TRAJECTORIES[:1], -100.0), "positive, finite duration.*end at -"),
-        ((TRAJECTORIES, 0.0, np.nan), "positive, finite duration"),
-    ],
-)
-def test_law_09_wrong_fleets_are_errors(arguments, message):
-    with pytest.raises(ConfigError, match=message):
-        PieceTable.create(*arguments)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
 
-from crazysim import ConfigError
 from crazysim.trajectories import Trajectory, of_bezier, spline
 
 RNG = np.random.default_rng(5)
@@ -87,32 +86,3 @@ def test_bezier_repeats_on_request():
     trajectory = of_bezier([1.0], [[[0, 0, 0], [1, 0, 0]]], repeats=True)
     np.testing.assert_allclose(trajectory.evaluate(2.25).pos, [0.25, 0, 0])
     assert trajectory.coefficients.dtype == jnp.float32
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: spline(TIMES, POINTS, 4), "degree 3, 5 or 7"),
-        (lambda: spline(TIMES[:-1], POINTS), "shapes"),
-        (lambda: spline(TIMES[::-1], POINTS), "ascending"),
-        (lambda: spline(TIMES * np.nan, POINTS), "ascending"),
-        (lambda: spline(TIMES, np.where(POINTS[2, 1] == POINTS, np.inf, POINTS)), r", got inf at index \[2, 1\]"),
-        (lambda: spline(TIMES, POINTS, yaw=[0.0, 1.0]), "one for each of 6"),
-        (lambda: spline(TIMES, POINTS, yaw=np.nan), "finite yaw"),
-        (lambda: spline(TIMES, POINTS, yaw=4.99e305), r"yaw of a size up to 1e\+06, got 4.99e\+305"),
-        (lambda: spline([-1e300, 0.0, 1.0], POINTS[:3]), "ascending times in float32"),
-        (lambda: Trajectory.of_pieces([1e20], np.ones((1, 3, 3))), "coefficients finite in float32"),
-        (lambda: spline(TIMES[:1], POINTS[:1]), "at least 2"),
-        (lambda: spline(TIMES[:3], POINTS[:3], 7, at_rest=False), "at least 4"),
-        (lambda: of_bezier([1.0, 2.0], [np.ones((4, 3))]), "1 curves"),
-        (lambda: of_bezier([], []), "at least one"),
-        (lambda: of_bezier([1.0], [np.ones((4, 2))]), "control points"),
-        (lambda: of_bezier([1.0, 2.0], [np.ones((4, 3)), np.ones((4, 4))]), "for all"),
-        (lambda: of_bezier([1.0, 1.0], [np.ones((4, 3))] * 2), "ascending"),
-        (lambda: of_bezier([0.0], [np.ones((4, 3))]), "positive"),
-        (lambda: of_bezier([1.0], [np.full((4, 3), np.nan)]), "finite control points"),
-    ],
-)
-def test_law_09_wrong_splines_are_errors(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()

@@ -1,17 +1,13 @@
 """The record of a trajectory, against polynomials of NumPy and SciPy in float64."""
 
-from itertools import pairwise
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.interpolate import PPoly
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories import Trajectory, figure_eight, line
+from crazysim.trajectories import Trajectory
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -23,10 +19,6 @@ on_device = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
 def evaluate(trajectory, t):
     """Return the setpoints at some times as NumPy arrays."""
     return jax.tree.map(np.asarray, on_device(trajectory, t))
-
-
-setpoint_at = jax.jit(Trajectory.evaluate)
-slopes_at = jax.jit(jax.jacfwd(Trajectory.evaluate, argnums=1))
 
 
 def random_pieces(n_pieces=5, degree=7, seed=0):
@@ -167,25 +159,6 @@ def test_moving_turns_and_shifts_positions_and_turns_derivatives(traced):
     np.testing.assert_allclose(after.yaw_rate, before.yaw_rate, atol=1e-12)
 
 
-@given(t=st.floats(-5, 20), repeats=st.booleans())
-def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
-    trajectory = Trajectory.of_pieces(*random_pieces(), repeats=repeats)
-    s, slopes = setpoint_at(trajectory, t), slopes_at(trajectory, t)
-    for low, high in [*pairwise(DERIVATIVES), *pairwise(YAW)]:
-        np.testing.assert_allclose(getattr(slopes, low), getattr(s, high), rtol=1e-9, atol=1e-9)
-
-
-def test_the_gradient_by_coefficients_is_that_of_a_linear_function():
-    durations, c = random_pieces()
-    trajectory = Trajectory.of_pieces(durations, c)
-    grad = jax.jit(jax.grad(lambda c: trajectory.replace(coefficients=c).evaluate(durations[0] + 0.1).pos[1]))(
-        jnp.asarray(trajectory.coefficients)
-    )
-    expected = np.zeros_like(c)
-    expected[1, 1] = (0.1 / durations[1]) ** np.arange(8)
-    np.testing.assert_allclose(grad, expected, atol=1e-12)
-
-
 def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
     """Coefficients of seconds would reach 60^7 = 3e12 in size; coefficients of the scaled time are positions."""
     t_end, n = 60.0, 8
@@ -201,31 +174,6 @@ def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
         np.testing.assert_allclose(s.pos, exact, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "durations, shape, message",
-    [
-        ([1.0, 2.0], (3, 4, 8), "n_pieces"),
-        ([1.0], (1, 2, 8), "without yaw"),
-        ([], (0, 4, 8), "n_pieces"),
-        ([1.0, 0.0], (2, 4, 8), "positive durations"),
-        ([1.0, -1.0], (2, 4, 8), "positive durations"),
-        ([1.0, np.inf], (2, 4, 8), "positive durations"),
-        ([1e9, 1e-9], (2, 4, 8), "piece 1"),
-        ([1.0], (1, 4, 0), "at least one"),
-    ],
-)
-def test_wrong_pieces_are_refused(durations, shape, message):
-    with pytest.raises(ConfigError, match=message):
-        Trajectory.of_pieces(durations, np.zeros(shape))
-
-
-def test_coefficients_that_are_not_finite_are_refused():
-    with pytest.raises(ConfigError, match="finite"):
-        Trajectory.of_pieces([1.0], np.full((1, 4, 2), np.nan))
-    with pytest.raises(ConfigError, match="at least one trajectory"):
-        Trajectory.stack([])
-
-
 @pytest.mark.parametrize("order", [0, 2])
 def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
     trajectory = Trajectory.of_pieces(*random_pieces(n_pieces=20))
@@ -236,36 +184,3 @@ def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
     for k in range(order + 1):
         np.testing.assert_allclose(result[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(result[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)
-
-
-EIGHT, UP = figure_eight(), line([0, 0, 0], [0, 0, 1], 2.0)
-PAIR = Trajectory.stack([EIGHT, UP])
-
-
-@pytest.mark.parametrize(
-    ("call", "remedy"),
-    [
-        (lambda: EIGHT.evaluate(np.linspace(0, 1, 5)), r"one time, got shape \(5,\).*jax.vmap"),
-        (lambda: PAIR.evaluate(0.5), r"one vehicle.*evaluate_one"),
-        (lambda: EIGHT.evaluate_one(0, 0.5), r"one leading axis.*evaluate\(t\)"),
-        (lambda: EIGHT.derivatives(0.5, 5), "order from 0 to 4"),
-        (lambda: PAIR.repeat(2), r"one vehicle.*unstacked\(\)"),
-        (lambda: PAIR.padded(9, 7), r"one vehicle.*unstacked\(\)"),
-        (lambda: PAIR.then(UP), r"one vehicle.*unstacked\(\)"),
-        (lambda: UP.then(PAIR), r"one vehicle.*unstacked\(\)"),
-        (lambda: UP.then("up"), "trajectory to follow, got 'up'"),
-        (lambda: Trajectory.stack([PAIR, UP]), "each of one vehicle"),
-        (lambda: Trajectory.stack([UP, None]), "each of one vehicle"),
-        (lambda: Trajectory.of_pieces(["a"], [[[1.0]]]), "durations as a number or array"),
-        (lambda: Trajectory.of_pieces([1.0], [[[1.0], [1.0, 2.0], [1.0]]]), "coefficients as a number or array"),
-        (lambda: Trajectory.of_pieces([1.0], np.zeros((1, 3, 2)), "no"), "repeats as True or False"),
-    ],
-)
-def test_arguments_of_a_wrong_kind_are_errors_with_a_remedy(call, remedy):
-    with pytest.raises(ConfigError, match=f"(?s){remedy}"):
-        call()
-
-
-def test_a_stack_of_a_stack_is_the_same_stack():
-    for x, y in zip(jax.tree.leaves(Trajectory.stack(PAIR)), jax.tree.leaves(PAIR), strict=True):
-        np.testing.assert_array_equal(x, y)

@@ -13,17 +13,9 @@ from crazysim import ConfigError
 from crazysim.trajectories import (
     Limits,
     check,
-    circle,
-    figure_eight,
-    formation,
     minimum_jerk,
     minimum_snap,
-    of_bezier,
-    save_csv,
-    save_samples,
-    spline,
 )
-from crazysim.trajectories.peaks import QUANTITIES
 from crazysim.trajectories.piece_table import PieceTable
 
 WAYPOINTS = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1.5], [0, 2, 1], [-1, 0, 1.0]])
@@ -269,11 +261,6 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     np.testing.assert_allclose(cost(result[:, :2]), min_cost, rtol=3e-3)
 
 
-def test_coincident_waypoints_are_allowed_with_durations():
-    trajectory = minimum_snap([[0, 0, 1], [0, 0, 1], [1, 0, 1]], [1.0, 2.0], corridors=0.1, yaw=[0, 1, 1])
-    assert deviations(trajectory, np.array([[0, 0, 1], [0, 0, 1], [1, 0, 1.0]]))[0] <= 0.1
-
-
 BENT = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
 """Waypoints of a path with a right angle."""
 
@@ -304,84 +291,9 @@ def test_a_plan_through_high_gates_does_not_dip_below_the_floor():
     assert check(limited, Limits()).peaks["floor"].value < 1e-3  # the flight reaches the floor
 
 
-NAN = np.full((3, 3), np.nan)
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: minimum_snap([[0, 0, 1]], limits=LIMITS), "at least two"),
-        (lambda: minimum_snap(np.zeros((3, 2)), limits=LIMITS), "waypoints"),
-        (lambda: minimum_snap([[0, 0, 1], [0, np.nan, 1]], limits=LIMITS), "finite waypoints"),
-        (lambda: minimum_snap(BENT), "durations or limits"),
-        (lambda: minimum_snap(BENT, [1.0]), "2 positive, finite durations"),
-        (lambda: minimum_snap(BENT, [1.0, 0.0]), "finite, positive durations"),
-        (lambda: minimum_snap(BENT, [1.0, np.inf]), "finite, positive durations"),
-        (lambda: minimum_snap(BENT, [1.0, 1e300]), "ascending times in float32"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], yaw=2.99e307), r"yaw of a size up to 1e\+06"),
-        (lambda: minimum_snap([*BENT, BENT[-1]], limits=LIMITS), "number 2 and 3"),
-        (lambda: minimum_snap(BENT, [0.5, 0.5], limits=LIMITS), "exceeds speed and acceleration. Multiply"),
-        (lambda: minimum_snap(BENT, limits=Limits(height=0.5)), "expected waypoints below the height of 0.5 m, got"),
-        (
-            lambda: minimum_snap([[0, 0, 1], [1, 0, -0.1]], limits=LIMITS),
-            r"expected waypoints above the floor of 0\.0 m, got number 1 at -0\.1 m\. Move it",
-        ),
-        (lambda: minimum_snap(BENT, limits=Limits(height=5.0)), "bound the speed"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, corridors=0.0), "positive corridors"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, corridors=[0.1] * 3), "positive corridors, one or 2"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, yaw=[0.0, 1.0]), "one for each of 3"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.zeros((2, 3))), "velocities"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.full((3, 3), np.inf)), "velocities"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], velocities=np.full((3, 3), 1e300)), "velocities .* of a size up to"),
-        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.full((3, 3), 3.0)), "however slow"),
-        (lambda: minimum_snap(BENT[:2], [1.0], velocities=NAN[:2], accelerations=NAN[:2], jerks=NAN[:2]), "unique"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], velocities=[[0, 0, 9]] * 3, corridors=0.001), "corridors"),
-    ],
-)
-def test_law_09_waypoints_that_cannot_be_flown_are_errors(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()
-
-
 def test_durations_times_the_factor_of_the_error_meet_the_limits():
     with pytest.raises(ConfigError, match="Multiply the durations by") as caught:
         minimum_snap(BENT, [0.5, 0.5], limits=LIMITS)
     factor = float(str(caught.value).split("durations by ")[1].split(",")[0])
     report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
     assert max(report.peaks[name].value[0] / LIMITS.as_dict()[name] for name in ("speed", "acceleration")) > 0.99
-
-
-def test_separation_is_no_quantity_of_one_trajectory():
-    assert "separation" not in QUANTITIES
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda: minimum_snap("abc", [1.0]), "waypoints"),
-        (lambda: minimum_snap([[0, 0], [1, 1, 1]], [1.0]), "waypoints"),
-        (lambda: minimum_snap(BENT, "ab"), "durations"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], corridors="x"), "corridors"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], yaw="x"), "yaw"),
-        (lambda: minimum_snap(BENT, [1.0, 1.0], velocities="x"), "velocities"),
-        (lambda: minimum_snap(BENT, limits=5), "limits as Limits"),
-        (lambda: spline("a", BENT), "times"),
-        (lambda: spline([0, 1, 2], BENT, degree=[3]), "degree 3, 5 or 7"),
-        (lambda: of_bezier([1.0], None), "control points as a list"),
-        (lambda: of_bezier([1.0], [[[0, 0, 1], [0, 1]]]), "control points"),
-        (lambda: check(5, Limits()), "each of one vehicle"),
-        (lambda: check(spline([0, 1, 2], BENT), None), "limits as Limits"),
-        (lambda: check(spline([0, 1, 2], BENT), Limits(), starts="x"), "starts"),
-        (lambda: check(spline([0, 1, 2], BENT), Limits(), tolerance="x"), "tolerance"),
-        (lambda: figure_eight(width="a"), "width"),
-        (lambda: circle(along="no"), "along as True or False"),
-        (lambda: formation.matched("a", "b"), "starts"),
-        (lambda: save_csv(None, "x.csv"), "a trajectory, got None"),
-        (lambda: save_samples("x.csv", 0.0, [0, 0, 0]), r"times \(n,\)"),
-        (lambda: save_samples("x.csv", [0, 1], BENT[:2], yaw=[[0], [0]]), r"times \(n,\)"),
-        (lambda: save_samples("x.csv", [0, 1], [[0, 0, 1], [0, 0, np.nan]]), "finite pos"),
-    ],
-)
-def test_arguments_of_a_wrong_kind_are_named(call, name):
-    with pytest.raises(ConfigError, match=f"expected .*{name}"):
-        call()

@@ -165,29 +165,6 @@ def test_wrong_csv_files_are_errors(content, message, tmp_path):
         load_csv(tmp_path / "a.csv")
 
 
-def test_wrong_memories_and_trajectories_are_errors(tmp_path):
-    for content in (b"", bytes(100), bytes(132)):
-        with pytest.raises(ConfigError):
-            unpack_poly4d(content)
-    packed = pack_compressed(random_trajectory())
-    for content in (b"", packed[:7], packed[:8], packed[:12], packed[:-4]):
-        with pytest.raises(ConfigError):
-            unpack_compressed(content)
-    far = Trajectory.of_pieces([1.0], np.full((1, 4, 1), 33.0))
-    with pytest.raises(ConfigError, match="16 bits"):
-        pack_compressed(far)
-    high = Trajectory.of_pieces([1.0], np.ones((1, 4, 9)))
-    for pack in (pack_poly4d, pack_compressed):
-        with pytest.raises(ConfigError, match="degree 8"):
-            pack(high)
-    with pytest.raises(ConfigError, match="one vehicle"):
-        pack_poly4d(Trajectory.stack([far, far]))
-    with pytest.raises(ConfigError, match="existing folder"):
-        save_memory(far, tmp_path / "nowhere" / "a.bin")
-    with pytest.raises(ConfigError, match="shapes"):
-        save_samples(tmp_path / "a.csv", [0.0], np.zeros((2, 3)))
-
-
 @given(st.binary(max_size=300))
 def test_any_memory_is_loaded_or_refused(content):
     for unpack in (unpack_poly4d, unpack_compressed):
