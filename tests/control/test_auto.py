@@ -272,29 +272,6 @@ def test_the_drag_torque_over_thrust_of_the_curves_agrees_with_the_tables():
 # Laws -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_drone_flies_alike_by_itself_and_in_a_mixed_batch():
-    """``f(batch)[i] == f(batch[i])`` up to 1e-4, the rounding of different fused code, through all loops."""
-    mixed_sim, weights = hovering_sim("state", 2, strict=True)
-    n = len(weights)
-    command = np.zeros((2, n, 16), np.float32)
-    command[..., :3], command[..., 12] = [1.0, -0.5, HIGH + 1], 1.0
-    command[1, :, 0] = -1.0
-    mixed_sim.state_control(command)
-    mixed_sim.step(100)
-    for k in (0, n - 1):
-        single_sim = Sim(drone=airframes()[k], control="state", controller="auto", strict=True)
-        s = single_sim.data.states
-        rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(single_sim.data.params), s.rotor_vel.shape)
-        single_sim.data = single_sim.data.replace(
-            states=s.replace(pos=s.pos + np.array([0, 0, HIGH]), rotor_vel=rotor_vel)
-        )
-        single_sim.state_control(command[1:, k : k + 1])
-        single_sim.step(100)
-        for name in ("pos", "quat", "vel", "ang_vel"):
-            single, mixed = getattr(single_sim.data.states, name)[0, 0], getattr(mixed_sim.data.states, name)[1, k]
-            np.testing.assert_allclose(mixed, single, atol=1e-4, err_msg=name)
-
-
 @pytest.mark.parametrize("drone", ["cf21B_500", "bumblebee"])
 def test_drones_beside_the_start_of_a_slow_climb_leave_the_floor(drone):
     """The floor stops every motion of a drone on it, so measurements there must not tilt the drone."""

@@ -1,7 +1,5 @@
 """Controllers in a simulation: the protocol, the firmware's controllers in flight, and several with a switch."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +7,9 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Latency, Sim, load_airframe
-from crazysim.control import INDI, PID, AirframeParams, Control, Controller, LoadLQR, Mellinger, Setpoint
+from crazysim.control import PID, AirframeParams, Control, Controller, Setpoint
 from crazysim.control.mellinger import MellingerParams
-from crazysim.core import functional as F
-from crazysim.engine.pytree import PyTree, leaf, replace_leaves
-from crazysim.engine.stage import as_stages
+from crazysim.engine.pytree import PyTree, leaf
 
 WORLDS, DRONES = 3, 2
 
@@ -266,42 +262,6 @@ def test_rates_of_the_simulation_replace_those_of_the_controller():
     assert Sim(control="attitude", controller="mellinger", attitude_freq=125).control_freq == 125
 
 
-@pytest.mark.parametrize(
-    "settings, message",
-    [
-        ({"controller": "pd"}, r"expected controller as one of 'auto', 'crazyflow', .*got 'pd'"),
-        ({"controller": "mine.so"}, r"got 'mine.so'. Use CFirmware\('mine.so'\) for a compiled"),
-        ({"controller": 3}, r"expected a controller as a name or a Controller, got 3"),
-        ({"controller": "mellinger", "control": "body_rate"}, r"'mellinger' follows, state or attitude.*body_rate"),
-        ({"controller": "pid", "dynamics": "so_rpy"}, r"expected dynamics with rotors for controller 'pid'"),
-        ({"controller": Mellinger(freq=300)}, r"expected freq of controller 'mellinger' to divide.*250 Hz"),
-        (
-            {"controller": "pid", "drone": "bumblebee"},
-            r"'bumblebee' lacks \[pid.position\] kp, ki, kd; \[pid.v.* controller='auto'",
-        ),
-        ({"controller": ["pid", "mellinger"]}, r"expected a switch for several controllers, got None"),
-        ({"controller": "pid", "switch": 0}, r"expected a list of controllers for a switch"),
-        ({"controller": [], "switch": 0}, r"expected at least one controller"),
-        (
-            {"controller": ["crazyflow"], "switch": 0},
-            r"'crazyflow' follows, attitude or body_rate, got control='state'",
-        ),
-        ({"controller": ["pid"], "switch": 1}, r"expected switch as a function or as integers from 0 to 0"),
-        ({"controller": ["pid"], "switch": lambda state, setpoint, time: time}, r"expected one integer"),
-        (
-            {"controller": ["pid"], "switch": np.zeros((3, 4), int)},
-            r"\(n_worlds, n_drones\) = \(1, 1\), got shape \(3, 4, 1\)",
-        ),
-        ({"controller": "load_lqr", "drone": "bumblebee"}, r"expected a load 'load' for controller 'load_lqr'"),
-        ({"controller": LoadLQR(length=0.0), "drone": "bumblebee"}, r"positive length, m, got 0\.05 and 0\.0"),
-        ({"controller": INDI(cutoff=-1.0)}, r"expected a positive, finite cutoff, Hz, got -1"),
-    ],
-)
-def test_wrong_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Sim(**({"control": "state"} | settings)).step()
-
-
 def test_a_memory_without_scopes_is_refused():
     class Bare(Spring):
         def memory(self, airframe):
@@ -392,108 +352,6 @@ def test_a_switch_in_hover_is_bumpless(names, max_change):
     assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < max_change
     sim.step(1000)
     assert np.max(np.abs(np.asarray(sim.data.states.vel))) < 0.1
-
-
-# Laws -----------------------------------------------------------------------------------------------------------
-
-EXTREME_ATTITUDES = {
-    "level": [0.0, 0, 0, 1],
-    "upside down": [1.0, 0, 0, 0],
-    "straight up": [0.0, -np.sqrt(0.5), 0, np.sqrt(0.5)],
-    "turned": [0.0, 0, 1, 0],
-}
-"""Quaternions, xyzw."""
-COMMANDS = {
-    "state": np.r_[50.0, -50, 50, np.zeros(9), 1, 0, 0, 3],
-    "body_rate": [40.0, -40, 40, 0.4],
-}
-"""Commands far beyond all limits, by command level."""
-LEVELS = {"state": ["pid", "mellinger"], "body_rate": ["pid"]}
-"""Controllers by the command level that they follow."""
-
-
-N_STEPS = 10
-"""Number of steps that a gradient goes back."""
-
-
-def is_number(x):
-    return jnp.issubdtype(x.dtype, jnp.floating)
-
-
-@functools.cache
-def all_controllers(control):
-    """Return a simulation with 8 worlds for each controller of a level, and a function: the gradient by the command.
-
-    The gradient is that of the climb after 10 steps, pulled back step by step through one compiled program.
-    """
-    names = LEVELS[control]
-    switch = np.repeat(np.arange(len(names)), 8)[:, None]
-    sim = Sim(8 * len(names), drone="cf2x_L250", control=control, controller=names, switch=switch)
-
-    @jax.jit
-    def pull_back(command, data, slopes):
-        leaves, treedef = jax.tree.flatten(data)
-        numbers = [k for k, x in enumerate(leaves) if is_number(x)]
-
-        def advance(command, values):
-            data = treedef.unflatten(replace_leaves(leaves, numbers, values))
-            data = F.stage_command(data, command)
-            for stage in as_stages(sim.step_pipeline):
-                data = stage(data)
-            after = jax.tree.leaves(data)
-            return [after[k] for k in numbers], data
-
-        _, pull, after = jax.vjp(advance, command, [leaves[k] for k in numbers], has_aux=True)
-        return after, *pull(slopes)
-
-    def slope(command, data):
-        # Arrays on the host and arrays on a device would compile two programs.
-        put = functools.partial(jax.device_put, device=jax.devices()[0])
-        command, data = put((command, data))
-        climb = data.replace(states=data.states.replace(vel=np.tile(np.float32([0, 0, 1]), (sim.n_worlds, 1, 1))))
-        numbers = [(x, y) for x, y in zip(*map(jax.tree.leaves, (climb, data)), strict=True) if is_number(y)]
-        slopes = put([np.zeros(y.shape, y.dtype) if x is y else x for x, y in numbers])
-        flight = [data]
-        for _ in range(N_STEPS):
-            flight.append(pull_back(command, flight[-1], slopes)[0])
-        total = np.zeros(command.shape)
-        for data in reversed(flight[:-1]):
-            _, by_command, slopes = pull_back(command, data, slopes)
-            total += np.asarray(by_command)
-        return total
-
-    return sim, slope
-
-
-@pytest.mark.long("compiles the gradient of every controller")
-@pytest.mark.parametrize("control", LEVELS)
-def test_no_nan_in_values_or_gradients(control):
-    """Law 7: from any attitude, at rest, spinning at 100 rad/s, with commands far beyond all limits, and motors off."""
-    sim, slope = all_controllers(control)
-    repeats = sim.n_worlds // 8
-    quat = np.tile(np.repeat(np.array(list(EXTREME_ATTITUDES.values())), 2, axis=0), (repeats, 1))[:, None]
-    ang_vel = np.tile(np.array([[0.0] * 3, [100.0, -100, 100]]), (4 * repeats, 1))[:, None]
-    start = with_states(sim.default_data, quat=quat, ang_vel=ang_vel)
-    for scale in (1.0, 0.0):
-        command = np.float32(COMMANDS[control]) * scale
-        command = jnp.asarray(np.broadcast_to(command, (sim.n_worlds, 1, len(command))))
-        sim.data = F.stage_command(start, command)
-        sim.step(2000)
-        assert not np.any(sim.data.core.nonfinite)
-        for leaf_ in jax.tree.leaves((sim.data.states, sim.data.controls)):
-            assert np.all(np.isfinite(leaf_))
-        assert np.all(np.isfinite(slope(command, start)))
-
-
-def test_gradients_flow_through_the_step():
-    sim, slope = all_controllers("state")
-    sim.reset()
-    command = jnp.asarray(make_setpoint(sim))
-    sim.state_control(command)
-    sim.step(1500)
-    gradient = slope(command, sim.data)
-    assert np.all(np.isfinite(gradient))
-    assert np.all(gradient[:, 0, 2] > 0)
 
 
 @pytest.mark.parametrize(

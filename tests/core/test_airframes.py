@@ -11,7 +11,6 @@ import crazysim as cs
 from crazysim import ConfigError, Sim, load_airframe
 from crazysim.core.airframes import create_per_drone
 from crazysim.dynamics import first_principles
-from crazysim.engine.pytree import check_axes
 from crazysim.errors import UnknownNameError
 
 FIRMWARE_PAIR = (HEXAROTOR, "cf2x_L250")
@@ -87,18 +86,6 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
         np.testing.assert_allclose(result, expected, rtol=3e-5, atol=3e-5)
 
 
-def test_fitted_models_may_be_mixed():
-    fleet, dynamics = ("cf21B_500", "cf2x_L250"), "so_rpy_rotor"
-    pos = random_positions(2, 2)
-    mixed = set_flying(Sim(2, drone=fleet, dynamics=dynamics, engine="interpret"), pos)
-    mixed.step(50)
-    for k, airframe in enumerate(fleet):
-        single_sim = set_flying(Sim(2, drone=airframe, dynamics=dynamics, engine="interpret"), pos[:, k : k + 1])
-        single_sim.step(50)
-        expected, result = np.asarray(single_sim.data.states.pos)[:, 0], np.asarray(mixed.data.states.pos)[:, k]
-        np.testing.assert_allclose(result, expected, rtol=1e-6)
-
-
 def test_equal_airframes_share_their_parameters():
     """The data are the same if the airframe is named once or once for each drone."""
     named_once, named_twice = Sim(2, 2), Sim(2, drone=["cf21B_500", "cf21B_500"])
@@ -117,15 +104,6 @@ def test_only_parameters_that_differ_have_an_axis_of_drones():
     exists = np.asarray(params.rotor_vel_max)[0, :, 4:] > 0
     np.testing.assert_array_equal(np.all(exists, axis=-1), [False, False, True, False])
     np.testing.assert_array_equal(np.any(exists, axis=-1), [False, False, True, False])
-
-
-@pytest.mark.parametrize("n_worlds", [2, 3])
-def test_worlds_and_drones_may_be_equally_many(n_worlds):
-    sim = Sim(n_worlds, drone=FLEET[:n_worlds], engine="plain")
-    check_axes(sim.data, n_worlds, sim.n_drones)
-    mass = [airframe.value("rigid_body.mass") for airframe in sim.airframes]
-    result = np.asarray(sim.data.params.mass)[..., 0]
-    np.testing.assert_allclose(result, np.broadcast_to(mass, (n_worlds, sim.n_drones)), rtol=1e-6)
 
 
 def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():

@@ -24,11 +24,6 @@ def test_grid_2d_keeps_distance_and_fills_from_its_centre(n, spacing):
     assert from_centre[-1] <= spacing * np.sqrt(n) / np.sqrt(2) + spacing
 
 
-def test_grid_2d_of_one_and_of_four():
-    np.testing.assert_array_equal(grid_2d(1), [[0, 0]])
-    np.testing.assert_array_equal(np.sort(grid_2d(4), axis=0), [[-0.5, -0.5], [-0.5, -0.5], [0.5, 0.5], [0.5, 0.5]])
-
-
 def test_drones_begin_at_rest_level_and_alike_in_every_world():
     states = SimState.create(3, 5, n_rotors=6)
     np.testing.assert_array_equal(states.pos[0], states.pos[2])

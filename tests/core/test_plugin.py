@@ -16,12 +16,8 @@ from crazysim import (
     ESKF,
     Battery,
     ConfigError,
-    ContactResponse,
-    Downwash,
-    GroundEffect,
     Integrator,
     Latency,
-    MotorFailure,
     Plugin,
     PyTree,
     RangeFinder,
@@ -122,32 +118,6 @@ def fly_on(sim, n_steps=20):
     return sim.data
 
 
-PLUGINS = [
-    Wind((2.0, 1.0, 0.0), 7.7),
-    Downwash(),
-    GroundEffect(),
-    Battery(0.25, 0.1),
-    MotorFailure(0.9, rate=0.5),
-    Latency(2),
-    Wake(),
-    ContactResponse(),
-    RangeFinder(),
-]
-
-
-def test_the_order_of_adding_does_not_matter():
-    """Products of several factors differ by rounding of float32."""
-    flights = []
-    for plugins in (PLUGINS, PLUGINS[::-1], PLUGINS[4:] + PLUGINS[:4]):
-        sim = make_hovering_sim(engine="interpret")
-        for plugin in plugins:
-            sim.add(plugin)
-        flights.append(fly_on(sim, 10))
-    for flight in flights[1:]:
-        for x, y in zip(jax.tree.leaves(flight.states), jax.tree.leaves(flights[0].states), strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
-
-
 def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
     """``estimator`` and ``aero`` are short for plugins, which come before the listed plugins."""
     wind, battery = Wind((1.0, 0, 0), speed_20ft=7.7), Battery()
@@ -166,28 +136,6 @@ def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
         assert [*sim.step_pipeline] == [*shorthand.step_pipeline]
         assert trees_equal(sim.data, shorthand.data)
         assert trees_equal(sim.default_data, shorthand.default_data)
-
-
-def test_remove_restores_the_simulation_before_the_plugin():
-    """Plugins are removed in any order. Stages, records and every bit of a flight are as before."""
-    sim = make_hovering_sim(engine="interpret")
-    before, data, default = dict(sim.step_pipeline), sim.data, sim.default_data
-    expected = fly_on(sim)
-    sim.data = data
-    for plugin in PLUGINS:
-        sim.add(plugin)
-    fly_on(sim, 2)
-    for k in (0, 5, 2, 3, 1, 8, 7, 6, 4):
-        sim.remove(PLUGINS[k] if k % 2 else PLUGINS[k].name)
-    assert list(sim.step_pipeline) == list(before)
-    for name, fn in before.items():
-        assert name == "integration" or sim.step_pipeline[name] is fn
-    assert not sim.step_pipeline["integration"].fn.plugins
-    assert not sim.plugins
-    assert trees_equal(sim.default_data, default)
-    assert jax.tree.structure(sim.data) == jax.tree.structure(data)
-    sim.data = data
-    assert trees_equal(fly_on(sim), expected)
 
 
 def test_replace_changes_numbers_without_compiling_and_keeps_states():
@@ -363,30 +311,6 @@ def test_new_data_has_new_records():
     sim.build_data()
     np.testing.assert_array_equal(sim.data.plugins["wake"].vel, 0.0)
     sim.step()
-
-
-def test_law_01_methods_get_one_drone():
-    shapes = []
-
-    class Probe(Plugin):
-        """A plugin that stores the shapes of its data."""
-
-        name: str = "probe"
-
-        def influence(self, data):
-            shapes.append((data.states.pos.shape, data.core.steps.shape))
-            return data
-
-        def observations(self, data):
-            shapes.append((data.states.pos.shape, data.core.steps.shape))
-            return {}
-
-    sim = Sim(n_worlds=3, n_drones=2)
-    sim.add(Probe())
-    sim.step_fn.plan(sim.data)
-    assert shapes
-    sim.plugins.observations(sim.data)
-    assert set(shapes) == {((3,), ())}
 
 
 @pytest.mark.parametrize(
@@ -619,20 +543,6 @@ def test_law_09_a_plugin_has_a_name():
 
         class Anonymous(Plugin):
             """A plugin without a name."""
-
-
-class ArrayPlugin(Plugin):
-    """A plugin with an array of any type."""
-
-    which: jax.Array | None = None
-    mask: np.ndarray | None = None
-    name: str = "arrays"
-
-
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_arrays_of_both_libraries_are_settings(xp):
-    np.testing.assert_array_equal(ArrayPlugin(xp.asarray([1.0, 2.0])).which, [1.0, 2.0])
-    np.testing.assert_array_equal(ArrayPlugin(mask=xp.asarray([True, False])).mask, [True, False])
 
 
 class Discs(Plugin):

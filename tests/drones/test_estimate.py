@@ -108,49 +108,35 @@ def test_given_numbers_replace_estimates():
     assert [float(estimated.value(f"battery.{key}")) for key in ("cells", "capacity", "resistance")] == [6, 1.3, 0.04]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"mass": 0.0}, "mass to be positive, got 0"),
-        ({"arm": None}, "either arm, .* or positions"),
-        ({"arm": 0.08}, r"propellers that do not touch, got a diameter of 0.127 m and rotors 0.113 m apart"),
-        ({"propeller": 5.0}, r"propellers that do not touch, .*5 inches are 0\.127 m"),
-        ({"mass": 1200.0}, r"mass in kg and lengths in m, got 1200 kg, .* N/m\^2 of propeller"),
-        ({"arm": 120.0}, "mass in kg and lengths in m, .*rotors up to 120 m from the centre"),
-        ({"n_rotors": 5}, "an even number of rotors from 4"),
-        ({"n_rotors": 100_000}, "an even number of rotors from 4 to 64, which alternate, got 100000"),
-        ({"layout": "h"}, "layout as 'x' or '\\+', got 'h'"),
-        ({"arm": None, "positions": [[0.1, 0.1, 0]]}, "at least 3 rotors"),
-        ({"arm": None, "positions": [[0.2, 0], [-0.2, 0.2], [-0.2, -0.2]]}, "expected spins for 3 rotors"),
-        ({"spins": [1, 1, 1, 1]}, "spins of 1 and -1 for 4 rotors, and not all equal"),
-        ({"thrust_to_weight": None}, "either thrust_to_weight or motor_table"),
-        ({"motor_table": TABLE}, "either thrust_to_weight or motor_table"),
-        ({"thrust_to_weight": None, "motor_table": "nowhere.csv"}, "existing CSV file, got 'nowhere.csv'"),
-        ({"thrust_to_weight": None, "motor_table": {"force": [1]}}, "columns of a motor table among .*got 'force'"),
-        ({"thrust_to_weight": None, "motor_table": {"rpm": [1e4]}}, "a column thrust_n or thrust_g"),
-        ({"thrust_to_weight": None, "motor_table": TABLE | {"rpm": [1, 2]}}, "columns of equal lengths"),
-        ({"thrust_to_weight": None, "motor_table": {"thrust_g": ["much"]}}, "numbers in column 'thrust_g'"),
-        (
-            {"thrust_to_weight": None, "motor_table": TABLE | {"rpm": [10e3, 24.5e3, 17.3e3]}},
-            "thrust grows with the speed, got 5.886 at 24500 rpm, and 11.77 below",
-        ),
-        (
-            {"thrust_to_weight": None, "motor_table": TABLE | {"torque_nm": [0.1, 0.3, 0.1]}},
-            "torque grows with the speed, got 0.1 at 24500 rpm",
-        ),
-        (
-            {"thrust_to_weight": None, "motor_table": TABLE | {"thrust_n": [2.0, 60.0, 11.8]}},
-            "agree on the thrust, got 5.886 and 60 in row 2",
-        ),
-        ({"mass": "heavy"}, "mass as a number, got 'heavy'"),
-        ({"cells": np.nan}, "cells as a whole number, got nan"),
-    ],
-)
-def test_law_09_wrong_numbers_are_refused(change, message):
-    with pytest.raises(ConfigError, match=message):
-        estimate_airframe(**QUAD | change)
+NO_RATIO = {"thrust_to_weight": None}
+WRONG_NUMBERS = [
+    ({"mass": 0.0}, "mass"),
+    ({"mass": 1200.0}, "mass in kg and lengths in m"),
+    ({"arm": None}, "either arm, .* or positions"),
+    ({"arm": 0.08}, "propellers that do not touch"),
+    ({"arm": 120.0}, "mass in kg and lengths in m"),
+    ({"arm": None, "positions": [[0.1, 0.1, 0]]}, "at least 3 rotors"),
+    ({"arm": None, "positions": [[0.2, 0], [-0.2, 0.2], [-0.2, -0.2]]}, "spins for 3 rotors"),
+    ({"propeller": 5.0}, r"5 inches are 0\.127 m"),
+    ({"n_rotors": 5}, "an even number of rotors"),
+    ({"n_rotors": 100_000}, "from 4 to 64"),
+    ({"layout": "h"}, "layout"),
+    ({"spins": [1, 1, 1, 1]}, "spins"),
+    (NO_RATIO, "either thrust_to_weight or motor_table"),
+    ({"motor_table": TABLE}, "either thrust_to_weight or motor_table"),
+    (NO_RATIO | {"motor_table": "nowhere.csv"}, "existing CSV file"),
+    (NO_RATIO | {"motor_table": {"force": [1]}}, "got 'force'"),
+    (NO_RATIO | {"motor_table": {"rpm": [1e4]}}, "thrust_n or thrust_g"),
+    (NO_RATIO | {"motor_table": TABLE | {"rpm": [1, 2]}}, "columns of equal lengths"),
+    (NO_RATIO | {"motor_table": {"thrust_g": ["much"]}}, "column 'thrust_g'"),
+    (NO_RATIO | {"motor_table": TABLE | {"rpm": [10e3, 24.5e3, 17.3e3]}}, "thrust grows with the speed"),
+    (NO_RATIO | {"motor_table": TABLE | {"torque_nm": [0.1, 0.3, 0.1]}}, "torque grows with the speed"),
+    (NO_RATIO | {"motor_table": TABLE | {"thrust_n": [2.0, 60.0, 11.8]}}, "agree on the thrust"),
+    ({"thrust_to_weight": 0.9}, "rotors that lift 1.2 kg"),
+]
 
 
-def test_law_09_a_drone_that_does_not_lift_itself_is_refused():
-    with pytest.raises(ConfigError, match=r"expected rotors that lift 1\.2 kg"):
-        load(**QUAD | {"thrust_to_weight": 0.9})
+@pytest.mark.parametrize(("change", "words"), WRONG_NUMBERS)
+def test_law_09_wrong_numbers_are_refused(change, words):
+    with pytest.raises(ConfigError, match=words):
+        load(**QUAD | change)

@@ -138,21 +138,6 @@ def test_float32_errs_by_rounding_only(rng, kind):
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_01_one_drone_then_many(rng, kind):
-    """Distances and gradients of all points at once equal those of each point by itself."""
-    points = (0.5 * rng.uniform(-1, 1, (N, 3))).astype(np.float32).astype(float)
-    batch, slopes = evaluate_points(kind, points)
-    single, slope = evaluate_points(kind, points, one_by_one=True)
-    np.testing.assert_allclose(batch, single, rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(slopes, slope, atol=1e-9)
-    np.testing.assert_allclose(
-        evaluate_points(kind, points[:12], np.float32, one_by_one=True)[1], slope[:12], atol=1e-4
-    )
-    shape = jax.eval_shape(lambda p: eager_point_distance(SHAPES[kind], p), jnp.zeros((3, 4, 3)))
-    assert shape.shape == (3, 4)
-
-
-@pytest.mark.parametrize("kind", SHAPES)
 def test_law_08_gradient_equals_central_differences_and_has_length_one(rng, kind):
     points, h = random_points(rng, N), 1e-6
     _, slope = evaluate_points(kind, points)

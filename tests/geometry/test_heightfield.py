@@ -107,11 +107,3 @@ def test_reach_by_hand(x64):
 @pytest.mark.parametrize("kind", DRONES)
 def test_law_07_no_nan(kind):
     check_finite(DRONES[kind], FIELD, np.float64, N)
-
-
-def test_law_01_one_drone_then_many(x64, rng):
-    pos, quat = draw_poses_near_surface(rng, 4)
-    rot = rotations(quat)
-    batch = distance(DRONES["sphere"], FIELD, pos.reshape(2, 2, 3), rot.reshape(2, 2, 3, 3))
-    singles = [distance(DRONES["sphere"], FIELD, p, r) for p, r in zip(pos, rot, strict=True)]
-    np.testing.assert_allclose(np.ravel(batch), singles, atol=1e-12)

@@ -74,17 +74,6 @@ def test_float32_rays_end_on_the_surface(rng, kind):
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_01_one_ray_then_many(x64, rng, kind):
-    """All rays at once give the results of a function of one ray that is mapped over them."""
-    rays = draw_rays(rng)
-    one_by_one = jax.jit(jax.vmap(functools.partial(ray_distance, SHAPES[kind])))(*rays)
-    for x, y in zip(trace_rays(kind, *rays), one_by_one, strict=False):
-        np.testing.assert_allclose(x, y, atol=1e-12)
-    shapes = jax.eval_shape(functools.partial(ray_distance, SHAPES[kind]), *(jnp.zeros((3, 4, 3)),) * 2)
-    assert [x.shape for x in shapes] == [(3, 4), (3, 4, 3)]
-
-
-@pytest.mark.parametrize("kind", SHAPES)
 def test_law_08_gradient_equals_central_differences(rng, kind):
     h = 1e-6
     origin, direction = draw_rays(rng)

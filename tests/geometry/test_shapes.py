@@ -31,16 +31,6 @@ def test_a_shape_does_not_change_with_the_array_it_was_made_of():
         shape.vertices[0, 0] = 1
 
 
-def test_hull_of_a_cube():
-    shape = hull([*CUBE, [0, 0, 0], [0.5, 0.2, 0.1]])
-    assert shape.vertices.shape == (8, 3)
-    assert shape.faces.shape == (12, 3)
-    assert {tuple(n) for n in np.round(shape.normals, 9) + 0.0} == {
-        tuple(s * e) for s in (1, -1) for e in np.eye(3) + 0
-    }
-    np.testing.assert_allclose(shape.offsets, 1)
-
-
 @pytest.mark.parametrize("n", [4, 12, 40])
 def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     vertices = rng.normal(size=(n, 3))

@@ -15,12 +15,12 @@ from cases import (
     hover_command,
     hover_rotor_state,
     send,
-    shared_sim,
     trees_equal,
     with_airframes,
     with_states,
     zero_thrust_command,
 )
+from sweep import NAMED_CONTROLLERS
 
 from crazysim import Drone, Sim, load_airframe
 from crazysim.core.integration import FLOOR_HEIGHT
@@ -60,22 +60,27 @@ ENGINE_CASES = [
     ("so_rpy", "attitude", "stages"),
     (*PAIRS[0], "auto"),
     ("so_rpy_rotor_drag", "state", "auto"),
+    ("first_principles", "state", "controllers"),
 ]
 """Dynamics, command level and engine of each case: every level, and the fits with the fewest and the most terms.
 
-Most cases run without an engine. The longest pipelines run on the default engine.
+Most cases run without an engine, and the longest pipelines on the default engine. In the case "controllers" each
+situation is flown by every controller.
 """
 
 
 @functools.cache
 def make_situations(dynamics, control, engine="auto"):
-    engine = "plain" if engine == "stages" else engine
-    sim = shared_sim(n_worlds=len(SITUATIONS), dynamics=dynamics, control=control, engine=engine)
-    n = len(SITUATIONS)
+    n, settings = len(SITUATIONS), {}
+    if engine == "controllers":
+        n *= len(NAMED_CONTROLLERS)
+        settings = {"controller": NAMED_CONTROLLERS, "switch": np.arange(n)[:, None] // len(SITUATIONS)}
+    engine = "plain" if engine in ("stages", "controllers") else engine
+    sim = Sim(n, dynamics=dynamics, control=control, engine=engine, **settings)
     pos, vel, quat, rotor_vel = (np.zeros((n, 1, k)) for k in (3, 3, 4, 4))
     pos[..., 2], quat[..., 3] = 1.0, 1.0
     commands = np.broadcast_to(hover_command(sim.data), (n, 1, len(hover_command(sim.data)))).copy()
-    world_ids = {name: i for i, name in enumerate(SITUATIONS)}
+    world_ids = {name: np.arange(i, n, len(SITUATIONS)) for i, name in enumerate(SITUATIONS)}
     rotor_vel[world_ids["hover"]] = hover_rotor_state(sim.data)
     for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR_HEIGHT), ("below floor", -1.0)):
         pos[world_ids[name], 0, 2] = height
@@ -101,7 +106,7 @@ def make_situations(dynamics, control, engine="auto"):
 @functools.cache
 def make_flight(dynamics, control, engine):
     sim = make_situations(dynamics, control, engine)[0]
-    step = build_stagewise_step(sim) if engine == "stages" else sim.build_step_fn()
+    step = sim.build_step_fn() if engine == "auto" else build_stagewise_step(sim)
 
     @jax.jit
     @functools.partial(jax.grad, has_aux=True)
@@ -126,9 +131,9 @@ def test_values_and_gradients_are_finite(dynamics, control, engine):
     """Law 7: every situation, every kind of dynamics and command, after 50 steps."""
     _, data, commands = make_situations(dynamics, control, engine)
     gradients, end = jax.device_get(make_flight(dynamics, control, engine)(differentiated_inputs(data, commands), data))
-    for world, name in enumerate(SITUATIONS):
+    for world in range(len(commands)):
         for leaf, x in {**vars(end.states), **{f"gradient of {k}": v for k, v in gradients.items()}}.items():
-            assert np.all(np.isfinite(x[world])), f"{leaf} in {name!r}"
+            assert np.all(np.isfinite(x[world])), f"{leaf} in {SITUATIONS[world % len(SITUATIONS)]!r}"
     assert not end.core.nonfinite.any()
     assert np.all(end.states.pos[..., 2] >= np.float32(FLOOR_HEIGHT))
     # Drones that fly have a gradient with respect to their initial position; drones on the floor have none.
@@ -243,7 +248,7 @@ def test_a_bad_world_changes_no_other(dynamics, control, engine):
             changes, jax.devices()[0]
         )  # on the device of the data, or the flight would be compiled again
         bad_gradients, bad = fly(differentiated_inputs(data.replace(states=states.replace(**changes)), commands), data)
-        others = np.arange(len(SITUATIONS)) != 1
+        others = np.arange(len(commands)) != 1
         for a, b in ((good, bad), (good_gradients, bad_gradients)):
             a, b = ((x.states, x.controls) if x in (good, bad) else x for x in (a, b))
             assert trees_equal(*(drone_leaves(tree, others) for tree in (a, b)))

@@ -12,6 +12,7 @@ from crazysim import (
     IMU,
     Battery,
     Camera,
+    Cars,
     Clutter,
     ConfigError,
     ContactResponse,
@@ -48,7 +49,8 @@ from crazysim.plugins import sensors
 from crazysim.plugins.effects import Grid
 from crazysim.plugins.estimators import ESKF, Complementary
 from crazysim.plugins.sensors import UWB, Barometer, Distortion, Lighthouse, Magnetometer, Triad
-from crazysim.trajectories import Trajectory, figure_eight, line
+from crazysim.plugins.vehicles import LPV, Path, PurePursuit, load_vehicle
+from crazysim.trajectories import Trajectory, figure_eight, hover, line, spline
 
 POINT = (0.0, 0.0, 2.0)
 
@@ -278,7 +280,65 @@ SCENE = [
     (lambda: Rooms(room=1.5, door=1.0), "rooms at least twice as wide as a door"),
     (lambda: Gates(start=(0, 0, 0.5)), "gates above the floor"),
 ]
-ROWS = [*SENSORS, *ESTIMATORS, *EFFECTS, *PAYLOADS_AND_PATHS, *SCENE]
+
+
+def cars(**settings):
+    return lambda: sim(Cars(**settings))
+
+
+def vehicle(**tables):
+    return lambda: load_vehicle({"base": "aiml_head", **tables})
+
+
+def points(*corners, **settings):
+    return lambda: Path.of_points(corners, **settings)
+
+
+SQUARE, BACKWARDS = [(0, 0), (2, 0), (2, 2), (0, 2)], Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0)
+STRAIGHT, CORNER = (spline([0, 1], ends) for ends in ([(0, 0, 0), (1, 0, 0)], [(1, 0, 0), (0, 1, 0)]))
+VEHICLES = [
+    (cars(vehicle="tank"), "a vehicle as one of"),
+    (cars(level="torque"), "level of 'cars'"),
+    (cars(reference="place"), "reference of 'cars'"),
+    (cars(controller=PurePursuit()), "a path for controller of 'cars'"),
+    (cars(controller="lqr", path=EIGHT), "controller of Cars as PathController"),
+    (cars(path="eight"), "a Path, a Trajectory"),
+    (cars(path=EIGHT, index=1), "index to be from 0 to 0"),
+    (cars(path=EIGHT, start=[0.0, 1.0]), "start as real numbers of shape (1,)"),
+    (cars(path=EIGHT, vehicle="bicycle"), "a vehicle that steers"),
+    (cars(vehicle="bicycle", trailer=True), "a table [trailer]"),
+    (cars(path=BACKWARDS, controller=LPV()), "can drive forwards"),
+    (cars(members=2, pos=[(0, 0, 0)]), "pos as real numbers of shape (2,)"),
+    (cars(yaw=[0.0, 1.0]), "yaw as real numbers of shape (1,)"),
+    (cars(freq=40), "to divide freq = 500 Hz"),
+    (cars(members=["a", "a"]), "got 'a' twice"),
+    (lambda: load_vehicle("f1tenth"), "aiml_apr24, aiml_head"),
+    (lambda: load_vehicle(3), "a vehicle as a name"),
+    (lambda: load_vehicle({"rigid_body": {"mass": 1.0}}), "which it lacks"),
+    (lambda: load_vehicle("bicycle").number("trailer.hitch"), "has no value 'trailer.hitch'"),
+    (vehicle(rigid_body={"mas": 1.0}), "Did you mean 'rigid_body.mass'"),
+    (vehicle(wheel={"radius": 1.0}), "a table that exists"),
+    (vehicle(rigid_body={"mass": 1e-300}), "rigid_body.mass"),
+    (vehicle(rigid_body={"mass": [1.0, 2.0]}), "of shape"),
+    (vehicle(wheels={"number": 0}), "wheels.number"),
+    (vehicle(drive={"torque": [0, 5, 1]}), "drive.torque"),
+    (vehicle(drive={"front_share": 1.5}), "drive.front_share"),
+    (vehicle(drive={"force": [1, 1, 1], "torque": [1, 1, 1], "force_max": 1}), "either"),
+    (vehicle(steering={"angle_max": 2.0}), "steering.angle_max"),
+    (vehicle(steering={"bandwidth": np.inf}), "steering.bandwidth"),
+    (vehicle(model="tank"), "single_track, kinematic"),
+    (points((0, 0), (1, 1)), "at least three points"),
+    (points((0, 0, 0), (1, 1, 0), (2, 0, 0)), "(n_points, 2)"),
+    (points((0, 0), (1, 1), (1, 1)), "twice"),
+    (points(*SQUARE, (0, 0), closed=True), "does not repeat its first point"),
+    (points(*SQUARE, speed=0), "a speed other than zero"),
+    (points((0, 0), (1e4, 0), (2e4, 1)), "a path of at most 10000 m"),
+    (lambda: Path.of_trajectory(hover((0, 0, 1), 2.0)), "a path longer than 1 mm"),
+    (lambda: Path.of_trajectory(STRAIGHT.then(CORNER)), "without a tangent at (1, 0) m"),
+    (lambda: Path.of_trajectory(STRAIGHT.replace(repeats=np.bool_(True))), "a gap of 1 m"),
+    (lambda: Path.stack([]), "at least one path"),
+]
+ROWS = [*SENSORS, *ESTIMATORS, *EFFECTS, *PAYLOADS_AND_PATHS, *SCENE, *VEHICLES]
 
 
 @pytest.mark.parametrize(("call", "words"), ROWS, ids=[row[1] for row in ROWS])

@@ -290,23 +290,6 @@ def test_a_range_finder_measures_at_its_rate():
     assert last == pytest.approx(float(np.asarray(sim.data.states.pos)[0, 0, 2]), abs=0.05)
 
 
-def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
-    sim, _, _ = room
-    for call, message in (
-        (lambda: sim.depth("nose"), "expected a camera of the scene, track_cam, fpv_cam, got 'nose'"),
-        (lambda: sim.depth(99), "got 99"),
-        (lambda: sim.depth("fpv_cam", 0, 4), "positive integers as width and height of an image, got 0 x 4 pixels"),
-        (lambda: sim.depth("fpv_cam", 4, 4.5), "expected height as a whole number, got 4.5"),
-        (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
-        (lambda: sim.add(RangeFinder([[0, 0, 0]])), "none of them zero"),
-        (lambda: sim.add(RangeFinder(max_range=0)), "max_range of RangeFinder to be positive"),
-        (lambda: sim.add(RangeFinder(freq=333)), "Use the nearest rate below, 250 Hz"),
-    ):
-        with pytest.raises(ConfigError) as error:
-            call()
-        assert message in str(error.value)
-
-
 ALL_KINDS = """<mujoco><asset>
 <mesh name="wedge" vertex="0 0 0 .4 0 0 0 .5 0 0 0 .6"/>
 <hfield name="hill" nrow="3" ncol="4" size=".5 .4 .3 .1" elevation="0 .2 .1 0 .5 1 .6 .3 0 .4 .2 .1"/></asset>

@@ -260,50 +260,6 @@ def test_the_lower_led_is_visible_from_below(opengl):
     assert counts["below", "led_bot"] > 10 > counts["below", "led_top"]
 
 
-# Wrong input ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("draw", "message"),
-    [
-        (lambda sim: draw_points(sim, np.zeros((4, 2))), r"shape \(n, 3\), got \(4, 2\)"),
-        (lambda sim: draw_line(sim, np.zeros((2, 2, 3))), r"shape \(n, 3\), got \(2, 2, 3\)"),
-        (lambda sim: draw_capsule(sim, [0, 0], [1, 1]), r"shape \(3,\), got \(2,\) and \(2,\)"),
-        (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
-        (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
-        (lambda sim: draw_text(sim, "x", "middle"), "expected corner 'top left' or .*, got 'middle'"),
-        (lambda sim: draw_text(sim, ""), "expected a string that is not empty as text, got ''"),
-        (lambda sim: draw_text(sim, 3), "expected text as str, got 3"),
-        (lambda sim: draw_text(sim, "5 µm"), "expected ASCII text, got '5 µm' with 'µ'"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "at most 99 characters, got 100"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label of one line"),
-        (lambda sim: draw_label(sim, [0, 0], "x"), r"shape \(3,\), got \(2,\)"),
-        (lambda sim: draw_setpoints(sim), "control='attitude'"),
-        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "at most 10000 overlays in one image, got 20000"),
-        (
-            lambda sim: change_material(sim, "led_top", [2], rgba=RED),
-            r"drone_ids must be in range \[0, 1\], got \[-?\d",
-        ),
-        (
-            lambda sim: change_material(sim, "led_top", [-1], rgba=RED),
-            r"drone_ids must be in range \[0, 1\], got \[-?\d",
-        ),
-        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
-        (
-            lambda sim: change_material(sim, "led_top", [0.5], rgba=RED),
-            "drone_ids must be 1D array.* of integers",
-        ),
-        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "got 'lamp'"),
-        (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
-    ],
-)
-def test_wrong_overlays_are_refused_and_nothing_is_drawn(sim, draw, message):
-    with pytest.raises(ValueError, match=message):
-        draw(sim)
-    assert len(sim.overlays) == 0
-    assert not sim.overlays.has_text
-
-
 def test_the_limit_of_overlays_can_be_raised():
     """An image takes as many geoms as the limit allows."""
     overlays = Overlays(limit=3)

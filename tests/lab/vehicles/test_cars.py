@@ -1,7 +1,5 @@
 """Cars in a simulation: engines, counts, commands, paths, gradients, the scene, terrain, and wrong input."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,25 +111,6 @@ def test_references_by_arc_length_stop_at_the_end():
     assert abs(np.asarray(record.body_vel)[0, 0, 0]) < 0.02
 
 
-def test_gradients_are_finite_at_rest():
-    """Gradients by all states, of a step at rest and of one after the car has driven off."""
-    sim, cars = build(1, path=EIGHT, controller=PathLQR(), in_scene=False)
-    stages = list(sim.step_pipeline.values())
-
-    def end(record, data):
-        data = cars.write(data, record)
-        for stage in stages:
-            data = stage(data)
-        return sum(jnp.sum(x) for x in jax.tree.leaves(cars.read(data)) if jnp.issubdtype(x.dtype, jnp.floating))
-
-    slopes = jax.jit(jax.grad(end, allow_int=True))
-    for n_steps in (0, 60):
-        if n_steps:
-            sim.step(n_steps)
-        result = jax.tree.leaves(slopes(cars.read(sim.data), sim.data))
-        assert all(x.dtype == jax.dtypes.float0 or np.all(np.isfinite(x)) for x in result)
-
-
 def test_external_forces_move_a_car():
     sim, cars = build(1, in_scene=False)
     record = cars.read(sim.data)
@@ -209,35 +188,6 @@ def test_cars_roll_down_a_slope():
     assert record.body_vel[0, 0, 0] == pytest.approx(speed, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"vehicle": "tank"}, "expected a vehicle as one of"),
-        ({"level": "torque"}, "expected level of 'cars' as one of"),
-        ({"reference": "place"}, "expected reference of 'cars' as one of"),
-        ({"controller": PurePursuit()}, "expected a path for controller of 'cars', got none"),
-        ({"controller": "lqr", "path": EIGHT}, "expected controller of Cars as PathController"),
-        ({"path": "eight"}, "expected a Path, a Trajectory"),
-        ({"path": EIGHT, "index": 1}, "index to be from 0 to 0"),
-        ({"path": EIGHT, "start": [0.0, 1.0]}, "expected start as real numbers of shape (1,) for all members"),
-        ({"path": EIGHT, "vehicle": "bicycle"}, "expected a vehicle that steers"),
-        ({"vehicle": "bicycle", "trailer": True}, "expected a vehicle with a table [trailer]"),
-        ({"path": Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0), "controller": LPV()}, "can drive forwards"),
-        ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as real numbers of shape (2,) for all members"),
-        ({"yaw": [0.0, 1.0]}, "expected yaw as real numbers of shape (1,) for all members"),
-        ({"freq": 40}, "to divide freq = 500 Hz"),
-        ({"members": ["a", "a"]}, "got 'a' twice"),
-    ],
-)
-def test_wrong_settings_are_errors(settings, message):
-    sim = Sim()
-    before = sim.data
-    with pytest.raises(ConfigError, match=re.escape(message)):
-        sim.add(Cars(**settings))
-    assert sim.data is before
-    assert "cars" not in sim.plugins
-
-
 def test_a_car_has_a_view_by_its_name():
     sim, cars = build(2, members=3, in_scene=False)
     assert sim["Fleet1Tenth_1"].pos.shape == (2, 3)
@@ -245,13 +195,6 @@ def test_a_car_has_a_view_by_its_name():
     sim["Fleet1Tenth_1"].command([0.1, 0.2])
     np.testing.assert_allclose(np.asarray(cars.read(sim.data).command)[:, 1], [[0.1, 0.2]] * 2)
     np.testing.assert_array_equal(np.asarray(cars.read(sim.data).command)[:, 0], 0.0)
-
-
-def test_wrong_commands_are_errors():
-    sim, cars = build(2, members=3, in_scene=False)
-    for command, message in ((np.zeros((2, 3, 4)), "(2, 3, 2)"), (np.full((2, 3, 2), np.nan), "finite")):
-        with pytest.raises(ValueError, match=re.escape(message)):
-            cars.with_command(sim.data, command)
 
 
 @pytest.mark.parametrize("members", [1, 2])

@@ -317,23 +317,6 @@ def test_a_report_in_a_stage_needs_a_world():
         contacts(sim.data.replace(states=jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)))
 
 
-def test_law_07_no_nan(rng):
-    """Loads overlap drones, obstacles and the floor, some without mass, at any speed."""
-    n = 12
-    sim = build(n, 2, height=0.3, strict=True)
-    load = sim.add(SlungLoad(mass=np.linspace(0, 0.3, 2 * n).reshape(n, 2), cable=True, size=RADIUS))
-    sim.scene.add("box", pos=[0.3, 0, 0.2], size=(0.2, 0.2, 0.4))
-    sim.add(ContactResponse())
-    leave_out_drones(sim)
-    pos = np.asarray(sim.data.states.pos) + rng.uniform(-0.3, 0.3, (n, 2, 3))
-    pos[0], pos[1, :] = np.asarray(sim.data.states.pos)[0], [0.3, 0, 0.2]
-    sim.data = with_load(load, sim.data, pos=pos, vel=5 * rng.normal(size=(n, 2, 3)))
-    for _ in range(4):
-        sim.step(300)
-        for x in jax.tree.leaves((sim.data.states, load.read(sim.data))):
-            assert np.isfinite(x).all()
-
-
 def test_the_bounce_has_gradients(x64):
     """The derivative of a drone's speed after a hit by the load's speed before equals the difference quotient.
 

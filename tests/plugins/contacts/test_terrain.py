@@ -2,7 +2,6 @@
 
 import zlib
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -188,23 +187,6 @@ def test_large_tables_of_heights_are_read_outside_of_the_kernel_with_the_same_nu
         ends.append(np.asarray(sim.data.states.pos))
     np.testing.assert_allclose(*ends, rtol=1e-5, atol=1e-6)
     assert ends[0][..., 2].max() < 0.7
-
-
-def test_law_08_gradients_of_the_height_are_its_slopes(x64):
-    sim, plugin = build()
-    record, h = plugin.read(sim.data), 1e-6
-    slope = jax.jit(jax.grad(lambda x: record.surface_at(x)[0][0]))
-
-    def surface_at(point):
-        return [np.asarray(x) for x in record.surface_at(point)]
-
-    for point in ([0.31, 0.17, 0.0], [-1.47, 1.2, 0.0]):
-        p = np.array(point)
-        gradient = np.asarray(slope(p))
-        central = [(surface_at(p + h * e)[0] - surface_at(p - h * e)[0])[0] / (2 * h) for e in np.eye(3)]
-        np.testing.assert_allclose(gradient, central, rtol=1e-6, atol=1e-8)
-        normal = surface_at(p)[1]
-        np.testing.assert_allclose(gradient[:2], -normal[:2] / normal[2], rtol=1e-9)
 
 
 def test_the_upper_edge_of_an_image_is_at_the_largest_y(tmp_path):

@@ -1,9 +1,6 @@
 """Battery: balance of energy, voltage under load calculated by hand, and rotors that slow down with it."""
 
-import functools
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
@@ -100,14 +97,6 @@ def test_without_compensation_all_speeds_follow_the_voltage():
         sim.replace(Battery(0.25, 0.1, command_voltage=0.0))
 
 
-@pytest.mark.parametrize("name, expected", [("cf21B_500", 3.1257), ("cf2x_T350", 2.8166), ("bumblebee", 2 * 3.7)])
-def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
-    """For a Crazyflie it follows from the firmware's thrust curve; airframes without a curve get 3.7 V per cell."""
-    sim = Sim(drone=name, control="rotor_vel")
-    sim.add(Battery(capacity=0.25, resistance=0.1, n_cells=2 if name == "bumblebee" else 1))
-    np.testing.assert_allclose(record(sim).full_speed_voltage, expected, atol=1e-4)
-
-
 @pytest.mark.parametrize("name", sorted(set(supported_drones("first_principles")) - {"bumblebee_lab"}))
 def test_without_arguments_a_battery_is_that_of_the_airframe(name):
     """The battery is full, its voltage falls under load, and it lasts minutes of hover. bumblebee_lab has none."""
@@ -158,17 +147,3 @@ def test_an_empty_battery_turns_no_rotor_and_a_reset_fills_it():
     charge = np.asarray(record(sim).charge)
     np.testing.assert_array_equal(charge[0], 1.0)
     assert np.all(charge[1] < 1)
-
-
-def test_law_07_gradients_are_finite_at_any_charge_and_power():
-    @jax.jit
-    @functools.partial(jax.grad, argnums=(0, 1))
-    def slopes(charge, power):
-        v, i = battery.voltage_under_load(power, battery.open_circuit_voltage(charge, 1), jnp.array([0.5]))
-        return jnp.sum(v + i)
-
-    for charge in (0.0, 0.1, 1.0):
-        charge = np.float32([charge])
-        max_power = np.asarray(battery.open_circuit_voltage(charge, 1)) ** 2 / 2
-        for power in (0 * max_power, max_power, 10 * max_power):
-            assert np.isfinite(slopes(charge, power)).all()

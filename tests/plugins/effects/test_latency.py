@@ -1,6 +1,5 @@
 """Latency: a command arrives exactly after its delay, at every command level; the data of the user stay."""
 
-import jax
 import numpy as np
 import pytest
 from cases import hover_command, hover_rotor_state, repeat_command, with_states
@@ -94,36 +93,6 @@ def test_a_command_that_is_sent_once_stays(delayed_sim):
     np.testing.assert_array_equal(in_force[2], 0.0)
     for command in in_force[3:]:
         np.testing.assert_array_equal(command, command_of(sim, 5)[0, 0].astype(np.float32))
-
-
-def test_a_reset_empties_the_queues_of_its_worlds_only(delayed_sim):
-    sim, before = delayed_sim, delayed_sim.data
-    fly(sim, 8)
-    flown = jax.device_get(sim.data.plugins["latency"])
-    sim.reset(np.array([True, False, False]))
-    after, sim.data = jax.device_get(sim.data.plugins["latency"]), before
-    default = jax.device_get(sim.default_data.plugins["latency"])
-    for name in ("queue", "arrived"):
-        np.testing.assert_array_equal(getattr(after, name)[0], getattr(default, name)[0])
-        np.testing.assert_array_equal(getattr(after, name)[1:], getattr(flown, name)[1:])
-        assert np.any(getattr(flown, name)[0] != getattr(after, name)[0])
-
-
-def test_the_delay_may_change_in_flight_without_another_trace(delayed_sim):
-    sim, before = delayed_sim, delayed_sim.data
-    record = before.plugins["latency"]
-    sim.attitude_control(command_of(sim, 0))
-    sim.step()
-    n_traces = sim.step_fn._cache_size()
-    sim.data = before.replace(plugins={"latency": record.replace(delay=np.asarray(record.delay) + 2)})
-    for _ in range(6):
-        arrived = np.asarray(sim.data.controls.attitude.cmd)
-        sim.attitude_control(command_of(sim, 0))
-        sim.step()
-    assert sim.step_fn._cache_size() == n_traces
-    assert not np.any(arrived)
-    assert np.all(np.asarray(sim.data.controls.attitude.cmd)[..., 3] > 0)
-    sim.data = before
 
 
 @pytest.mark.parametrize("first", ["latency", "motors"])

@@ -2,9 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from crazysim import ConfigError, Residual, Sim
+from crazysim import Residual, Sim
 from crazysim.plugins.effects.residual import N_INPUTS
 
 RNG = np.random.default_rng(3)
@@ -86,7 +85,3 @@ def test_the_wrench_is_that_of_the_coefficients():
 def test_aero_identified_adds_the_residual_of_the_airframe():
     sim = Sim(drone=drone(linear=LINEAR), aero="identified", control="rotor_vel")
     np.testing.assert_allclose(sim.data.plugins["residual"].linear, LINEAR, rtol=1e-6)
-    with pytest.raises(ConfigError, match="crazysim identify LOG --airframe cf2x_L250"):
-        Sim(drone="cf2x_L250", aero="identified")
-    with pytest.raises(ConfigError, match=r"expected aero='identified' or None, got True. Use plugins=\[Rotor"):
-        Sim(aero=True)

@@ -18,8 +18,6 @@ from crazysim.plugins.sensors import (
     GPS,
     IMU,
     UWB,
-    Barometer,
-    Magnetometer,
     MotionCapture,
     OpticalFlow,
     TimeOfFlight,
@@ -266,17 +264,6 @@ def test_errors_with_flow_range_and_differences_have_the_covariance_of_the_filte
     innovation = np.asarray(values - jax.vmap(predict)(state), np.float64)
     h, cov = np.asarray(h, np.float64), np.asarray(error_state.covariance(state.cov), np.float64)
     assert_chi_squared(normalised_square(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
-
-
-@pytest.mark.slow("64 drones for 8 s; the tests above fly other aids through the same filter")
-def test_satellites_barometer_and_magnetometer_are_enough():
-    """NEES after 8 s; only the magnetic field shows the heading, with a noise of 0.08 rad in each sample."""
-    field = Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7))
-    sim = fly([GPS(noise=0.3, vel_noise=0.05), Barometer(noise=3.0), field], 4000)
-    error, cov = all_errors(sim)
-    assert_chi_squared(normalised_square(error, cov), 15)
-    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.08, "m: a quarter of the noise of one position"
-    assert np.sqrt(np.mean(error[:, 12:] ** 2)) < 0.1 * 0.0175
 
 
 def test_an_impossible_estimate_is_reset(indoor_sim):

@@ -55,14 +55,6 @@ def test_a_measurement_arrives_after_the_delay_of_its_drone():
     np.testing.assert_allclose(age[expected >= 0], (steps - expected)[expected >= 0], atol=1e-4)
 
 
-def test_a_reset_empties_the_queue_of_its_world():
-    sim = record_clock(10, 2, freq=100, delay=0.01)[2]
-    sim.reset(np.array([False, True]))
-    np.testing.assert_array_equal(np.asarray(sim.plugins.observations(sim.data)["clock.step"])[:, 0, 0], [0, -7])
-    sim.step(6)
-    np.testing.assert_array_equal(np.asarray(sim.plugins.observations(sim.data)["clock.step"])[:, 0, 0], [10, 0])
-
-
 def test_jitter_delays_within_its_bounds_and_never_goes_back():
     values, age, _ = record_clock(60, 100, delay=0.004, jitter=0.01)
     has_arrived = values >= 0
@@ -84,15 +76,6 @@ def test_lost_measurements_leave_the_last_one():
         assert abs(changed.mean() - 0.7) < 4 * np.sqrt(0.21 / changed.size)
     values, _, _ = record_clock(3, dropout=1.0)
     assert (values == -7).all()
-
-
-def test_another_delay_up_to_max_delay_compiles_nothing():
-    sim = record_clock(20, delay=0.0, max_delay=0.02)[2]
-    step = sim.step_fn
-    sim.replace(Clock(delay=0.01, max_delay=0.02))
-    assert sim.step_fn is step
-    sim.step(8)
-    assert np.asarray(sim.plugins.observations(sim.data)["clock.step"]).item() == 22
 
 
 def test_a_default_rate_adapts_and_a_rate_of_the_user_is_refused():
