@@ -97,6 +97,9 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.export.policies": "to_c to_onnx",
     },
     "crazysim.trajectories": {
+        "crazysim.lab.planning.approaches": "Approach",
+        "crazysim.lab.planning.limits": "Limits Report Violation check",
+        "crazysim.lab.planning.waypoints": "minimum_jerk minimum_snap smoothest",
         "crazysim.lab.trajectory_files.csv": "load_csv save_csv save_samples",
         "crazysim.lab.trajectory_files.polynomials": "pack_compressed",
     },

@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING
 
 from crazysim.names import lazy_getattr
 from crazysim.trajectories import formation
-from crazysim.trajectories.approaches import Approach
 from crazysim.trajectories.curves import circle, figure_eight, helix, hover, line, lissajous
-from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory
-from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap, smoothest
 
 if TYPE_CHECKING:
+    from crazysim.lab.planning.approaches import Approach
+    from crazysim.lab.planning.limits import Limits, Report, Violation, check
+    from crazysim.lab.planning.waypoints import minimum_jerk, minimum_snap, smoothest
     from crazysim.lab.trajectory_files.csv import load_csv, save_csv, save_samples
     from crazysim.lab.trajectory_files.polynomials import pack_compressed
 

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.engine.pytree import PyTree, float_dtype, leaf
 from crazysim.errors import ConfigError
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.rotation import clip
 from crazysim.trajectories import interpolation
-from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.splines import spline
 from crazysim.trajectories.trajectory import Trajectory
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
+from crazysim.lab.planning.piece_table import Floats, Ints, PieceTable
 
 N_INTERVALS = 64
 """Number of sampling intervals per piece."""

@@ -5,8 +5,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import Trajectory, spline
-from crazysim.trajectories.piece_table import PieceTable
 
 RNG = np.random.default_rng(2)
 TRAJECTORIES = [

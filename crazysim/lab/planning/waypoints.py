@@ -10,11 +10,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError, require
+from crazysim.lab.planning import timing
+from crazysim.lab.planning.corridors import HEIGHT_TOLERANCE, fill_in_corridors
+from crazysim.lab.planning.limits import Limits, require_limits
 from crazysim.tables import read_floats
-from crazysim.trajectories import interpolation, timing
-from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
+from crazysim.trajectories import interpolation
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits, require_limits
 from crazysim.trajectories.splines import require_finite, trajectory_from_unit_pieces, unwrap_yaw
 from crazysim.trajectories.trajectory import MAX_SIZE, Trajectory, ends_of
 

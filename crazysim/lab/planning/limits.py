@@ -14,9 +14,9 @@ from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import expect, require
-from crazysim.trajectories.approaches import Approach, closest_approaches
-from crazysim.trajectories.peaks import QUANTITIES, Peak, find_peaks
-from crazysim.trajectories.piece_table import PieceTable
+from crazysim.lab.planning.approaches import Approach, closest_approaches
+from crazysim.lab.planning.peaks import QUANTITIES, Peak, find_peaks
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory, trajectory_list
 
 LIMIT_TOLERANCE = 1e-4

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import load_airframe
+from crazysim.lab.planning.peaks import QUANTITIES, find_peaks
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import Limits, Trajectory, check, circle, line, spline
-from crazysim.trajectories.peaks import QUANTITIES, find_peaks
-from crazysim.trajectories.piece_table import PieceTable
 
 
 def fly_straight(begin, end, duration):

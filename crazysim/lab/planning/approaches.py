@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from crazysim.lab.planning.piece_table import Floats, Ints, PieceTable
 from crazysim.trajectories.bezier import bernstein_matrix
-from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 CELL_DURATION = 0.4
 """Length of the cells at the start of the search, s. A cell is an interval of time in the flight of one pair."""

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazysim.lab.planning.approaches import closest_approaches
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import Trajectory, spline
-from crazysim.trajectories.approaches import closest_approaches
-from crazysim.trajectories.piece_table import PieceTable
 
 TOLERANCE = 1e-3
 """Tolerance of the distances, m."""
@@ -82,7 +82,7 @@ def test_a_jump_of_the_position_has_no_points_in_between():
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("table", [0, 10**6])
 def test_blocks_and_tables_do_not_change_the_result(table, seed, monkeypatch):
-    from crazysim.trajectories import approaches
+    from crazysim.lab.planning import approaches
 
     rng = np.random.default_rng(seed)
     pieces = PieceTable.create([spline(np.arange(4.0), rng.normal(size=(4, 3))) for _ in range(4)])

@@ -10,13 +10,13 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize
 
 from crazysim import ConfigError
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import (
     Limits,
     check,
     minimum_jerk,
     minimum_snap,
 )
-from crazysim.trajectories.piece_table import PieceTable
 
 WAYPOINTS = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1.5], [0, 2, 1], [-1, 0, 1.0]])
 DURATIONS = np.array([1.5, 1.2, 1.4, 1.0])

@@ -10,12 +10,12 @@ from collections.abc import Callable
 import numpy as np
 
 from crazysim.errors import ConfigError
+from crazysim.lab.planning.corridors import OutsideError
+from crazysim.lab.planning.limits import Limits, tolerance_scale
+from crazysim.lab.planning.peaks import QUANTITIES, find_peaks
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import interpolation
-from crazysim.trajectories.corridors import OutsideError
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits, tolerance_scale
-from crazysim.trajectories.peaks import QUANTITIES, find_peaks
-from crazysim.trajectories.piece_table import PieceTable
 
 LIMIT_MARGIN = 1e-4
 """Fraction of a limit that is left unused to allow for rounding in float32. A height limit may instead be exceeded by
