@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
+from crazysim.lab.planning.piece_table import PieceTable
 from crazysim.trajectories import (
     Limits,
     Trajectory,
@@ -27,7 +28,6 @@ from crazysim.trajectories import (
     spline,
 )
 from crazysim.trajectories.files import pack_compressed, pack_poly4d, save_memory
-from crazysim.trajectories.piece_table import PieceTable
 
 BENT = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1.5]])
 TIMES, POINTS = np.arange(6.0), np.ones((6, 3))
