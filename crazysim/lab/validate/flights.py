@@ -35,7 +35,7 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
     paths = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
     require(
         paths,
-        f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/lab/validate.md says where to get them.",
+        f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/results.md says where to get them.",
     )
     return paths
 
