@@ -47,7 +47,6 @@ class BrowserScene:
         self._batches: list[tuple[Any, NDArray]] = []
         for equal_bodies in _group_equal_bodies(shapes_by_body):
             self._add_bodies(np.array(equal_bodies), shapes_by_body[equal_bodies[0]], picture)
-        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
         self.update(picture)
 
     def update(self, picture: Picture, follow: bool = False) -> None:
@@ -105,7 +104,7 @@ class BrowserScene:
             self._batches.append((handle, bodies))
 
     def _show_spheres(self, name: str, spheres: Spheres) -> None:
-        is_shown = spheres.is_shown.ravel() & self.visible.get(name, True)
+        is_shown = spheres.is_shown.ravel()
         if is_shown.size and name not in self._handles:
             import trimesh
 
@@ -130,7 +129,6 @@ class BrowserScene:
                 "/world/wind", finite_rows(points), rgb(WIND_COLOR), shaft_radius=WIND_RADIUS, head_radius=0.015,
                 head_length=0.04,
             )  # fmt: skip
-        self._handles["wind"].visible = self.visible["wind"]
         self._send(self._handles["wind"], "points", points)
 
     def _show_trails(self, path: NDArray) -> None:
@@ -144,7 +142,6 @@ class BrowserScene:
                 "/world/trails", finite_rows(points), np.repeat(shades, 2, axis=1), thickness=2.0,
                 thickness_units="screen",
             )  # fmt: skip
-        self._handles["trails"].visible = self.visible["trails"]
         self._send(self._handles["trails"], "points", points)
 
     def _to_grid(self, pos: NDArray) -> NDArray:

@@ -1,7 +1,6 @@
 """Live operation: the real-time loop, viewers and pilots, commands over TCP, motion capture, real drones, ROS."""
 
 from crazysim.lab.live.browser import Browser
-from crazysim.lab.live.client import DroneClient, StreamClient
 from crazysim.lab.live.commands import Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.lab.live.fleet import Fleet, RemoteCommands
@@ -42,7 +41,6 @@ __all__ = [
     "Convention",
     "CrtpDevice",
     "CrtpServer",
-    "DroneClient",
     "DroneState",
     "Fleet",
     "Frame",
@@ -70,7 +68,6 @@ __all__ = [
     "SimLink",
     "Start",
     "StartShow",
-    "StreamClient",
     "StreamListener",
     "Swarm",
     "TakeOff",

@@ -40,8 +40,9 @@ class Browser(Viewer[Live]):
         browser = live.show(Browser(port=8080))
         print(browser.url)
 
-    A click on a drone selects it; a click on a vehicle, load or object makes the viewer follow it. The panel plots any
-    array of the data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may connect and
+    For machines without a screen, several spectators, and plots. A click on a drone selects it; a click on a vehicle,
+    load or object makes the viewer follow it. The panel plots any array of the data, pauses, resets, records, and has
+    the buttons and sliders of the loop. Browsers may connect and
     disconnect at any time.
 
     The address has a new token every time. Whoever has the token can watch and command the simulation. Requests without
@@ -108,7 +109,7 @@ class Browser(Viewer[Live]):
         size = max(np.ptp(self._scene.offsets[:, :2], axis=0).max() + extent, 2.0)
         camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
         camera.position = (0.0, -0.9 * size, 0.6 * size + 0.5)
-        self._panel = BrowserPanel(self._server, live, self._scene, bodies, self._follow, self._plot)
+        self._panel = BrowserPanel(self._server, live, self._follow, self._plot)
 
         @self._server.on_client_connect
         def _(client: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from crazysim.lab.live.picture import PlotSamples
 from crazysim.media.picture import Picture
 from crazysim.media.trail import COLORS
 
@@ -20,9 +21,7 @@ class Chart:
     """Plot of one quantity over time, with a line for each of its numbers."""
 
     def __init__(self, name: str):
-        self._name, self._selected_drone = name, None
-        self._times: list[float] = []
-        self._values: list[np.ndarray] = []
+        self._name, self._samples = name, PlotSamples(MAX_SAMPLES)
         self._figure = figure = mujoco.MjvFigure()
         mujoco.mjv_defaultFigure(figure)
         figure.title, figure.flg_extend, figure.gridsize[:] = name, 1, (4, 4)
@@ -31,30 +30,21 @@ class Chart:
             figure.linergb[k] = COLORS[k % len(COLORS), :3]
 
     def add(self, picture: Picture) -> None:
-        """Add the values of a picture; the chart restarts for another drone or after a jump back in time."""
-        values = picture.plot[:MAX_LINES]
-        must_restart = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
-        if must_restart or picture.selected != self._selected_drone:
-            self._times.clear()
-            self._values.clear()
-        self._selected_drone = picture.selected
-        if len(values) and np.isfinite(values).all() and (not self._times or picture.time > self._times[-1]):
-            self._times.append(picture.time)
-            self._values.append(values)
-            del self._times[:-MAX_SAMPLES], self._values[:-MAX_SAMPLES]
+        """Add the values of a picture."""
+        self._samples.add(picture, self._name, MAX_LINES)
 
     def draw(self, window: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
         """Draw the lines into the lower right corner of a window."""
-        n = len(self._times)
+        n = len(self._samples)
         if n < 2:
             return
-        lines = np.stack(self._values).T
+        times, lines = self._samples.arrays()
         for k, line in enumerate(lines):
             self._figure.linepnt[k] = n
-            self._figure.linedata[k, : 2 * n] = np.stack([self._times, line], axis=-1).ravel()
+            self._figure.linedata[k, : 2 * n] = np.stack([times, line], axis=-1).ravel()
         low, high = float(lines.min()), float(lines.max())
         margin = max(0.05 * (high - low), 1e-3)
-        self._figure.range[:] = (self._times[0], self._times[-1]), (low - margin, high + margin)
+        self._figure.range[:] = (times[0], times[-1]), (low - margin, high + margin)
         width, height = int(PLOT_FRACTION * window.width), int(PLOT_FRACTION * window.height)
         corner = mujoco.MjrRect(window.left + window.width - width, window.bottom, width, height)
         mujoco.mjr_figure(corner, self._figure, context)

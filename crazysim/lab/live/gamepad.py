@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, require
+from crazysim.errors import require
 from crazysim.lab.live.loop import Live
 
 DEADBAND = 0.12
@@ -19,52 +18,24 @@ N_JOYSTICKS = 16
 
 
 class Gamepad:
-    """Sticks of a gamepad, for ``Pilot(sticks=[Gamepad()])``.
+    """Sticks of the first gamepad, for ``Pilot(sticks=[Gamepad()])``: smooth flight, where keys only switch.
 
-    The left stick climbs and turns, the right stick moves forwards and sideways: mode 2 of model flying. Buttons call
-    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. While the gamepad is unplugged, the
-    deflections are zero.
+    The left stick climbs and turns, the right stick moves forwards and sideways: mode 2 of model flying. While the
+    gamepad is unplugged, the deflections are zero.
     """
 
-    def __init__(self, number: int | None = None, glfw: Any = None):
+    def __init__(self, glfw: Any = None):
         self._glfw = _import_glfw() if glfw is None else glfw
-        numbers = range(N_JOYSTICKS) if number is None else [number]
-        gamepads = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
+        gamepads = [k for k in range(N_JOYSTICKS) if self._glfw.joystick_is_gamepad(k)]
         require(gamepads, "expected a gamepad, got none. Connect it before the program starts.")
         self._number = gamepads[0]
-        self._callbacks: dict[int, Callable[[Live], object]] = {}
-        self._last_buttons: list[int] = []
-
-    @property
-    def name(self) -> str:
-        """Name of the gamepad's layout."""
-        name = self._glfw.get_gamepad_name(self._number)
-        return name.decode(errors="replace") if isinstance(name, bytes) else str(name or "disconnected")
-
-    def bind(self, button: str, callback: Callable[[Live], object]) -> None:
-        """Make a button call a function of the loop.
-
-        Args:
-            button: ``"a"``, ``"b"``, ``"x"``, ``"y"``, ``"left_bumper"``, ``"right_bumper"``, ``"back"``, ``"start"``,
-                ``"guide"``, ``"dpad_up"``, ...: GLFW's names.
-            callback: Function of the loop.
-        """
-        index = getattr(self._glfw, f"GAMEPAD_BUTTON_{button.upper()}", None)
-        if index is None:
-            raise ConfigError(f"expected the name of a button, such as 'a' or 'start', got {button!r}")
-        self._callbacks[index] = callback
 
     def __call__(self, live: Live) -> NDArray:
         glfw = self._glfw
         state = glfw.get_gamepad_state(self._number)
         if not state:
-            self._last_buttons = []
             return np.zeros(4)
-        buttons, axes = list(state.buttons), state.axes
-        for index, callback in self._callbacks.items():
-            if buttons[index] and not (self._last_buttons and self._last_buttons[index]):
-                live.post(callback)
-        self._last_buttons = buttons
+        axes = state.axes
         right_y, right_x = axes[glfw.GAMEPAD_AXIS_RIGHT_Y], axes[glfw.GAMEPAD_AXIS_RIGHT_X]
         left_y, left_x = axes[glfw.GAMEPAD_AXIS_LEFT_Y], axes[glfw.GAMEPAD_AXIS_LEFT_X]
         return remove_deadband(-np.array([right_y, right_x, left_y, left_x]))  # GLFW: down and right are positive

@@ -7,6 +7,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
+from itertools import count
 from pathlib import Path
 from time import perf_counter, sleep
 from typing import TypeVar
@@ -21,10 +22,10 @@ from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
 from crazysim.lab.live.pace import LiveReport, Pace, Speed, protect_loop
 from crazysim.lab.live.process import Event, OnError, Process, RateLimit, steps_per_call
-from crazysim.lab.live.recordings import Recordings
 from crazysim.lab.live.staging import StagedCommands, compile_step
 from crazysim.lab.live.viewer import Viewer
 from crazysim.lab.live.viewers import Viewers
+from crazysim.media.flight_recorder import Recorder
 from crazysim.sim.sim import Sim
 from crazysim.storage import Closeable
 
@@ -85,9 +86,10 @@ class Live(Interaction, Closeable):
         self._processes: list[Process] = []
         self._events: dict[int, list[Event]] = defaultdict(list)
         self._viewers = Viewers[Live](fps, self.stop)
-        self._recordings = Recordings(sim, control_freq)
+        self._recorder: Recorder | None = None
+        self._recording_path, self._recording_period, self._recording_start = Path("flight.journal"), 1, 0
         self._paused = self._is_stopped = self._in_step = False
-        self._n_refused_requests = 0
+        self._n_refused_requests = self._n_failed_recordings = 0
         self._factor_sample = (perf_counter(), 0, 0.0)  # wall-clock time, s; steps run until then; real-time factor
         self._may_warn = RateLimit(WARNING_PERIOD)
         for key, callback in KEY_CALLBACKS.items():
@@ -212,23 +214,42 @@ class Live(Interaction, Closeable):
         Raises:
             ConfigError: If the file cannot be created, or the rate is invalid.
         """
-        return self._recordings.start(path, steps_per_call(freq, self.control_freq, "recording"))
+        period = steps_per_call(freq, self.control_freq, "recording")
+        self.stop_recording()
+        unused_path = _unused_path(Path(path))
+        self._recorder = Recorder(self.sim, path=unused_path)
+        self._recording_path, self._recording_period, self._recording_start = Path(path), period, self.n_steps_run
+        self._record_sample()
+        return unused_path
 
     @property
     def is_recording(self) -> bool:
         """True while a recording is being written."""
-        return self._recordings.is_open
+        return self._recorder is not None
 
     def stop_recording(self) -> None:
         """Finish the recording, if there is one."""
-        self._recordings.close()
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None
 
     def toggle_recording(self) -> None:
         """Finish the present recording, or start a new one, named like the last."""
         if self.is_recording:
             self.stop_recording()
         else:
-            self.record(self._recordings.last_path or "flight.journal")
+            self.record(self._recording_path)
+
+    def _record_sample(self) -> None:
+        step = self.n_steps_run - self._recording_start
+        if self._recorder is None or step % self._recording_period:
+            return
+        try:
+            self._recorder.add(step / self.control_freq)
+        except OSError as error:  # as on a full disk: the flight continues
+            log.warning("recording %s ended after %.2f s: %s", self._recording_path, step / self.control_freq, error)
+            self._n_failed_recordings += 1
+            self.stop_recording()
 
     # Running --------------------------------------------------------------------------------------------------------
 
@@ -254,12 +275,12 @@ class Live(Interaction, Closeable):
         jax.block_until_ready(self.sim.data.states.pos)
         wall_s = perf_counter() - start_time - paused_s
         simulated_s = (self.n_steps_run - first_step) * self._dt
-        failures = self._n_refused_requests + self._viewers.failures + self._recordings.failures
+        failures = self._n_refused_requests + self._viewers.failures + self._n_failed_recordings
         n_pictures = self._viewers.n_pictures - first_picture
         return self._pace.report(self._processes, simulated_s, wall_s, n_pictures, failures)
 
     def close(self) -> None:
-        self._recordings.close()
+        self.stop_recording()
         self._viewers.close()
 
     @property
@@ -314,7 +335,7 @@ class Live(Interaction, Closeable):
             self._in_step = False
         self.step += 1
         self.n_steps_run += 1
-        self._recordings.add()
+        self._record_sample()
 
     def _run_posted(self) -> None:
         try:
@@ -368,6 +389,11 @@ class Live(Interaction, Closeable):
             process.compile()
         self._viewers.update(self)
         self._viewers.next_picture_time = perf_counter()
+
+
+def _unused_path(path: Path) -> Path:
+    numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
+    return path if not path.exists() else next(candidate for candidate in numbered if not candidate.exists())
 
 
 KEY_FRACTION = 0.05

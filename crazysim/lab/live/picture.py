@@ -25,6 +25,8 @@ WIND_SCALE = 0.1
 """Length of a wind arrow divided by the wind speed, s."""
 TRAIL_PERIOD = 0.05
 """Time between two samples of a trail, s."""
+PLOT_PERIOD = 0.02
+"""Shortest simulated time between two samples of a plot, s."""
 CONTACT_COLOR, FOLLOWED_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25)
 """Colours of marks, rgba."""
 
@@ -117,6 +119,33 @@ class PictureSource:
             path.append(pos)
             self._trail_time = time
         return np.stack([*path, pos])
+
+
+class PlotSamples:
+    """Samples of a plotted quantity, which begin again for another drone or quantity and after a jump back in time."""
+
+    def __init__(self, length: int):
+        self._samples: deque[tuple[float, NDArray]] = deque(maxlen=length)
+        self._key: tuple[object, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def add(self, picture: Picture, quantity: str, n_lines: int) -> bool:
+        """Add the first ``n_lines`` values of a picture, if a sample is due; return whether the samples begin again."""
+        samples, key = self._samples, (quantity, picture.selected, len(picture.plot))
+        begins_again = key != self._key or bool(samples and picture.time < samples[-1][0])
+        if begins_again:
+            self._key = key
+            samples.clear()
+        if len(picture.plot) and (not samples or picture.time - samples[-1][0] >= PLOT_PERIOD):
+            samples.append((picture.time, picture.plot[:n_lines]))
+        return begins_again
+
+    def arrays(self) -> tuple[NDArray, NDArray]:
+        """Return the times, s, (n,), and the values of each line; zero where they are not finite, (k, n)."""
+        values = np.stack([values for _, values in self._samples], axis=-1)
+        return np.array([time for time, _ in self._samples]), np.where(np.isfinite(values), values, 0.0)
 
 
 def _marks(pos: NDArray, is_shown: NDArray, rgba: Sequence[float], radius: float) -> Spheres:

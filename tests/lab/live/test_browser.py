@@ -179,9 +179,7 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
             wait_for(lambda: (click(chromium, pixel_pos), time.sleep(0.3), live.followed == expected)[-1])
 
         pick([2.5, -0.5, 0.08], (1, "cars", 0))
-        wait_for(
-            lambda: chromium.value("[...document.querySelectorAll('input')].some(e => e.value === 'Fleet1Tenth_0')")
-        )
+        wait_for(lambda: page._scene._label.text == "Fleet1Tenth_0")
         np.testing.assert_allclose(load.read(sim.data).pos[0, 0], [0.0, 0.0, 1.0], atol=1e-6)
         pick([-1.5, 0.0, 1.0], (0, "load", 0))
         assert live.selected == (0, 0), "the drone stays selected"

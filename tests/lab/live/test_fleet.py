@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from tcp_clients import DroneClient, StreamClient
 
 from crazysim import Sim
 from crazysim.errors import ConfigError
 from crazysim.lab.live import (
     CommandServer,
-    DroneClient,
     Fleet,
     Hover,
     Land,
@@ -15,7 +15,6 @@ from crazysim.lab.live import (
     SetParameter,
     Start,
     StartShow,
-    StreamClient,
     TakeOff,
     Upload,
 )
@@ -142,8 +141,8 @@ def test_commands_over_the_network_while_the_simulation_runs(sim):
     with CommandServer(drone_port=0, stream_port=0) as server:
         fleet = Fleet(sim, max_pieces=8)
         with DroneClient(1, port=server.drone_port) as drone, StreamClient(port=server.stream_port) as stream:
-            drone.take_off(0.6)
-            stream.command(2, "takeoff", "0.4")
+            drone.command("takeoff_0.6")
+            stream.command(2, "takeoff_0.4")
             with pytest.raises(ConfigError):
                 stream.send(b"garbage: the fleet flies on")
             heights = []
