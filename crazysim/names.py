@@ -41,10 +41,10 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "crazysim.control": {
         "crazysim.control.auto": "Auto",
-        "crazysim.control.firmware": "CFirmware",
+        "crazysim.lab.control.firmware": "CFirmware",
         "crazysim.control.geometric": "Geometric geometric_control",
         "crazysim.control.indi": "INDI indi_control",
-        "crazysim.control.lqr": "LQR lqr_control",
+        "crazysim.lab.control.lqr": "LQR lqr_control",
         "crazysim.lab.control.load_lqr": "LoadLQR load_lqr_control",
         "crazysim.lab.control.tracking_lqr": "TrackingLQR tracking_lqr_control",
     },

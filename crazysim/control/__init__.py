@@ -21,11 +21,11 @@ from crazysim.names import lazy_getattr
 
 if TYPE_CHECKING:
     from crazysim.control.auto import Auto
-    from crazysim.control.firmware import CFirmware
     from crazysim.control.geometric import Geometric, geometric_control
     from crazysim.control.indi import INDI, indi_control
-    from crazysim.control.lqr import LQR, lqr_control
+    from crazysim.lab.control.firmware import CFirmware
     from crazysim.lab.control.load_lqr import LoadLQR, load_lqr_control
+    from crazysim.lab.control.lqr import LQR, lqr_control
     from crazysim.lab.control.tracking_lqr import TrackingLQR, tracking_lqr_control
 
 __all__ = [

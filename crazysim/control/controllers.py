@@ -18,7 +18,7 @@ CONTROLLERS = {
     "mellinger": "crazysim.control.mellinger:Mellinger",
     "geometric": "crazysim.control.geometric:Geometric",
     "indi": "crazysim.control.indi:INDI",
-    "lqr": "crazysim.control.lqr:LQR",
+    "lqr": "crazysim.control:LQR",
     "load_lqr": "crazysim.control:LoadLQR",
     "tracking_lqr": "crazysim.control:TrackingLQR",
 }

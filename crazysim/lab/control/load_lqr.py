@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.control.flatness import attitude_of_thrust, thrust_direction
 from crazysim.control.levels import Control
-from crazysim.control.linear_models import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import Reference, lqr_weights, solve_on_host, state_error, to_heading_frame
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
-from crazysim.control.riccati import gain_discrete
 from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.errors import expect, require
+from crazysim.lab.control.linear_models import linearize, load_derivative, rod_angles
+from crazysim.lab.control.lqr import Reference, lqr_weights, solve_on_host, state_error, to_heading_frame
+from crazysim.lab.control.riccati import gain_discrete
 from crazysim.rotation import cross, dot, matvec
 
 SetpointBody = Literal["load", "drone"]

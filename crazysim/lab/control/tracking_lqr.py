@@ -14,22 +14,22 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control.levels import Control
-from crazysim.control.lqr import (
-    Reference,
-    flat_reference,
-    lqr_weights,
-    solve_on_host,
-    state_error,
-)
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
-from crazysim.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.engine.pytree import leaf
 from crazysim.errors import require
+from crazysim.lab.control.lqr import (
+    Reference,
+    flat_reference,
+    lqr_weights,
+    solve_on_host,
+    state_error,
+)
+from crazysim.lab.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.rotation import cross, matvec
 
 MAX_KNOTS = 60

@@ -12,11 +12,11 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
-from crazysim.control.lqr import solve_on_host, weight_matrix
-from crazysim.control.riccati import gain_discrete
 from crazysim.core.settings import setting
 from crazysim.engine.jaxcompat import fori_loop
 from crazysim.engine.pytree import PyTree, as_parameter, leaf
+from crazysim.lab.control.lqr import solve_on_host, weight_matrix
+from crazysim.lab.control.riccati import gain_discrete
 from crazysim.lab.vehicles.car_params import CarParams
 from crazysim.lab.vehicles.car_state import CarState
 from crazysim.lab.vehicles.following import PathController, PathState, motor_reference

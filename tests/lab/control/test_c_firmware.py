@@ -11,10 +11,11 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Sim
-from crazysim.control import AllocationParams, CFirmware, Control, Controller, firmware
+from crazysim.control import AllocationParams, CFirmware, Control, Controller
 from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.engine.backends import native
 from crazysim.engine.pytree import PyTree, leaf
+from crazysim.lab.control import firmware
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 WORLDS, DRONES = 3, 2
@@ -52,7 +53,7 @@ void crazysim_update(void *memory, enum crazysim_level level, const struct crazy
 }
 """
 """Controllers in C: one that climbs to a height, one that stores its input, and one with constant motor commands."""
-EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "crazyflie.c"
+EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "crazyflie.c"
 STAND_IN_HEADER = """
 #pragma once
 #include <stdint.h>

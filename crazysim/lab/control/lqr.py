@@ -15,16 +15,16 @@ from crazysim import rotation
 from crazysim.control.bandwidth import bandwidth
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.levels import Control
-from crazysim.control.linear_models import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
-from crazysim.control.riccati import check_gain, gain_continuous
 from crazysim.control.rigid_body_params import RigidBodyParams
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.engine.pytree import leaf
 from crazysim.errors import ConfigError
+from crazysim.lab.control.linear_models import drone_derivative, linearize
+from crazysim.lab.control.riccati import check_gain, gain_continuous
 from crazysim.rotation import cross, dot, matvec
 from crazysim.tables import read_numbers
 

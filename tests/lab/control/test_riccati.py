@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from crazysim.control.riccati import check_gain, gain_continuous, gain_discrete, solve_continuous, solve_discrete
 from crazysim.errors import ConfigError
+from crazysim.lab.control.riccati import check_gain, gain_continuous, gain_discrete, solve_continuous, solve_discrete
 
 SOLVERS = {
     "continuous": (jax.jit(solve_continuous), scipy.linalg.solve_continuous_are),

@@ -7,7 +7,7 @@ from cases import vectors
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
-from crazysim.control.linear_models import drone_derivative, linearize, load_derivative, rod_angles, rod_direction
+from crazysim.lab.control.linear_models import drone_derivative, linearize, load_derivative, rod_angles, rod_direction
 
 pytestmark = pytest.mark.usefixtures("x64")
 
