@@ -11,7 +11,7 @@ SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
     "commands": 821,
-    "control": 1748,
+    "control": 1417,
     "core": 1577,
     "crazysim": 837,
     "drones": 514,
@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3238,
     "geometry": 1089,
-    "lab": 14042,
+    "lab": 14373,
     "media": 1095,
     "plugins": 5974,
     "scene": 2576,
