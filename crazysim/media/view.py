@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,6 +25,8 @@ BORDER_COLOR = 40
 MAX_PIXELS = 16_384
 """Largest width and height of an image."""
 
+RING_POINTS, RING_LINE_WIDTH = 25, 2.0
+"""Number of points of a ring around a drone, and width of its line, pixels."""
 MIN_VIEW_RADIUS = 0.25
 """Smallest radius around points that a camera holds in view, m; a Crazyflie is then a sixth of the image's height."""
 DISTANCE_MARGIN = 1.25
@@ -70,6 +73,8 @@ class View:
     top_view: bool = False
     """True to draw a map from above at the bottom left of each world that has obstacles, with the drones' paths since
     the last reset."""
+    ring_width: int = setting(default=0, low=0)
+    """Width of a ring around every drone that the free camera shows smaller than that, pixels; 0 for no rings."""
     columns: int | None = None
     """Worlds per row; None for a grid with about as many columns as rows."""
     border: int = setting(default=2, low=0)
@@ -149,6 +154,8 @@ class View:
                 sim.overlays.restore(saved_overlays)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(sim, k, time[k], pos[k])
+                if self.ring_width and self.camera == -1:
+                    self._draw_rings(sim, pos[k], config)
                 tile = image[self.tile(k)]
                 tile[:] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
                 if self._top_view is not None:
@@ -219,6 +226,22 @@ class View:
             aim = self._smooth_aim(k, time, _frame_points(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config
+
+    def _draw_rings(self, sim: Sim, pos: NDArray, config: Mapping[str, Any]) -> None:
+        model, camera = sim.mj_model, mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(model, camera)
+        lookat, distance = np.asarray(config.get("lookat", camera.lookat)), config.get("distance", camera.distance)
+        azimuth, elevation = (np.radians(config.get(x, getattr(camera, x))) for x in ("azimuth", "elevation"))
+        right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+        ahead = np.array([*(np.cos(elevation) * np.array([-right[1], right[0]])), np.sin(elevation)])
+        angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
+        circle = np.cos(angle) * right + np.sin(angle) * np.cross(right, ahead)
+        depth = (pos - lookat) @ ahead + distance
+        pixel_size = 2 * depth * np.tan(np.radians(model.vis.global_.fovy) / 2) / self.tile_size[1]
+        for drone, drone_color in enumerate(choose_drone_colors(sim.n_drones, self.rgba)):
+            radius = pixel_size[drone] * self.ring_width / 2
+            if radius > model.geom(f"col_sphere:{drone}").size[0] and np.isfinite(pos[drone]).all():
+                sim.overlays.line(pos[drone] + radius * circle, drone_color, RING_LINE_WIDTH, RING_LINE_WIDTH)
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
         last_time, value = self._aim.get(k, (np.inf, aim))

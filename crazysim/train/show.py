@@ -29,6 +29,8 @@ from crazysim.train.training import CURVE_FILE
 
 TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
 """Colour, RGBA, and smallest radius, m, of the mark at a drone's target."""
+RING_WIDTH = 25
+"""Least width of a drone or the ring around it in films, pixels."""
 DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))
 """Colours of depths from far to near, RGB."""
 SUCCESS_LIMITS = (-2, 102)
@@ -223,8 +225,9 @@ def color_depth(depth: np.ndarray, far: float) -> np.ndarray:
 def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False) -> int:
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
-    A world whose episode ends early, by success or by a crash, stands still from then on, and its text says which of
-    them ended it. The film ends with the episodes, or a second after the last of them ended early.
+    A world whose episode is over stands still from then on, and its text says how it ended: ``success``, ``crashed``
+    or, at the time limit, ``late``. The film ends a second after the last of them. Drones that would be smaller than 25
+    pixels have a ring of that width.
 
     If the policy observes images, the first depth image of the first drone, or else its first segmentation of the
     target, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles then also
@@ -275,18 +278,26 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     @jax.jit
     def step(state: EnvState, memory: Any) -> tuple[EnvState, Any]:
         action, memory = act(policy, state.obs, memory)
-        return select_states(~state.terminated, env.step(state, action), state), memory
+        return select_states(~state.done, env.step(state, action), state), memory
+
+    def find_outcome(world: int) -> str:
+        if not state.done[world]:
+            return ""
+        succeeded, is_terminated = find_success(state), bool(state.terminated[world])
+        has_succeeded = n_steady_steps[world] >= n_hold_steps and not is_terminated
+        if has_succeeded if succeeded is None else bool(succeeded[world].all()):
+            return ": success"
+        return ": crashed" if is_terminated else ": late"
 
     def draw_overlays(sim: Sim, world: int) -> None:
         draw_target(sim, world)
-        outcome = ""
-        if state.terminated[world]:
-            succeeded = find_success(state)
-            outcome = ": crashed" if succeeded is None or not succeeded[world].all() else ": succeeded"
-        draw_text(sim, f"{int(state.data.core.steps[world, 0]) / sim.freq:.1f} s{outcome}")
+        draw_text(sim, f"{int(state.data.core.steps[world, 0]) / sim.freq:.1f} s{find_outcome(world)}")
 
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
     n_shown = min(worlds, sim.n_worlds)
+    # Steps for which the error of all drones has been below the tolerance, and those that a success takes.
+    n_steady_steps = np.zeros(sim.n_worlds, int)
+    n_hold_steps = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     camera = dict(env.task.camera(sim.n_drones) or {"elevation": -20})
     rows, columns = View(worlds=range(n_shown)).grid
     width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
@@ -302,20 +313,24 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         top_view=bool(depths + masks),
         hold=None if "distance" in camera else points_in_view,
         lag=0.6,
+        ring_width=RING_WIDTH,
     )
-    n_frames = env.max_steps // frame_steps + 1
+    n_frames = (env.max_steps + freq) // frame_steps + 1
     with Film(path, view, fps=freq / frame_steps, progress=progress, total=n_frames) as recording:
-        last_step = env.max_steps
-        for i in range(env.max_steps + 1):
+        last_step = env.max_steps + freq
+        for i in range(last_step + 1):
             if i % frame_steps == 0:
                 core = state.data.core
                 steps = jnp.full_like(core.steps, i * (sim.freq // freq))  # the clock of the film does not stand still
                 sim.data = state.data.replace(core=core.replace(steps=steps))
                 recording.add(sim)
-                if state.terminated[:n_shown].all():
+                if state.done[:n_shown].all():
                     last_step = min(last_step, i + freq)
             if i >= last_step:
                 break
+            was_over = np.asarray(state.done)
             state, memory = step(state, memory)
+            is_steady = (np.asarray(state.info["error"]) < env.task.tolerance).all(axis=-1)
+            n_steady_steps = np.where(was_over, n_steady_steps, np.where(is_steady, n_steady_steps + 1, 0))
         sim.data = state.data
         return recording.n_frames

@@ -262,6 +262,18 @@ def test_a_top_view_of_a_large_area_moves_along_with_the_first_drone(opengl, pla
     sim.close()
 
 
+def test_small_drones_have_rings_of_a_width(sim):
+    """A ring of 20 pixels around the drone 8 m away; the drone 0.4 m away is larger than that."""
+    place(sim, POSITIONS, 0.0)
+    for distance, width in ((8.0, 20), (0.4, 0)):
+        config = {"lookat": POSITIONS[0], "distance": distance, "azimuth": 30, "elevation": -40}
+        shown = make_view(camera=-1, cam_config=config, ring_width=20, rgba=RED)
+        rows, columns = np.nonzero(has_colour(shown.render(sim), RED))
+        assert [np.ptp(x) + 1 if len(x) else 0 for x in (rows, columns)] == pytest.approx([width, width], abs=2)
+        if width:
+            np.testing.assert_allclose([rows.mean(), columns.mean()], [HEIGHT / 2, WIDTH / 2], atol=1.5)
+
+
 def test_a_camera_may_move_with_time(sim):
     """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
     moving = make_view(

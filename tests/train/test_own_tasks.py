@@ -245,6 +245,16 @@ def test_a_film_stands_still_where_an_episode_has_ended_and_says_so(monkeypatch)
     assert len(set(heights[-n_crashed:])) == 1
     assert len(set(heights[:-n_crashed])) == len(heights) - n_crashed > 5
 
+    def to_goal(obs):
+        ax, ay, az = jnp.moveaxis(4 * obs["difference_to_goal"] - 3 * obs["vel"], -1, 0)
+        return jnp.stack([-0.13 * ay, 0.13 * ax, 0 * ax, 0.15 * az], axis=-1)
+
+    for policy, outcome in ((to_goal, "success"), (lambda obs: jnp.zeros((1, 1, 4)), "late")):
+        texts.clear()
+        film(env, policy, "hover.mp4", worlds=1)
+        assert texts[-1] == f"5.0 s: {outcome}"
+        assert sum(text.endswith(outcome) for text in texts) == 26
+
 
 class StoppedError(Exception):
     """Raised instead of filming."""

@@ -644,7 +644,7 @@ def test_a_film_shows_the_drone_and_its_goal(uninterrupted_run, tmp_path):
 
     env = small_config().make_env(2)
     path = tmp_path / "film.gif"
-    assert film(env, uninterrupted_run.policy, path, worlds=1) == 11
+    assert film(env, uninterrupted_run.policy, path, worlds=1) == 11 + 25, "with a second of the last image"
     env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
     images = read_frames(path, 360, 480, "-vf", "scale=480:360").astype(int)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
