@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.lab.control.mppi import MPPI
+    from crazysim.lab.estimators.eskf import ESKF
     from crazysim.lab.plugins.radar import Radar
     from crazysim.lab.plugins.rotor_jet import RotorJet
     from crazysim.lab.scene.splats import SplatScene
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
         Wind,
         WindField,
     )
-    from crazysim.plugins.estimators.eskf import ESKF
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, SharedLoad, SlungLoad

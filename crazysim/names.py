@@ -31,7 +31,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.contacts.terrain": "Terrain",
         "crazysim.plugins.effects": "Battery Downwash GroundEffect Latency MotorFailure Randomize Residual "
         "RotorAerodynamics Wind WindField",
-        "crazysim.plugins.estimators.eskf": "ESKF",
+        "crazysim.lab.estimators.eskf": "ESKF",
         "crazysim.plugins.estimators.kalman": "Kalman",
         "crazysim.plugins.follow": "Follow",
         "crazysim.plugins.payloads": "Hook SharedLoad SlungLoad",
@@ -57,6 +57,10 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.envs.brax": "BraxEnv",
         "crazysim.envs.pettingzoo": "make_parallel",
         "crazysim.envs.sb3": "DroneVecEnv",
+    },
+    "crazysim.plugins.estimators": {
+        "crazysim.lab.estimators.complementary": "Complementary",
+        "crazysim.lab.estimators.eskf": "ESKF",
     },
     "crazysim.plugins.payloads": {
         "crazysim.lab.control.load_flatness": "LoadedState load_flat_state",

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import crazysim.envs.tasks
+import crazysim.lab.estimators
 import crazysim.lab.plugins
 import crazysim.lab.tasks
 import crazysim.lab.vehicles
@@ -107,7 +108,9 @@ def concrete_classes(base, *packages):
     return sorted(named, key=lambda kind: kind.__name__)
 
 
-PLUGINS = concrete_classes(Plugin, crazysim.plugins, crazysim.lab.plugins, crazysim.lab.vehicles)
+PLUGINS = concrete_classes(
+    Plugin, crazysim.plugins, crazysim.lab.estimators, crazysim.lab.plugins, crazysim.lab.vehicles
+)
 TASKS = concrete_classes(Task, crazysim.envs.tasks, crazysim.lab.tasks)
 OTHER_CLASSES = [
     Origin,

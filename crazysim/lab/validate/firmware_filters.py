@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.estimators import complementary
 from crazysim.lab.validate.firmware_controllers import RECORDINGS
 from crazysim.lab.validate.rows import Row
-from crazysim.plugins.estimators import complementary, error_state, updates
+from crazysim.plugins.estimators import error_state, updates
 
 FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
 """Folder with the recorded outputs of filters."""

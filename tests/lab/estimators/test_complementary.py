@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from crazysim import Sim, rotation
+from crazysim.lab.estimators import complementary
 from crazysim.lab.validate import firmware_filters
-from crazysim.plugins.estimators import complementary
 
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])

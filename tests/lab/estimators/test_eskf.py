@@ -11,9 +11,9 @@ from consistency import assert_chi_squared, errors, normalised_square
 from crazysim import ConfigError, Sim, param, rotation
 from crazysim.core.plugin import Param
 from crazysim.engine.stage import vmap_drones, vmap_worlds
+from crazysim.lab.estimators.eskf import update_by_ideal
+from crazysim.lab.estimators.inertial_path import EMPTY_PATH_ROW, InertialPath, propagate_along
 from crazysim.plugins.estimators import ESKF, error_state, updates
-from crazysim.plugins.estimators.eskf import update_by_ideal
-from crazysim.plugins.estimators.inertial_path import EMPTY_PATH_ROW, InertialPath, propagate_along
 from crazysim.plugins.sensors import (
     GPS,
     IMU,

@@ -19,10 +19,11 @@ from crazysim.core.settings import setting
 from crazysim.engine.jaxcompat import Literal
 from crazysim.engine.stage import Stage, vmap_drones, vmap_worlds
 from crazysim.errors import require
-from crazysim.plugins.estimators import error_state, inertial_path, updates
+from crazysim.lab.estimators import inertial_path
+from crazysim.lab.estimators.inertial_path import InertialPath
+from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
-from crazysim.plugins.estimators.inertial_path import InertialPath
 from crazysim.plugins.estimators.kalman import UPDATE_FNS as KALMAN_UPDATE_FNS
 from crazysim.plugins.sensors.barometer import (
     LAPSE_RATE,
