@@ -178,7 +178,7 @@ def gradients(lines: list[Line]) -> str:
         Over_steps_alone=lambda x: f"{x['forward_passes']:.2g}",
         Forward_mode_over_steps_alone=lambda x: f"{x['jvp_passes']:.2g}",
         First_gradient_compiles_in=lambda x: f"{x['compile_s']:.2g} s",
-    )([line for line in lines if line["n_worlds"] != 16384])
+    )([line for line in lines if line["machine"] != "H100" or line["n_worlds"] == 131072])
 
 
 def env_rates(lines: list[Line]) -> str:
@@ -249,6 +249,16 @@ path_errors = columns(
     },
 )
 """Largest errors of each controller with two models of cars, one for each speed of ``vehicles.py --errors``."""
+
+
+def ratios(lines: list[Line]) -> str:
+    """Return the times of cases divided by the times of their references, a row for each reference."""
+    cells: dict[tuple[str, str], list[str]] = {}
+    for x in lines:
+        if x["case"] != x["reference"]:
+            cells.setdefault((x["machine"], f"`{x['reference']}`"), []).append(f"`{x['case']}` {x['ratio']:.3g}")
+    rows = [[*key, ", ".join(texts)] for key, texts in sorted(cells.items(), key=lambda item: item[0][1])]
+    return markdown_table(["Machine", "Reference", "Time of each case over it"], rows)
 
 
 def further(lines: list[Line]) -> str:
@@ -591,7 +601,10 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "gradient": (("gradient",), gradients),
     "envs": (("envs", "envs-training", "envs-depth", "randomize"), env_rates),
     "depth": (("depth", "range-finder"), depths),
-    "plugins": (("plugins", "loads", "follow"), costs),
+    "costs": (("plugins", "loads", "follow"), ratios),
+    "plugins": (("plugins",), costs),
+    "loads": (("loads",), costs),
+    "follow": (("follow",), costs),
     "controllers-rates": (("controllers-rates",), control_rates),
     "further": (("coupled", "sight", "vehicles", "fleets", "mppi", "live", "mocap", "first-results"), further),
     "devices": (("devices",), devices),
