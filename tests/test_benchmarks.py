@@ -62,19 +62,15 @@ SCRIPTS = [
      [{"case": "rotor"}, {"case": "rod", "reference": "rotor"}]),
     ("vehicles.py --worlds 4 --cases path beside_drone --repeats 1", "steps_per_s",
      [{"case": "path", "alone": True}, {"case": "beside_drone", "alone": False}]),
-    ("first_results.py --repeat 1 --cases step", "cpu_s", [{"cache": "off"}, {"cache": "on"}]),
     ("gradient.py --worlds 4 --controls rotor_vel --steps 3 --repeats 1", "steps_per_s", [{"control": "rotor_vel"}]),
 ]  # fmt: skip
 """Scripts with small settings, a positive number that each line has, and parts of the lines."""
-SLOW_SCRIPTS = {
-    "first_results": pytest.mark.slow("starts two processes; compile.py, too, is tested in a process of its own")
-}
 
 
 @pytest.mark.long("compiles the programs that it measures")
 @pytest.mark.parametrize(
     ("command", "figure", "expected"),
-    [pytest.param(*x, id=x[0].split(".")[0], marks=SLOW_SCRIPTS.get(x[0].split(".")[0], ())) for x in SCRIPTS],
+    [pytest.param(*x, id=x[0].split(".")[0]) for x in SCRIPTS],
 )
 def test_a_script_prints_lines_with_their_figure(run, tmp_path, command, figure, expected):
     lines = run(*command.format(tmp_path).split())
@@ -82,17 +78,6 @@ def test_a_script_prints_lines_with_their_figure(run, tmp_path, command, figure,
     assert all(line[figure] > 0 for line in lines)
     if command.startswith("step"):
         assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
-
-
-@pytest.mark.slow("compiles trainings and evaluations; tests/train/test_networks.py trains with memory")
-def test_memory_prints_the_success_of_each_variant_on_other_airframes(run, monkeypatch, tmp_path):
-    monkeypatch.setattr(importlib.import_module("memory"), "AIRFRAMES", ("cf2x_L250",))
-    small = ["--worlds", 16, "--iterations", 1, "--starts", 8, "--seconds", 0.1, "--tasks", "hover", "--out", tmp_path]
-    lines = run("memory.py", *small, "--variants", "memory-privileged", "--seeds", "3:5")
-    assert [(line["variant"], line["seed"]) for line in lines] == [("memory-privileged", 3), ("memory-privileged", 4)]
-    assert all(line["env_steps"] == pytest.approx(16 * 64, rel=0.01) for line in lines)  # three round_digits
-    for line in lines:
-        assert all(0 <= line[drones]["success"] <= 1 for drones in ("drawn", "cf2x_L250"))
 
 
 def test_compile_prints_its_parts_from_a_process_of_its_own():
@@ -129,72 +114,6 @@ def test_each_timed_batch_starts_from_the_same_data(benchmarks, device, n_calls)
     assert ends == [50 * n_calls] * 3
 
 
-def test_measured_functions_alternate(benchmarks):
-    import measure
-
-    order = []
-    values = iter([1.0, 10.0, 3.0, 30.0, 2.0, 20.0])
-
-    def take(name):
-        order.append(name)
-        return next(values)
-
-    assert measure.medians({"a": lambda: take("a"), "b": lambda: take("b")}, 3) == {"a": 2.0, "b": 20.0}
-    assert order == ["a", "b"] * 3
-
-
-def test_randomised_leaves_no_parameter_shared(benchmarks):
-    import jax
-    import step
-
-    from crazysim import Sim
-    from crazysim.engine.pytree import scopes
-
-    sim = Sim(n_worlds=2, n_drones=3, engine="lanes")
-    step.randomise_parameters(sim)
-    assert set(jax.tree.leaves(scopes(sim.data.params))) == {"drone"}
-    assert "shared" not in jax.tree.leaves(scopes(sim.data.controls))
-    assert len(set(sim.data.params.mass.ravel().tolist())) == 6
-
-
-def test_limits_prints_the_least_possible_time_and_the_ratio_to_it(monkeypatch, benchmarks, capsys):
-    import limits
-
-    monkeypatch.setattr(limits, "COPY_SIZES", {"cpu": 2**16})
-    monkeypatch.setattr(limits, "DEFAULT_WORLDS", {"cpu": 64})
-    monkeypatch.setattr(
-        sys, "argv", ["limits.py", "--repeats", "1", "--controls", "rotor_vel", "--integrators", "euler"]
-    )
-    limits.main()
-    machine, line = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
-    assert machine["bytes_per_s"] > 0
-    assert machine["multiply_adds_per_s"] > 0
-    assert line["floor_s"] == max(line["arithmetic_s"], line["memory_s"]) > 0
-    assert line["ratio"] > 0
-
-
-def test_operations_are_counted_in_multiply_adds(benchmarks):
-    import limits
-
-    from crazysim.engine.ir.blocks import Builder
-
-    builder = Builder()
-    x, y = builder.input(np.float32), builder.input(np.float32)
-    product = builder.add("mul", (x, y), np.float32)
-    total = builder.add("add", (product, x), np.float32)
-    assert limits.count_operations(builder.finish([total]), 1.0) == 1  # one multiply-add
-    assert limits.count_operations(builder.finish([total, product]), 1.0) == 2  # the product is needed for itself
-    root = builder.add("sqrt", (total,), np.float32)
-    assert limits.count_operations(builder.finish([root]), 1.0) == 5
-
-    outer = Builder()
-    mask, old = outer.input(bool), outer.input(np.float32)
-    inner = Builder(outer)
-    guarded = inner.finish([inner.add("max", (old, np.float32(1)), np.float32)])
-    new = outer.add_many("when", (mask, old), (np.float32,), (), (guarded,))
-    assert limits.count_operations(outer.finish(new), 0.2) == pytest.approx(0.2)
-
-
 def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
     import limits
 
@@ -205,15 +124,6 @@ def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
     read = 3 + 4 + 3 + 3 + 3 + 3 + 4 + 4 + 1
     assert n_bytes == 4 * (2 * read - 6)
     assert limits.count_work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
-
-
-def test_a_gradient_is_timed_like_a_flight(benchmarks):
-    import contestant
-
-    case = {"control": "attitude", "dynamics": "so_rpy", "n_worlds": 2, "n_steps": 3, "engine": "lanes"}
-    gradient = contestant.build("crazysim", "gradient", case, "cpu")
-    assert gradient.seconds() > 0
-    gradient.require_flying()
 
 
 def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
@@ -309,27 +219,6 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
     assert run("train.py", "--only-plot", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old") == []
     (kept,) = run("train.py", "--only-plot", "--keep", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old")
     assert kept["least"] == 1.0
-
-
-def test_a_seed_that_diverged_is_named_and_counts_as_no_success(run, train, tmp_path):
-    """Its last stored policy may succeed, but its training did not end."""
-    curve = [{"iteration": 20, "success": 0.97, "crashed": 0.0, "error": 0.01, "env_steps": 10, "seconds": 1.0,
-              "compile_seconds": 0.5, "kept": True}]  # fmt: skip
-    (tmp_path / "curve.json").write_text(json.dumps(curve))
-    diverged = train.read_result(tmp_path, 33)
-    assert (train.read_result(tmp_path, None)["success"], diverged["success"], diverged["diverged"]) == (0.97, 0.0, 33)
-    run_info = {
-        "task": "hover",
-        "algorithm": "ppo",
-        "commit": "0",
-        "date": "0",
-        "machine": "0",
-        "jax": "0",
-        "parallel": 1,
-    }
-    row = train.make_row([train.read_result(tmp_path, x) | run_info | {"seed": i} for i, x in enumerate((None, 33))])
-    assert (row["least"], row["diverged"]) == (0.0, [1])
-    assert "| 0, 1; diverged: 1 | 0.0% |" in train.figures.tables.training([row])
 
 
 @pytest.mark.long("trains in a process of its own")

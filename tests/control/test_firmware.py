@@ -4,6 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import vectors
+from hypothesis import given
+from hypothesis import strategies as st
 
 from crazysim.control.power_distribution import PowerDistributionParams, distribute_power
 from crazysim.drones import load_airframe
@@ -49,3 +52,12 @@ def test_rounding_to_whole_numbers_does_not_change_the_gradient(motors):
 @pytest.fixture(scope="module")
 def motors():
     return PowerDistributionParams.create(load_airframe("cf2x_L250"))
+
+
+@given(vectors(3, 60000.0), st.floats(1.0, 65535.0))
+def test_power_distribution_stays_within_the_limits(torque, thrust):
+    motors = PowerDistributionParams.create(load_airframe("cf2x_L250"))
+    pwm = np.asarray(distribute(np.array([thrust]), np.asarray(torque, np.float32), params=motors))
+    assert pwm.min() >= 0
+    assert pwm.max() <= 65535.01
+    assert not np.any(np.asarray(distribute(np.array([0.0]), np.asarray(torque, np.float32), params=motors)))

@@ -11,7 +11,7 @@ import pytest
 
 from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
-from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
+from crazysim.drones import Drone, airframe_names, load_airframe
 from crazysim.drones.body import body_geoms, body_shape
 from crazysim.drones.keys import LAYOUT, TABLES
 from crazysim.drones.loading import AIRFRAME_FOLDER
@@ -154,12 +154,6 @@ def test_mixing_matrix_by_hand():
     airframe = load_airframe(tables)
     assert airframe.arm == 0.4
     np.testing.assert_allclose(airframe.mixing_matrix, [[0.5, -0.5, 0.0], [-0.25, -0.75, 1.0], [1, -1, 1]])
-
-
-def test_mixing_matrix_of_a_crazyflie():
-    """Rotors 1 to 4 go clockwise from ahead-right, seen from above; 1 and 3 turn so that their drag yaws right."""
-    expected = [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]
-    np.testing.assert_array_equal(load_airframe("cf21B_500").mixing_matrix, expected)
 
 
 @pytest.mark.parametrize("name", airframe_names())
@@ -435,17 +429,6 @@ def test_models_of_the_keys_are_those_of_the_dynamics():
     assert fits == set(Dynamics) - {Dynamics.first_principles}
 
 
-def test_a_file_may_give_its_own_name(tmp_path):
-    path = tmp_path / "file.toml"
-    path.write_text('name = "racer"\nbase = "cf2x_L250"\n', encoding="utf-8")
-    assert load_airframe(path).name == "racer"
-
-
-def test_an_airframe_shows_its_name():
-    assert repr(load_airframe("hb_x500")) == "Airframe('hb_x500')"
-    assert isinstance(load_airframe("hb_x500"), Airframe)
-
-
 def test_law_09_a_mistyped_path_is_answered_with_those_that_are_near():
     airframe = load_airframe("cf21B_500")
     for path, near in (
@@ -523,14 +506,6 @@ def test_figure_of_merit_at_hover(name):
     assert (merit < 0.2) == (name in ("crazyflie", "bumblebee_lab"))
 
 
-def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
-    """At this voltage, the firmware's cubic of thrust over voltage gives thrust_max (by ``numpy.roots``)."""
-    expected = {"cf21B_500": 3.1257, "cf2x_P250": 3.0799, "cf2x_T350": 2.8166, "cf2x_L250": 2.9836, "crazyflie": 3.3482}
-    for name, volts in expected.items():
-        assert load_airframe(name).full_thrust_voltage == pytest.approx(volts, abs=1e-4)
-    assert load_airframe("hb_x500").full_thrust_voltage is None
-
-
 @pytest.mark.parametrize("name", ["cf21B_500", "cf2x_L250", "bumblebee", "hb_x500"])
 def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     """Lengths that are left out follow from mass and rotors: within a factor of 2.1, spheres of contact within 20%."""
@@ -555,3 +530,11 @@ def test_a_drone_without_a_shape_steps_and_has_all_geoms():
     sim.step(5)
     assert len(body_geoms(sim.airframe)) == len(body_geoms(load_airframe("cf21B_500")))
     assert sim.mj_model.geom("col_sphere:0").size[0] > 0.05
+
+
+def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
+    """At this voltage, the firmware's cubic of thrust over voltage gives thrust_max (by ``numpy.roots``)."""
+    expected = {"cf21B_500": 3.1257, "cf2x_P250": 3.0799, "cf2x_T350": 2.8166, "cf2x_L250": 2.9836, "crazyflie": 3.3482}
+    for name, volts in expected.items():
+        assert load_airframe(name).full_thrust_voltage == pytest.approx(volts, abs=1e-4)
+    assert load_airframe("hb_x500").full_thrust_voltage is None

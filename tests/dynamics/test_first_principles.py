@@ -93,14 +93,6 @@ def test_limits_of_rotor_speed_give_the_limits_of_thrust(name):
     np.testing.assert_allclose(p.J @ p.J_inv, np.eye(3), atol=1e-12)
 
 
-def test_no_disturbance_is_a_disturbance_of_zero():
-    params = first_principles.Params.create(load_airframe("cf21B_500"))
-    args = (np.zeros(3), np.array([0.1, 0.2, 0.3, 0.9]), np.ones(3), np.ones(3), np.full(4, 1e4), np.full(4, 9e3))
-    undisturbed = model(*args, params=params)
-    for a, b in zip(undisturbed, model(*args, np.zeros(3), np.zeros(3), params=params), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_external_wrench_acts_in_the_world_frame():
     """A drone on its side, with body z along world x, by hand.
 

@@ -9,7 +9,7 @@ import pytest
 from cases import shared_sim
 
 from crazysim import ConfigError, Downwash, Kalman, Sim
-from crazysim.engine import Step, explain, jaxcompat
+from crazysim.engine import Step
 from crazysim.engine.backends import cuda, kernel, native
 from crazysim.engine.backends.exchange import make_exchange
 from crazysim.engine.backends.source import Writer
@@ -34,13 +34,6 @@ OLD, NEW = Gpu("8.6", 0), Gpu("9.0", 1)
 def source():
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     return kernel.write_kernel(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "cuda")
-
-
-def test_an_architecture_is_that_of_the_device():
-    """It does not depend on which device was asked about first."""
-    assert [cuda.architecture(d) for d in (NEW, OLD, NEW)] == ["compute_90", "compute_86", "compute_90"]
-    assert cuda.architecture(None) == cuda.DEFAULT_ARCHITECTURE
-    assert jaxcompat.compute_capability(Gpu("12.0")) == 120
 
 
 def test_kernels_for_several_gpus_run_on_the_oldest():
@@ -173,15 +166,3 @@ def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():
     sim.add(Downwash())
     with pytest.raises(ConfigError, match=r"expected a kernel for the GPU, .*at most 1024 .*\. Use engine='lanes'"):
         lowered_text(sim, "cpu", "cuda")
-
-
-def test_a_step_that_splits_is_described():
-    def undeclared_stage(data):
-        return data.replace(states=data.states.replace(force=0 * data.states.force))
-
-    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    if cuda.nvrtc() is None:
-        pytest.skip("no NVRTC here; CI has it")
-    text = explain(Step({"mine": undeclared_stage} | sim.step_pipeline, "fused", "gpu"), sim.data)
-    assert "splits the step: 'mine' is not fused" in text
-    assert text.splitlines()[-1].startswith("kernel: ")

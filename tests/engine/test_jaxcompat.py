@@ -1,7 +1,6 @@
 """JAX beyond its public interface: each name that the engine relies on, on every version that is supported."""
 
 import dataclasses
-import functools
 import os
 import subprocess
 import sys
@@ -23,19 +22,6 @@ def equation(fn, *args, name=None):
 
 
 # Jaxprs --------------------------------------------------------------------------------------------------------------
-
-
-def test_a_jaxpr_drops_inputs_that_it_does_not_use():
-    jaxpr = jax.make_jaxpr(lambda a, b, c: (a - c,))(1.0, 2.0, 3.0)
-    selected = jaxcompat.select_inputs(jaxpr, [0, 2])
-    assert len(selected.jaxpr.invars) == 2
-    assert jaxcompat.jaxpr_as_fun(selected)(5.0, 3.0)[0] == 2.0
-
-
-def test_an_input_that_is_dropped_may_be_a_random_key():
-    jaxpr = jax.make_jaxpr(lambda key, x: (x + 1.0,))(jax.random.key(0), jnp.ones(3))
-    selected = jaxcompat.select_inputs(jaxpr, [1])
-    np.testing.assert_array_equal(jaxcompat.jaxpr_as_fun(selected)(jnp.zeros(3))[0], np.ones(3))
 
 
 def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
@@ -85,74 +71,6 @@ def test_primitives_written_in_terms_of_others_are_expanded():
                 for a, b in zip(jaxcompat.expand_primitive(eqn)(*args), expected, strict=True):
                     np.testing.assert_allclose(a, b, rtol=1e-6)
     assert not result or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
-
-
-def test_a_primitive_is_replaced_under_vmap_and_an_error_elsewhere():
-    def outside(*args, **params):
-        raise TypeError("outside")
-
-    def batched(axis, args, dims, factor):
-        assert (axis.name, axis.size, dims) == ("some", 3, (0,))
-        return [factor * args[0]], [0]
-
-    p = jaxcompat.batched_primitive("scaled", lambda x, factor: [x], batched, outside)
-    scale = lambda x: p.bind(x, factor=2.0)[0]  # noqa: E731
-    result = jax.jit(jax.vmap(scale, axis_name="some"))(jnp.arange(3.0))
-    np.testing.assert_array_equal(result, [0.0, 2.0, 4.0])
-    for fn in (scale, jax.jit(scale)):
-        with pytest.raises(TypeError, match="outside"):
-            fn(jnp.float32(1))
-
-
-def test_a_primitive_is_lowered_as_the_function_of_its_platform():
-    traced = []
-
-    def times(factor, x, *, power):
-        traced.append(factor)
-        return [factor * x**power]
-
-    functions = {"cpu": functools.partial(times, 3.0), "cuda": functools.partial(times, 7.0)}
-    p = jaxcompat.primitive_by_platform("times", lambda x, power: [jax.ShapeDtypeStruct(x.shape, x.dtype)], functions)
-    apply = lambda x: p.bind(x, power=2)[0]  # noqa: E731
-    assert apply(jnp.float32(2)) == jax.jit(apply)(2.0) == 12.0
-    traced.clear()
-    text = jax.jit(apply).trace(2.0).lower(lowering_platforms=("cuda",)).as_text()
-    assert "7.0" in text
-    assert traced == [7.0]
-
-
-def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
-    """The parameter ``n_nonlinear`` is the number of first operands in which the primitive is not linear."""
-    p = jaxcompat.primitive_by_platform(
-        "product",
-        lambda x, y, n_nonlinear: [jax.ShapeDtypeStruct(y.shape, y.dtype)],
-        {"": lambda x, y, n_nonlinear: [x * y]},
-        differentiable_fn=lambda x, y, n_nonlinear: [5.0 * x * y],
-        transpose_rule=lambda fixed, cotangents, n_nonlinear: [7.0 * fixed[0] * cotangents[0]],
-        batching_rule=jaxcompat.make_vmap_rule(lambda x, y, n_nonlinear: [x * y + 1.0]),
-    )
-    apply = lambda x, y: p.bind(x, y, n_nonlinear=1)[0]  # noqa: E731
-    two, three = jnp.float32(2), jnp.float32(3)
-    assert jax.jit(apply)(two, three) == 6.0
-    assert jax.jvp(apply, (two, three), (1.0, 0.0))[1] == 15.0
-    assert jax.linear_transpose(lambda y: apply(two, y), three)(jnp.float32(1)) == (14.0,)
-    np.testing.assert_array_equal(jax.vmap(apply, (None, 0))(two, jnp.arange(3.0)), [1.0, 3.0, 5.0])
-
-
-def test_a_jaxpr_takes_what_it_closes_over():
-    table = jnp.arange(3.0)
-    closed = jax.make_jaxpr(lambda x: x + table)(1.0)
-    assert len(closed.consts) == 1
-    opened = jaxcompat.constants_to_inputs(closed)
-    assert not opened.consts
-    (result,) = jaxcompat.jaxpr_as_fun(opened)(table, 1.0)
-    np.testing.assert_array_equal(result, [1.0, 2.0, 3.0])
-
-
-def test_the_index_of_a_loop_has_32_bits(x64):
-    jaxpr = jax.make_jaxpr(lambda x: jaxcompat.fori_loop(3, lambda k, x: x + k, x))(1.0)
-    assert "i64" not in str(jaxpr)
-    assert jaxcompat.jaxpr_as_fun(jaxpr)(1.0)[0] == 4.0
 
 
 # Arrays --------------------------------------------------------------------------------------------------------------

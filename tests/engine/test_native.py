@@ -169,13 +169,6 @@ def test_a_library_that_does_not_load_here_is_compiled_again(source, cache_folde
     assert compilations() == 2
 
 
-def test_a_folder_that_forbids_execution_does_no_harm(source, cache_folder, compilations, monkeypatch):
-    real = native._load_library
-    monkeypatch.setattr(native, "_load_library", lambda path: None if path.is_relative_to(cache_folder) else real(path))
-    native.register_kernel(source)
-    assert compilations() == 1
-
-
 def test_a_kernel_that_cannot_be_written_says_so(source, cache_folder, compilations, monkeypatch):
     def raise_no_space(*args):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -183,16 +176,6 @@ def test_a_kernel_that_cannot_be_written_says_so(source, cache_folder, compilati
     monkeypatch.setattr(kernel_cache, "store_file", raise_no_space)
     with pytest.raises(KernelError, match=r"cannot be written: .*No space left on device; make room, or set TMPDIR"):
         native.register_kernel(source)
-
-
-def test_a_file_of_the_key_without_a_kernel_is_not_used(cache_folder, monkeypatch):
-    path = cache_folder / "empty.so"
-    done = subprocess.run(
-        [native.compiler(), "-shared", "-x", "c++", "-", "-o", str(path)], input="int x;", text=True, check=False
-    )
-    assert done.returncode == 0
-    assert ctypes.CDLL(str(path))
-    assert native._load_library(path) is None
 
 
 def test_nothing_partial_is_ever_seen(source, cache_folder, monkeypatch, tmp_path_factory):
@@ -225,12 +208,6 @@ def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatc
     assert kernel_cache.folder() == kernel_cache.temporary_folder()
     monkeypatch.setenv("CRAZYSIM_CACHE", str(tmp_path / "kept"))
     assert kernel_cache.folder() == default_folder() / "crazysim"
-
-
-def test_boundaries_between_the_parts_of_a_key_count():
-    assert kernel_cache.digest("ab", "c") != kernel_cache.digest("a", "bc")
-    assert kernel_cache.digest("a", "b") != kernel_cache.digest("b", "a")
-    assert len(kernel_cache.digest("a")) == kernel_cache.DIGEST_LENGTH
 
 
 @pytest.mark.parametrize(
@@ -267,24 +244,6 @@ def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
         native.register_kernel(source)
     assert not list(cache_folder.iterdir())
     assert compilations() == 0
-
-
-def test_lines_with_a_selection_lower_the_largest_size_of_a_kernel(cache_folder, monkeypatch):
-    """Selections take longer to compile than other lines."""
-
-    def start_compiler(*args):
-        raise LookupError
-
-    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1")
-    monkeypatch.setattr(native, "_run_compiler", start_compiler)
-    for line, n_lines, error in (
-        ("x = mul_(a, b);", 9_999, LookupError),
-        ("x = max_(a, b);", 4_000, LookupError),
-        ("x = max_(a, b);", 4_200, KernelError),
-        ("x = select_n_(a, b, c);", 4_200, KernelError),
-    ):
-        with pytest.raises(error):
-            native._compile(["g++"], f"{line}\n" * n_lines)
 
 
 def test_a_compiler_is_a_command_with_options(source, cache_folder, monkeypatch):

@@ -58,19 +58,6 @@ def pipeline():
     return verify(program), numbers
 
 
-def test_fusing_changes_no_number(pipeline):
-    """Results are equal to the bit, from the same operations in the same order."""
-    program, numbers = pipeline
-    fused = verify(schedule.fuse(program))
-    assert len(fused.segments) == 1 < len(program.segments)
-    assert fused.segments[0].stages == tuple(s.stages[0] for s in program.segments)
-    assert fused.segments[0].n_operations <= sum(s.n_operations for s in program.segments)
-    assert {op.stage for op in fused.segments[0].block.walk()} <= {*fused.segments[0].stages}
-    expected, result = run_program(program, numbers, 3), run_program(fused, numbers, 3)
-    for slot, x in expected.items():
-        np.testing.assert_array_equal(result[slot], x, err_msg=str(slot))
-
-
 def test_hoisting_takes_work_out_of_the_loop(pipeline):
     """Results are equal up to the rounding of a product with an inverse instead of a division."""
     program, numbers = pipeline
@@ -145,24 +132,6 @@ def test_stages_of_the_same_ticks_are_joined(result):
     expected, with_joined = run_program(fused, numbers, 2), run_program(joined, numbers, 2)
     assert all((with_joined[slot] == expected[slot]).all() for slot in (X, Y, Z))
     assert (with_joined[result] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[result])).all()
-
-
-def test_stages_of_other_ticks_are_not_joined():
-    first = guarded_segment("first", [], Y, lambda b: np.float32(1))
-    between = segment("between", [Y], [X], apply_fn("neg"))
-    second = guarded_segment("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
-    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (first, between, second))))
-    assert [op.name for op in joined.segments[0].block.operations].count("when") == 2
-
-
-def test_phases_and_scopes_are_not_joined():
-    stages = [
-        segment("a", [X], [Y], apply_fn("exp"), phase="before"),
-        segment("b", [Y], [Z], apply_fn("neg")),
-        segment("c", [Z], [X], apply_fn("exp"), scope="world"),
-        segment("d", [X], [Y], apply_fn("exp")),
-    ]
-    assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
 
 
 def test_the_inverse_of_a_number_is_computed_once():

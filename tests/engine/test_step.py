@@ -310,28 +310,6 @@ def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
     np.testing.assert_allclose([value, *slopes], [2 * 1.1**n, 2 * n * 1.1 ** (n - 1), 1.1**n], rtol=1e-5)
 
 
-def test_vmap_over_commands_and_parameters_is_a_loop():
-    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    data, step = scatter_drones(sim), Step(sim.step_pipeline)
-    commands = (
-        np.asarray(data.controls.attitude.staged_cmd) * np.linspace(0.5, 1.5, 4, dtype=np.float32)[:, None, None, None]
-    )
-    masses = np.asarray(data.params.mass) * np.linspace(0.9, 1.1, 4, dtype=np.float32)[:, None]
-
-    def fly(command, mass):
-        ready = F.attitude_control(data.replace(params=data.params.replace(mass=mass)), command)
-        return step(ready, jnp.int32(7)).states
-
-    cases = [(jax.vmap(fly), masses), (jax.vmap(fly, (0, None)), np.asarray(data.params.mass))]
-    compiled = jax.jit(fly)
-    for batched_fly, mass in cases:
-        many = jax.device_get(jax.jit(batched_fly)(commands, mass))
-        for k in range(4):
-            single = compiled(commands[k], mass[k] if mass.ndim > 1 else mass)
-            for name in ("pos", "vel"):
-                np.testing.assert_allclose(getattr(many, name)[k], getattr(single, name), rtol=1e-5, atol=1e-6)
-
-
 # Leaves that share an array ------------------------------------------------------------------------------------------
 
 
@@ -457,23 +435,6 @@ def test_a_rollout_has_a_gradient():
     np.testing.assert_allclose(slope, central, rtol=2e-2)  # float32: 1e-7 m over 0.02
 
 
-@pytest.mark.parametrize("settings, words", [
-    ({"n_control_steps": 0}, "n_control_steps is 0; it must be a positive whole number"),
-    ({"n_control_steps": 2.0}, "n_control_steps as a whole number, got 2.0"),
-    ({"n_control_steps": 10, "every": 3}, "every=3 does not divide n_control_steps=10"),
-])  # fmt: skip
-def test_law_09_rollouts_refuse_wrong_input(settings, words):
-    sim = shared_sim(n_worlds=1, n_drones=1, control="attitude")
-    with pytest.raises(ConfigError, match=words):
-        sim.rollout(climb_policy, jnp.float32(0.3), **settings)
-
-
-def test_law_09_a_command_of_another_shape_from_a_policy_is_an_error():
-    sim = shared_sim(n_worlds=2, n_drones=1, control="attitude")
-    with pytest.raises(ValueError, match=r"attitude command has shape \(2, 1, 3\); expected \(2, 1, 4\)"):
-        sim.rollout(lambda params, data: data.states.pos, None, 3)
-
-
 # Choice --------------------------------------------------------------------------------------------------------------
 
 
@@ -485,17 +446,6 @@ def test_auto_takes_the_kernel_and_says_so():
     assert text.startswith("engine: fused")
     assert "fused, for one drone: state_controller, attitude_controller" in text
     assert "compiled by" in text
-
-
-def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
-    monkeypatch.setattr("crazysim.engine.backends.native.compiler", lambda: None)
-    sim = Sim(control="rotor_vel")
-    assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
-    sim.step(2)
-    with pytest.raises(
-        ConfigError, match=r"engine 'fused' cannot run here: no C\+\+ compiler was found.*engine='lanes'"
-    ):
-        Sim(engine="fused")
 
 
 def select_controller(state, setpoint, time):

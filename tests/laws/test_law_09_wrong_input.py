@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from cases import LEVELS
 
-from crazysim import Cars, ConfigError, ContactLog, Sim, SlungLoad, Terrain, Wind
+from crazysim import Cars, ConfigError, Sim, Terrain, Wind
 from crazysim.control.geometric import Geometric
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
-from crazysim.envs.task_check import require_installed
-from crazysim.envs.tasks.race import Race
 from crazysim.media import View
-from crazysim.sim import rollout, use_box_collision
-from crazysim.sim.visualize import change_material, draw_capsule, draw_points
+from crazysim.sim import rollout
+from crazysim.sim.visualize import change_material
 
 # Arguments, and parts of the message: the given value, then the expected one or the remedy.
 WRONG_SETTINGS = [
@@ -37,7 +35,6 @@ WRONG_SETTINGS = [
     ({"drone": []}, "got an empty list", "a list with one for each drone"),
     ({"mesh": 2}, "got 2", "world_mesh"),
     ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
-    ({"strict": "no"}, "expected strict as True or False", "got 'no'"),
     ({"control": "state", "controller": Geometric(feedforward="no")}, "feedforward of Geometric", "got 'no'"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
     ({"rng_key": 2**70}, str(2**70), "64 bits"),
@@ -131,14 +128,10 @@ def sim():
 # Calls, and parts of the message.
 WRONG_CALLS = [
     (lambda sim: sim.step(0), "n_steps is 0", "positive whole number"),
-    (lambda sim: sim.step("3"), "n_steps is '3'", "positive whole number"),
     (lambda sim: sim.reset(np.zeros(2, bool)), "shape (2,)", "(3,) and bool"),
     (lambda sim: sim.reset([[True], [True, False]]), "[[True], [True, False]]", "one bool per world"),
-    (lambda sim: sim.seed(1.5), "1.5", "an integer"),
-    (lambda sim: sim.render("rgb_array", world=3), "expected a world from 0 to 2", "got 3"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
     (lambda sim: sim.sync(1.0), "expected a world from 0 to 2, got 1.0"),
-    (lambda sim: setattr(sim, "max_geom_pairs", "a"), "max_geom_pairs is 'a'", "positive whole number"),
     (
         lambda sim: sim.rollout(lambda params, data: jnp.zeros((*data.states.pos.shape[:2], 4)), None, 2 * 10**9),
         "expected arrays that fit into the ",
@@ -150,36 +143,17 @@ WRONG_CALLS = [
         "expected arrays that fit into the ",
         "Keep less",
     ),
-    (lambda sim: sim.rollout(None, None, 4), "expected policy as a function, got None"),
-    (lambda sim: sim.rollout(lambda params, data: 0, None, 4, keep=3), "expected keep as a function, got 3"),
-    (lambda sim: sim.contact_report(3), "expected objects as handles or names of bodies, got 3"),
-    (lambda sim: sim.add(ContactLog(objects=3)), "expected objects as handles or names of bodies,", "got 3"),
     (lambda sim: setattr(sim, "step_pipeline", []), "expected step_pipeline as a dict", "got []"),
     (lambda sim: setattr(sim, "step_pipeline", {"still": 3}), "expected names and functions", "'still': 3"),
-    (lambda sim: setattr(sim, "reset_pipeline", None), "expected reset_pipeline as a dict", "got None"),
-    (lambda sim: sim.scene.add("box", rgba="red"), "expected rgba as a number or array", "Use (1, 0, 0, 1)"),
-    (lambda sim: sim.scene.add("box", size="big"), "expected size of 'box' as a number or array", "'big'"),
     (lambda sim: sim.scene.add("box", size=(np.nan, 1, 1)), "expected size of 'box' to be positive", "nan"),
     (lambda sim: sim.scene.add("sphere", radius="1"), "expected radius of 'sphere' as a number, got '1'"),
     (lambda sim: sim.scene.add("box", count=10**9), "count is 1000000000", "at most 100000"),
-    (lambda sim: sim.scene.add("box", mocap="no"), "expected mocap as True or False", "got 'no'"),
-    (lambda sim: sim.contact_report(floor="no"), "expected floor as True or False", "got 'no'"),
-    (lambda sim: sim.depth(hide_own=None), "expected hide_own as True or False", "got None"),
-    (lambda sim: sim.explain(measure="no"), "expected measure as True or False", "got 'no'"),
-    (lambda sim: sim.attitude_control(np.zeros((3, 1, 4)), "no"), "expected check_finite as True", "got 'no'"),
-    (lambda sim: use_box_collision(sim, "no"), "expected enable as True or False", "got 'no'"),
-    (lambda sim: draw_capsule(sim, [0, 0, 0], [0, 0, 1], cylinder="no"), "expected cylinder as True", "got 'no'"),
-    (lambda sim: sim.add(SlungLoad(0.01, cable="no")), "expected cable of SlungLoad as True", "got 'no'"),
-    (lambda sim: require_installed(sim, Race(practice="no")), "expected practice of Race as True", "got 'no'"),
-    (lambda sim: View(setpoints="no"), "expected setpoints of View as True or False", "got 'no'"),
-    (lambda sim: sim.add(SlungLoad(0.01, rgba="red")), "expected rgba of SlungLoad as a number or array", "got 'red'"),
     (lambda sim: sim.add(Cars(1, rgba=(1, 0, 0))), "expected rgba of Cars of shape (4,)", "got (3,)"),
     (
         lambda sim: sim.add(Terrain(np.zeros((2, 2)), (1, 1), rgba=(2, 0, 0, 1))),
         "expected rgba",
         "got [2.0, 0.0, 0.0, 1.0]",
     ),
-    (lambda sim: draw_points(sim, [0, 0, 0], rgba="red"), "expected rgba as numbers", "got 'red'"),
     (lambda sim: change_material(sim, "led_top", [0], rgba=(np.nan,) * 4), "expected rgba to be from 0 to 1", "nan"),
     (lambda sim: View(width=10**9), "width is 1000000000", "at most 16384"),
     (lambda sim: sim.add(Wind((1e300, 0, 0))), "expected", "1e+300"),

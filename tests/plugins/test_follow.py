@@ -8,7 +8,7 @@ from cases import build_stagewise_step, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.plugins.follow import Follow
-from crazysim.trajectories import Trajectory, figure_eight, helix, hover, line
+from crazysim.trajectories import Trajectory, figure_eight, hover, line
 
 N_WORLDS, N_DRONES = 3, 2
 EIGHT, UP = figure_eight(period=4.0), line([0, 0, 1], [0, 1, 2], duration=1.0)
@@ -86,17 +86,6 @@ def test_one_start_per_drone_spaces_them_along_a_curve():
     )
     with pytest.raises(ConfigError, match="start for each of 2 drones, got 3 numbers"):
         follow.assign(sim, start=np.zeros(N_WORLDS))
-
-
-def test_drones_follow_a_helix():
-    sim = build(n_worlds=1, n_drones=1)
-    sim.add(Follow(helix(0.3, 0.2, 2, period=3.0, height=1.0)))
-    sim.step(1500)
-    error = np.asarray(sim.plugins.observations(sim.data)["follow.pos_error"])
-    s = evaluate(helix(0.3, 0.2, 2, period=3.0, height=1.0), 3.0)
-    np.testing.assert_allclose(error[0, 0], np.asarray(s.pos) - np.asarray(sim.data.states.pos)[0, 0], atol=1e-5)
-    assert np.linalg.norm(error) < 0.1
-    assert sim.plugins.observations(sim.data)["follow.vel_error"].shape == (1, 1, 3)
 
 
 def test_uploads_are_flown_and_nothing_is_compiled_again():

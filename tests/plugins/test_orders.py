@@ -272,16 +272,6 @@ def test_edits_are_replayed_when_plugins_come_and_go():
     assert pipeline["attitude_controller"] is controller
 
 
-def test_a_stage_stays_where_it_was_inserted_when_its_neighbours_go():
-    sim = Sim(plugins=[IMU(), MotionCapture(), ContactResponse()])
-    for k, anchor in enumerate(("integration", "contact_response", "imu", "motion_capture_begin")):
-        insert_fn_after(sim.step_pipeline, anchor, lambda data: data, f"mine_{k}")
-    for name in list(sim.plugins):
-        sim.remove(name)
-    names = ["integration", "mine_0", "clip_floor_pos", "mine_1", "mine_2", "mine_3", "increment_steps"]
-    assert list(sim.step_pipeline)[2:] == names
-
-
 @pytest.mark.parametrize("make_sensor", [IMU, RangeFinder, lambda: Radar((0, 0, 0)), ContactLog])
 @pytest.mark.parametrize("make_plugin", [DroneCollisions, ContactResponse, Cars, lambda: FreeBodies(1, size=0.05)])
 def test_sensors_measure_behind_stages_that_move_drones(make_plugin, make_sensor):
@@ -460,3 +450,13 @@ def test_plugins_added_and_removed_in_any_order_give_the_same_flight(names):
     sim = new_sim()
     try_orders(sim, names)
     require_same_flight(sim, rebuilt(sim))
+
+
+def test_a_stage_stays_where_it_was_inserted_when_its_neighbours_go():
+    sim = Sim(plugins=[IMU(), MotionCapture(), ContactResponse()])
+    for k, anchor in enumerate(("integration", "contact_response", "imu", "motion_capture_begin")):
+        insert_fn_after(sim.step_pipeline, anchor, lambda data: data, f"mine_{k}")
+    for name in list(sim.plugins):
+        sim.remove(name)
+    names = ["integration", "mine_0", "clip_floor_pos", "mine_1", "mine_2", "mine_3", "increment_steps"]
+    assert list(sim.step_pipeline)[2:] == names

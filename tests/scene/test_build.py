@@ -135,19 +135,6 @@ def test_a_swarm_built_in_chunks_equals_one_built_one_by_one(monkeypatch):
         np.testing.assert_array_equal(getattr(one_by_one, name), getattr(in_chunks, name), err_msg=name)
 
 
-def test_a_handler_of_mujocos_warnings_stays():
-    def handle(text):
-        raise AssertionError(text)
-
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(handle)
-    try:
-        Sim()
-        assert mujoco.get_mju_user_warning() is handle
-    finally:
-        mujoco.set_mju_user_warning(previous)
-
-
 # What users add -------------------------------------------------------------------------------------------------
 
 
@@ -303,12 +290,6 @@ def test_a_broken_scene_is_refused_at_construction(tmp_path, case):
         Sim(xml_path=broken_scene(tmp_path, text))
 
 
-@pytest.mark.parametrize("path", ["nowhere.xml", "."])
-def test_a_missing_scene_is_refused_at_construction(path):
-    with pytest.raises(ValueError, match="expected an existing MJCF file"):
-        Sim(xml_path=path)
-
-
 def test_a_scene_with_names_of_the_drones_is_refused(tmp_path):
     """Names of the drones' materials, cameras and geoms are reserved, too."""
     for mjcf in (
@@ -365,8 +346,3 @@ def test_contacts_are_refused_for_geoms_that_mjx_does_not_support(unsupported_by
     unsupported_by_mjx.step()
     with pytest.raises(ValueError, match="expected a scene that MJX supports"):
         unsupported_by_mjx.contacts()
-
-
-def test_geoms_that_mjx_does_not_support_are_drawn(unsupported_by_mjx, opengl):
-    assert unsupported_by_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
-    unsupported_by_mjx.close()

@@ -87,12 +87,6 @@ def test_every_distance_equals_that_of_c_mujoco(scattered_course):
     np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
 
 
-def test_a_report_allocates_nothing_of_mujoco(scattered_course):
-    sim, _ = scattered_course
-    sim.contact_report()
-    assert not sim.scene.is_allocated
-
-
 def test_box_collision_changes_the_distances():
     sim = Sim(n_worlds=2, control="attitude")
     sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
@@ -144,17 +138,6 @@ def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered_course):
     )
     np.testing.assert_allclose(states.force, expected, atol=1e-5)
     np.testing.assert_allclose(states.torque, full_report.object_distance[..., :3], atol=1e-5)
-
-
-def test_the_gradient_of_the_distance_is_a_unit_vector(scattered_course):
-    sim, handles = scattered_course
-    contacts = sim.scene.contact_fn(handles["ball"], floor=False, drones=False)
-
-    def distance(pos):
-        return contacts(sim.data.replace(states=sim.data.states.replace(pos=pos))).object_distance
-
-    gradient = jax.jit(jax.grad(lambda pos: jnp.sum(distance(pos))))(sim.data.states.pos)
-    np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1.0, atol=1e-4)
 
 
 def test_distances_in_a_large_swarm_are_computed_in_chunks():

@@ -70,16 +70,6 @@ def test_a_line_goes_through_its_points(sim):
     np.testing.assert_allclose([y[second].min(), y[second].max()], [-0.3, 0.3], atol=0.02)
 
 
-def test_a_line_has_the_requested_width(sim):
-    """Its width in pixels grows from piece to piece, as a trail's does."""
-    points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
-    draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
-    mask = has_colour(take_picture(sim), BLUE)
-    widths = mask.sum(0)[mask.any(0)]
-    assert abs(widths[:10].mean() - 2) < 1.5
-    assert abs(widths[-10:].mean() - 8) < 1.5
-
-
 @pytest.mark.parametrize("cylinder", [False, True])
 def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     """A capsule is longer by its round ends than a cylinder; both are as wide as twice their radius."""
@@ -88,34 +78,6 @@ def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     end = 0.0 if cylinder else 0.06
     np.testing.assert_allclose([x.min(), x.max()], [-0.2 - end, 0.3 + end], atol=0.02)
     np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
-
-
-def test_overlays_are_red_by_default(sim):
-    nose = has_colour(take_picture(sim), RED)
-    draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
-    draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
-    draw_capsule(sim, [-0.4, 0.2, 1], [-0.4, 0.3, 1])
-    x, y = positions_of_pixels(has_colour(take_picture(sim), RED) & ~nose)
-    for point in ([0, 0.3], [0.2, -0.3], [-0.4, 0.25]):
-        assert (np.hypot(x - point[0], y - point[1]) < 0.03).sum() > 20, point
-
-
-def test_overlays_are_not_in_depth_images(sim):
-    """The colour image has them; the depth image is that of the bodies."""
-    plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
-    draw_points(sim, [[0.0, 0.0, 1.0]], rgba=GREEN, size=0.1)
-    color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
-    assert has_colour(color.astype(int), GREEN).sum() > 200
-    np.testing.assert_array_equal(depth, plain)
-
-
-def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
-    """Crazyflow's draw functions do nothing until something has been rendered."""
-    sim = Sim(n_worlds=2)
-    draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
-    view = {"lookat": [0, 0, 0.5], "distance": 2.0}
-    assert has_colour(sim.render("rgb_array", cam_config=view, width=64, height=48).astype(int), GREEN).sum() > 50
-    sim.close()
 
 
 def test_overlays_are_kept_through_steps_and_failed_images(sim):

@@ -152,15 +152,6 @@ def test_a_law_in_c_flies_like_the_same_law_in_jax(library):
     np.testing.assert_allclose(result.data.states.pos, expected.data.states.pos, atol=1e-5)
 
 
-def test_the_memory_of_each_drone_lasts_until_its_world_is_reset(library):
-    sim = fly_to_heights(CFirmware(library("hover", HOVER)), n_steps=20)
-    sim.reset(np.arange(WORLDS) == 1)
-    sim.step(5)
-    memory = np.asarray(sim.data.controls.controller.memory.words)
-    assert memory[..., 1].tolist() == [[25, 25], [5, 5], [25, 25]]
-    assert len(np.unique(memory[..., 0])) > DRONES
-
-
 @pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
 def test_a_library_receives_state_command_and_time(library, level):
     sim = Sim(2, 1, control=level, controller=CFirmware(library("echo", ECHO), motors="thrust", freq=250))

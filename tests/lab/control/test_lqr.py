@@ -79,11 +79,6 @@ def test_gains_inside_jit_have_gradients():
     np.testing.assert_allclose([value, slope], [root, np.sqrt(2) / root], rtol=1e-3)
 
 
-def test_weights_may_be_singular_matrices():
-    direction = np.array([0.1, 0.7, 0.3])
-    np.testing.assert_array_equal(weight_matrix("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
-
-
 def zero_setpoint():
     return Setpoint(*[np.zeros(3)] * 5, *[np.zeros(1)] * 3)
 

@@ -332,18 +332,6 @@ def drone_update(data, estimate, gyro, measured):
     return jax.tree.map(lambda x: x[0, 0], vmap_worlds(vmap_drones(update))(data))
 
 
-def test_an_antenna_off_the_centre_of_mass_gives_the_position_of_the_centre():
-    """The antenna is 0.3 m beside a turned drone, and the noise of a position is 0.02 m."""
-    gps = GPS(noise=0.02, vel_noise=0.02, pos=(0.3, 0.0, 0.0), freq=100)
-    estimator = ESKF([IMU(gyro=GYRO, accel=ACCEL), gps], control=False)
-    sim = Sim(n_worlds=8, control="state", estimator=estimator, engine="interpret")
-    quat = jnp.tile(jnp.array([0.0, 0.0, np.sin(0.75), np.cos(0.75)]), (8, 1, 1))
-    sim.data = sim.data.replace(states=sim.data.states.replace(quat=quat))
-    sim.step(100)
-    s = sim.data.states
-    np.testing.assert_allclose(sim.data.plugins["eskf"].estimate.pos, s.pos, atol=0.04)  # twice the noise
-
-
 class TurnedProbe(BodyVelocity):
     """A probe whose error is a rotation, which has no variance in the components of its measurement."""
 

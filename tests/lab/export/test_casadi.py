@@ -126,18 +126,6 @@ def test_the_jacobian_is_that_of_jax(dynamics):
         np.testing.assert_allclose(np.asarray(a) / size, b / size, rtol=1e-10, atol=1e-11)
 
 
-@pytest.mark.parametrize(("dynamics", "control"), CHOSEN_PAIRS)
-def test_the_jacobian_is_finite_in_hover_and_at_rest(dynamics, control):
-    sim = Sim(dynamics=dynamics, control=control)
-    exported = to_casadi(sim)
-    jacobian = exported.function.jacobian()
-    for height in (0.0, 1.0):
-        x = exported.x.of(sim.data)
-        x[2] = height
-        for u in (hover_command(sim.data), 0 * hover_command(sim.data)):
-            assert all(np.isfinite(np.asarray(part)).all() for part in jacobian(x, u, 0))
-
-
 def test_parameters_are_an_input():
     sim = Sim(N_WORLDS, N_DRONES, control="rotor_vel")
     names = ("states.force", "params.mass", "params.rpm2thrust")
@@ -267,12 +255,3 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
 def test_wrong_input_is_an_error(options, words):
     with pytest.raises(ValueError, match=words):
         to_casadi(Sim(control="rotor_vel"), **options)
-
-
-def test_a_vector_returns_the_slice_of_a_field():
-    x = to_casadi(Sim(control="rotor_vel")).x
-    assert len(x) == 17
-    assert x["states.quat"] == slice(3, 7)
-    assert x["states.rotor_vel"] == slice(13, 17)
-    with pytest.raises(ValueError, match=r"'core.steps' is not in this vector; it has states.pos"):
-        x["core.steps"]

@@ -234,13 +234,6 @@ def test_exported_actions_are_finite_whatever_is_observed(tmp_path, policy, meta
             assert (np.abs(memory) <= 1).all()
 
 
-def test_every_command_level_is_described(tmp_path, policy, meta):
-    for level, unit in {"body_rate": "rate about x, rad/s", "rotor_vel": "speed of rotor 0, rpm",
-                        "force_torque": "collective thrust, N"}.items():  # fmt: skip
-        other = meta | {"actions": meta["actions"] | {"level": level}}
-        assert f"[0] {unit} = " in to_c(policy, tmp_path / "policy.h", other).read_text()
-
-
 @pytest.mark.parametrize("write", [to_c, to_onnx])
 def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, write):
     path = tmp_path / "policy"

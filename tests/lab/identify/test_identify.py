@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,9 +14,7 @@ from crazysim.dynamics import first_principles
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import (
     Columns,
-    Model,
     errors_table,
-    fast_rotation,
     fit_residual,
     identify,
     prediction_errors,
@@ -89,15 +86,6 @@ def test_identified_model_predicts_held_out_flights(flights, result):
     for name in ("unchanged", "at constant body rates"):
         assert np.all(errors["attitude"] < 0.1 * errors[f"attitude {name}"])
     assert "attitude, degrees" in errors_table(errors)
-
-
-def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, result):
-    """Equal moments of inertia of 1,000 kg m^2: no gyroscopic torque, and 1e-9 rad/s^2 by the rotors."""
-    heavy = jnp.asarray(1e3 * np.eye(3), jnp.float32)
-    params = result.model.params.replace(J=heavy, J_inv=heavy / 1e6)
-    errors = prediction_errors([read_log(flights[-1])], result.model.replace(params=params))
-    for name in ("position", "attitude"):
-        np.testing.assert_allclose(errors[f"{name} at constant body rates"], errors[name], rtol=1e-4)
 
 
 def test_the_errors_of_predictions_that_are_off_by_a_known_amount(flights, result, monkeypatch):
@@ -218,14 +206,6 @@ def test_offset_of_quaternions_is_found(flights):
     assert "subtracted" in read.repairs[0]
 
 
-def test_spikes_of_rotor_speeds_are_interpolated(flights):
-    x = flights[0]["rpm3"].copy()
-    x[40] = 1e6
-    read = read_log(flights[0] | {"rpm3": x})
-    assert read.rotor_vel[40, 2] < 4e4
-    assert "interpolated 1 rotor speeds" in read.repairs[0]
-
-
 def test_lost_values_are_gaps(flights):
     """0.08 s of NaN or of zero quaternions, as when motion capture loses the drone, are a gap; 0.008 s are filled."""
     for names, value in (("x",), np.nan), (("qx", "qy", "qz", "qw"), 0.0):
@@ -297,24 +277,6 @@ def test_factors_of_columns_are_applied(flights):
         np.testing.assert_allclose(
             np.reshape(getattr(read, key), (len(read.t), -1))[:, 0], flights[0][name], atol=1e-12
         )
-
-
-def test_several_mistakes_are_named_in_turn(flights):
-    quat = ("qw", "qx", "qy", "qz")
-    log = {
-        k: x * (1e3 if k in "xyz" else 100 if k[0] == "v" else 57.3 if k[0] == "w" else 1)
-        for k, x in flights[0].items()
-    }
-    columns = Columns(quat=quat)
-    for message, change in (
-        ("order w, x, y, z", {"quat": (*quat[1:], "qw")}),
-        ("in mm and cm/s: give metres_per_unit=0.001 and speed", {"metres_per_unit": 1e-3, "speed_per_unit": 1e-2}),
-        ("rad_per_unit=0.0174533", {"rad_per_unit": 0.0174533}),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            read_log(log, columns)
-        columns = replace(columns, **change)
-    np.testing.assert_allclose(read_log(log, columns).pos, read_log(flights[0]).pos)
 
 
 def test_columns_that_cannot_be_are_refused(capsys):
@@ -468,32 +430,6 @@ def test_a_damaged_archive_is_refused(tmp_path):
         read_log(tmp_path / "log.npz")
 
 
-@pytest.mark.slow("fits 20 logs; test_random_fits.py has noisy and late rotor speeds, with commands and without")
-def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
-    """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact.
-
-    A second of a flight leaves an error of some 5%, so each flight is logged three times.
-    """
-    rng, logs, delays_s = np.random.default_rng(1), [], 3 * [0.004, 0.012, 0.0, 0.008, 0.004]
-    for flight, delay in zip(3 * flights[:-1], delays_s, strict=True):
-        t, columns = flight["t"], {}
-        for k in range(1, 5):
-            columns[f"cmd{k}"] = flight[f"rpm{k}"]
-            measured = np.interp(t + delay, t, flight[f"rpm{k}"]) + rng.normal(scale=1000, size=len(t))
-            columns[f"rpm{k}"] = 17 * np.round(measured / 17)
-        logs.append(read_log(flight | columns, Columns(command=("cmd1", "cmd2", "cmd3", "cmd4"))))
-    params = Model.create(load_airframe("cf21B_500")).params
-    with_commands = fast_rotation(logs, params, FACTORS["thrust factor"])
-    without = fast_rotation([replace(log, command=None) for log in logs[:5]], params, FACTORS["thrust factor"])
-    true = np.array([FACTORS["inertia x"], FACTORS["inertia y"]])
-    deviations = with_commands.deviations[:2]
-    assert np.all(np.abs(with_commands.values[:2] - true) < 3 * deviations), with_commands
-    assert np.all(deviations < 0.05 * true), deviations
-    delays = np.median(np.reshape(with_commands.delays, (3, 5)), axis=0)
-    np.testing.assert_allclose(delays, delays_s[:5], atol=3e-3)
-    assert np.all(without.values[:2] > 1.07 * true), without.values
-
-
 @pytest.mark.long("compiles the gradient of a flight of 0.5 s, and trains")
 @pytest.mark.parametrize(
     "n_hidden", [4, pytest.param(0, marks=pytest.mark.slow("with hidden units the linear terms are trained too"))]
@@ -507,10 +443,6 @@ def test_training_a_residual_finds_a_wrong_thrust(flights, result, n_hidden):
     inputs = residual_inputs(level, rest, rest, 1.05 * first_principles.hover_rotor_vel(p), p)
     force, _ = residual_wrench(inputs, trained.residual)
     np.testing.assert_allclose(force[2], -0.1 * 9.81 * p.mass[0], rtol=0.4)
-
-
-def test_results_are_plain_numbers(result):
-    assert all(isinstance(x, float) for x in jax.tree.leaves(result.values))
 
 
 @pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy"])

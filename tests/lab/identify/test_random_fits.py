@@ -135,15 +135,3 @@ def test_errors_are_as_large_as_their_deviations(tmp_path, at_samples):
     assert shares[0] < 0.93, shares
     assert len(errors["motor lag"]) == 2
     assert np.all(np.abs(errors["motor lag"]) < 3), errors["motor lag"]
-
-
-@pytest.mark.slow("50 airframes; the test above does the same with four")
-@pytest.mark.parametrize("at_samples", [False, True])
-def test_errors_of_50_airframes_are_as_large_as_their_deviations(tmp_path, at_samples):
-    """Shares of all numbers, and of each parameter, within one, two and three deviations."""
-    errors = normalised_errors(tmp_path, 50, 60.0, 1, at_samples=at_samples, fits_both=True)
-    shares = shares_within(np.concatenate(list(errors.values())))
-    assert np.all(shares >= [0.68, 0.95, 0.997]), shares
-    for name, numbers in errors.items():
-        shares = shares_within(np.array(numbers))
-        assert np.all(shares[1:] >= [0.86, 0.95]), (name, shares)

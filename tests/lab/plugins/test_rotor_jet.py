@@ -8,7 +8,6 @@ from cases import with_states
 
 from crazysim import ConfigError, RotorJet, SharedLoad, Sim, SlungLoad
 from crazysim.geometry import Shape
-from crazysim.lab.plugins import rotor_jet
 from crazysim.lab.plugins.panels import shape_panels
 from crazysim.plugins.effects.downwash import hover_jet_speed
 from crazysim.plugins.payloads import Hook, JetTable, load_jet_table
@@ -109,14 +108,6 @@ def test_the_analytic_jet_has_the_speed_of_downwash():
     np.testing.assert_allclose(force[0, 0], [0, 0, -1.225 * speed**2 * 0.2 * 0.1], rtol=1e-5, atol=1e-6)
 
 
-def test_finer_panels_converge():
-    forces = []
-    for panel in (0.1, 0.02, 0.01):
-        sim, _ = build(panel=panel)
-        forces.append(np.asarray(jet_record(sim).force)[0, 0, 2])
-    assert abs(forces[1] - forces[2]) < 0.02 * abs(forces[2]) < abs(forces[0]) / 10
-
-
 def test_the_force_of_a_jet_accelerates_the_load():
     """A released load under a jet falls faster by F dt / m; the record holds the force of that step."""
     sim, plugin = build(table=pressure_table(400.0, 400.0))
@@ -151,17 +142,6 @@ def test_a_load_gets_the_jets_of_all_drones_above():
     force_of_own = np.asarray(jet_record(own_sim).force)[0, :, 2]
     assert force_of_all[0] < 1.1 * force_of_own[0] < 0
     np.testing.assert_allclose(force_of_all[1], force_of_own[1], rtol=1e-5)
-
-
-def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
-    ends = []
-    for max_values in (10**6, 1):
-        monkeypatch.setattr(rotor_jet, "MAX_FUSED_VALUES", max_values)
-        sim, _ = build(table=pressure_table(), n_drones=2, engine="auto")
-        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (max_values == 1)
-        sim.step(20)
-        ends.append(sim.data.plugins["load"].vel)
-    np.testing.assert_allclose(*ends, rtol=1e-4, atol=1e-5)
 
 
 def test_law_08_gradients_of_a_step_equal_central_differences(x64):

@@ -314,19 +314,3 @@ def test_mutated_json_is_loaded_or_refused(name, seed, value, remove):
     else:
         holder[path[-1]] = value
     load_or_refuse(skyc_files.pack_archive(files))
-
-
-@given(st.binary(max_size=300))
-def test_any_bytes_are_refused(content):
-    with pytest.raises(ConfigError):
-        parse_show(content)
-    with pytest.raises(ConfigError):
-        parse_show(skyc_files.pack_archive({"show.json": content}))
-
-
-def test_the_archive_reads_a_file_once():
-    archive = Archive(skyc_files.pack_archive(skyc_files.create_lab_show()), "a.skyc")
-    assert archive.json("cues.json") is archive.json("cues.json")
-    assert archive.resolve({"$ref": "./cues.json#"}, "x")[1] == "a.skyc: cues.json"
-    with pytest.raises(ConfigError, match="whole file"):
-        archive.resolve({"$ref": "./cues.json#/items"}, "x")

@@ -9,8 +9,6 @@ import time
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from live_loops import no_compilation
 from screens import screen_pixels, virtual_screen
 
@@ -64,16 +62,6 @@ def test_closest_approach_of_straight_lines():
     assert distance[0, 1] == distance[1, 0] == pytest.approx(0.3, abs=1e-6)
     assert when[0, 1] == pytest.approx(1.234, abs=1e-6)
     assert np.all(np.isinf(np.diag(distance)))
-
-
-@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(2, 5))
-def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
-    pos = np.random.default_rng(seed).normal(size=(n, n_drones, 3)).cumsum(axis=0)
-    distance, when = sampled_approaches(0.5 * np.arange(n), pos)
-    sample_distances = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
-    is_pair = ~np.eye(n_drones, dtype=bool)
-    assert np.all(distance[is_pair] <= sample_distances[is_pair] + 1e-12)
-    assert np.all((when >= 0) & (when <= 0.5 * (n - 1)))
 
 
 @pytest.fixture(scope="module")

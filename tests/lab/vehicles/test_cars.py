@@ -111,16 +111,6 @@ def test_references_by_arc_length_stop_at_the_end():
     assert abs(np.asarray(record.body_vel)[0, 0, 0]) < 0.02
 
 
-def test_external_forces_move_a_car():
-    sim, cars = build(1, in_scene=False)
-    record = cars.read(sim.data)
-    force = np.zeros(record.force.shape, np.float32)
-    force[..., 0] = 2.923
-    sim.data = cars.write(sim.data, record.replace(force=jnp.asarray(force)))
-    sim.step(10)
-    assert np.asarray(cars.read(sim.data).body_vel)[0, 0, 0] == pytest.approx(0.02 * 2.923 / 2.923, rel=0.15)
-
-
 def test_bicycles_are_driven_by_a_torque():
     """The acceleration is the torque over the radius, over mass and rotating inertia."""
     sim = Sim(control="rotor_vel")
@@ -195,11 +185,3 @@ def test_a_car_has_a_view_by_its_name():
     sim["Fleet1Tenth_1"].command([0.1, 0.2])
     np.testing.assert_allclose(np.asarray(cars.read(sim.data).command)[:, 1], [[0.1, 0.2]] * 2)
     np.testing.assert_array_equal(np.asarray(cars.read(sim.data).command)[:, 0], 0.0)
-
-
-@pytest.mark.parametrize("members", [1, 2])
-def test_every_car_has_an_index_and_a_start_of_its_own(members):
-    sim, cars = build(2, members=members, path=[EIGHT, EIGHT])
-    record = cars.read(sim.data)
-    for values in (record.index, record.start, record.arc):
-        assert values.shape == (2, members, 1)

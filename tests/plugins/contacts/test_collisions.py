@@ -3,11 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from cases import broadcast_like, with_params, with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError, ContactLog, ContactResponse, Hook, SharedLoad, Sim, SlungLoad
+from crazysim import ContactLog, ContactResponse, Hook, Sim, SlungLoad
 from crazysim.core.pipeline import remove_fn
 from crazysim.engine import Step
 
@@ -179,19 +178,6 @@ def test_a_load_hits_a_drone_head_on(x64):
     np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, :, 2], drone - 1.0, rtol=1e-6)
 
 
-def test_two_loads_head_on(x64):
-    """Released loads of different mass, along the line between them: speeds by hand."""
-    sim = remove_gravity(build(n_drones=2, engine="interpret"))
-    load = sim.add(SlungLoad(mass=[[0.1, 0.3]], size=RADIUS))
-    sim.add(ContactResponse(restitution=0.5, friction=0.0))
-    leave_out_drones(sim)
-    load_pos = [[[0, 0, 1.0], [0.1, 0, 1.0]]]
-    sim.data = with_load(load, load.release(sim.data), pos=load_pos, vel=[[[2.0, 0, 0], [0, 0, 0]]])
-    sim.step(25)
-    after = 2.0 * 0.1 * 1.5 / 0.4
-    np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
-
-
 def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(x64, rng):
     """Three released loads and three empty hooks overlap. The contact stage keeps momentum and adds no energy."""
     n = 60
@@ -262,29 +248,6 @@ def test_a_wall_that_stops_a_load_holds_back_the_drone():
     assert pos[0, 0, 0] - start[0, 0, 0] < 0.015
 
 
-def test_shared_loads_and_hooks_collide():
-    sim = remove_gravity(build(n_drones=2, integrator="symplectic_euler"))
-    load = sim.add(SharedLoad(mass=0.2, length=3.0, size=RADIUS))
-    load_pos = np.asarray(load.read(sim.data).pos)
-    sim.scene.add("sphere", pos=load_pos[0, 0] + [0.2, 0, 0], radius=0.1)
-    sim.add(ContactResponse(restitution=0.5, friction=0.0))
-    leave_out_drones(sim)
-    sim.data = with_load(load, load.release(sim.data), vel=[1.0, 0, 0])
-    sim.step(80)
-    np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, 0], [-0.5, 0, 0], atol=0.01)
-
-    sim = remove_gravity(build())
-    hook = sim.add(Hook(mass=0.2, damping=0.0, size=RADIUS, ring=0.05))
-    sim.scene.add("sphere", pos=np.asarray(hook.read(sim.data).pos)[0, 0] + [0.2, 0, -0.05], radius=0.1)
-    sim.add(ContactResponse(restitution=0.5, friction=0.0))
-    leave_out_drones(sim)
-    sim.data = with_load(hook, sim.data, vel=[1.0, 0, 0], tip_vel=[1.0, 0, 0])
-    sim.step(60)
-    record = hook.read(sim.data)
-    assert np.asarray(record.vel)[0, 0, 0] < -0.2
-    np.testing.assert_array_equal(record.tip_vel, record.vel)
-
-
 def test_the_log_has_the_step_in_which_a_load_touches():
     """Without gravity loads move into drones at a known speed: a contact is logged in the step of the first overlap."""
     sim = remove_gravity(build(2, 2))
@@ -305,16 +268,6 @@ def test_the_log_has_the_step_in_which_a_load_touches():
     sim.data = pole.set_pose(sim.data, np.asarray(sim.data.states.pos)[:, :1])
     sim.step()
     assert np.asarray(log.read(sim.data).objects)[0, 0, 2]
-
-
-def test_a_report_in_a_stage_needs_a_world():
-    sim = build()
-    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
-    sim.data = with_load(load, sim.data, pos=sim.data.states.pos)
-    contacts = sim.scene.contact_fn(floor=False, drones=False)
-    assert np.asarray(jax.jit(contacts)(sim.data).objects)[0, 0, 0]
-    with pytest.raises(ConfigError, match="expected the data of a world, got the data of one drone"):
-        contacts(sim.data.replace(states=jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)))
 
 
 def test_the_bounce_has_gradients(x64):

@@ -11,7 +11,6 @@ from pictures import encode_png
 from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, Sim, SlungLoad, Terrain, Wind
 from crazysim.core.integration import FLOOR_HEIGHT, Integrator
 from crazysim.core.pipeline import remove_fn
-from crazysim.plugins.contacts import terrain as terrain_module
 from crazysim.plugins.effects.ground import ground_at, ground_height
 
 SIZE = (4.0, 3.0)
@@ -174,19 +173,6 @@ def test_ground_effect_and_wind_use_the_height_above_ground():
         vels.append(np.asarray(s.data.states.vel))
     np.testing.assert_allclose(vels[0], vels[1], rtol=1e-4, atol=1e-6)
     assert abs(vels[0][..., 0]).min() > 1e-3
-
-
-def test_large_tables_of_heights_are_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
-    ends = []
-    for max_values in (10**6, 1):
-        monkeypatch.setattr(terrain_module, "MAX_FUSED_VALUES", max_values)
-        sim, _ = build(n_worlds=3, pos=(0.3, 0.2, 0.62))
-        assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (max_values == 1)
-        sim.data = with_states(sim.data, vel=[0.5, 0.2, -0.5])
-        sim.step(60)
-        ends.append(np.asarray(sim.data.states.pos))
-    np.testing.assert_allclose(*ends, rtol=1e-5, atol=1e-6)
-    assert ends[0][..., 2].max() < 0.7
 
 
 def test_the_upper_edge_of_an_image_is_at_the_largest_y(tmp_path):

@@ -123,16 +123,6 @@ def test_drones_of_a_fleet_have_their_own_batteries():
     np.testing.assert_allclose(np.ravel(record(sim).full_speed_voltage[1]), [3.1257, 4 * 3.7], atol=1e-4)
 
 
-def test_above_full_speed_voltage_nothing_is_limited():
-    strong = build(resistance=1e-3, full_speed_voltage=3.0)
-    plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
-    plain.data = strong.data.replace(plugins={})
-    for sim in (strong, plain):
-        sim.rotor_vel_control(np.full((2, 2, 4), 30000.0))
-        sim.step(50)
-    np.testing.assert_allclose(strong.data.states.rotor_vel, plain.data.states.rotor_vel, rtol=1e-6)
-
-
 def test_an_empty_battery_turns_no_rotor_and_a_reset_fills_it():
     """2 A for 2 s from 0.0002 A h: empty, no current, rotors run down; the other battery flies on."""
     sim = build(capacity=[[2e-4, 0.25], [0.25, 0.25]])

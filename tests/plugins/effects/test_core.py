@@ -23,7 +23,6 @@ from crazysim import (
     MotorFailure,
     Sim,
     Wind,
-    load_airframe,
 )
 from crazysim.core.pipeline import replace_fn
 from crazysim.engine.pytree import scopes
@@ -82,23 +81,6 @@ def test_effects_without_strength_change_nothing():
 def signature(tree):
     """Return structure, shapes and types of a tree."""
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
-
-
-def test_law_02_a_step_keeps_shapes_and_types_for_six_rotors():
-    tables = dict(load_airframe("cf21B_500").tables)
-    angle = np.arange(6) * np.pi / 3
-    rotors = {
-        "position": 0.05 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1),
-        "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
-    }
-    hexacopter = tables | {"rotors": dict(tables["rotors"]) | rotors}
-    sim = Sim(1, 3, drone=hexacopter, control="rotor_vel", engine="lanes")
-    add_effects(sim)
-    after = jax.eval_shape(lambda d: sim.step_fn(d, 1), sim.data)
-    assert signature(after) == signature(sim.data)
-    for scope, x in zip(*map(jax.tree.leaves, (scopes(sim.data.plugins), sim.data.plugins)), strict=True):
-        assert scope in ("drone", "shared")
-        assert scope == "shared" or x.shape[:2] == (1, 3)
 
 
 def test_float64_stays_float64(x64):
@@ -217,21 +199,3 @@ def test_law_09_effects_need_the_built_in_integration():
         sim.add(Wind((1.0, 0, 0)))
     assert not sim.data.plugins
     assert not sim.plugins
-
-
-def test_default_data_get_the_record_and_nothing_else():
-    """An effect that is added in flight does not change the states that resets return to."""
-    sim = make_hovering_sim()
-    sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
-    sim.step(3)
-    default = sim.default_data
-    add_effects(sim)
-    assert trees_equal(sim.default_data.replace(plugins={}), default)
-    assert (
-        set(sim.default_data.plugins)
-        == set(sim.plugins)
-        == {effect(**kwargs).name for effect, kwargs in EFFECTS.items()}
-    )
-    sent = np.asarray(sim.data.controls.attitude.staged_cmd)
-    np.testing.assert_array_equal(sim.data.plugins["latency"].arrived, sent)
-    np.testing.assert_array_equal(sim.default_data.plugins["latency"].arrived, 0 * sent)

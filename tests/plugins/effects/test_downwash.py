@@ -108,11 +108,6 @@ def test_the_drag_pushes_the_lower_drone_down_and_the_force_of_the_user_stays(si
     np.testing.assert_array_equal(states.force, np.broadcast_to(np.float32([0.1, 0, 0]), (4, 3, 3)))
 
 
-def test_stopped_rotors_have_no_jet(sim):
-    data = with_states(sim.data, rotor_vel=0.0)
-    np.testing.assert_array_equal(air_velocity(sim, data), 0.0)
-
-
 def test_the_jet_is_the_same_in_a_mirrored_or_turned_world(sim, rng):
     """The air has the same speeds where positions are turned about the vertical or mirrored: the jet is round."""
     pos = rng.uniform(-0.3, 0.3, (4, 3, 3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.plugins.effects.grid import interpolate, is_inside, load_wind_grid
+from crazysim.plugins.effects.grid import interpolate, load_wind_grid
 
 
 def test_interpolation_is_that_of_numpy_axis_by_axis(rng):
@@ -20,12 +20,6 @@ def test_interpolation_is_that_of_numpy_axis_by_axis(rng):
         expected.append(np.interp(p[2], np.arange(3), line))
     result = jax.jit(interpolate)(np.float32(values), np.float32(points))
     np.testing.assert_allclose(result, expected, atol=3e-6)  # float32, eight products
-
-
-def test_vectors_and_axes_of_one_node(rng):
-    values = rng.normal(size=(1, 4, 1, 3))
-    result = jax.jit(interpolate)(values, np.array([[0.3, 1.25, -2.0], [0.0, 3.0, 0.0]]))
-    np.testing.assert_allclose(result, [0.75 * values[0, 1, 0] + 0.25 * values[0, 2, 0], values[0, 3, 0]], rtol=1e-6)
 
 
 def test_law_08_gradients_are_the_slopes_of_the_cell_and_zero_outside(x64, rng):
@@ -43,12 +37,6 @@ def test_law_08_gradients_are_the_slopes_of_the_cell_and_zero_outside(x64, rng):
 def test_law_07_positions_that_are_not_finite_read_no_memory_beyond_the_grid(y):
     result = jax.jit(interpolate)(np.ones((3, 3, 3)), np.array([1.0, y, 1.0]))
     np.testing.assert_array_equal(result, np.nan if np.isnan(y) else 1.0)
-
-
-def test_inside_is_the_box_of_the_nodes():
-    points = np.array([[0, 0, 0], [2, 1, 3], [2.01, 0, 0], [0, -0.01, 0], [np.nan, 0, 0]])
-    inside = jax.jit(lambda points: is_inside((3, 2, 4), points))
-    np.testing.assert_array_equal(inside(points), [True, True, False, False, False])
 
 
 def write_flow(path, header, rows):

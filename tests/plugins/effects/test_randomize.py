@@ -5,14 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
-from jax import Array
 from sweep import RANGES
 
-from crazysim import IMU, Battery, ConfigError, Latency, Randomize, RotorAerodynamics, Sim, Wind
+from crazysim import IMU, Battery, ConfigError, Latency, Randomize, Sim, Wind
 from crazysim.core.pipeline import append_fn
-from crazysim.core.plugin import Param, Plugin, param, state
 from crazysim.engine.stage import stage
-from crazysim.envs import AutoReset, make
 from crazysim.plugins.effects.battery import open_circuit_voltage
 from crazysim.plugins.estimators import ESKF
 from crazysim.plugins.sensors import TimeOfFlight
@@ -117,28 +114,6 @@ def test_presets_fly_and_accept_changes():
     assert Randomize.crazyflie(mass=(1.0, 1.1)).mass == (1.0, 1.1)
 
 
-def test_a_task_draws_new_drones_in_every_episode():
-    env = AutoReset(make("hover", 4, randomize="crazyflie", seconds=0.1))
-    assert "splits the step" not in env.explain(), "draws at resets are fused too"
-    assert "randomize_begin" not in [s.__name__ for s in env.step_fn.stages], "and nothing is drawn again in a step"
-    state = jax.jit(env.reset)(jax.random.key(0))
-    step, factors_by_step = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
-    for _ in range(8):
-        state = step(state, jnp.zeros_like(state.action))
-        factors_by_step.append(np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0])
-    np.testing.assert_array_equal(factors_by_step[0], factors_by_step[1])
-    assert len(np.unique(factors_by_step[0])) == 4
-    assert np.all(factors_by_step[-1] != factors_by_step[0])
-
-
-def test_numbers_of_a_sensor_are_drawn_without_rotors():
-    fitted = Sim(2, dynamics="so_rpy", engine="interpret", plugins=[IMU.crazyflie()])
-    drawn = fitted.add(Randomize({"plugins.imu.accel.noise": (0.5, 2.0)}))
-    fitted.reset()
-    fitted.step()
-    assert np.ptp(drawn.read(fitted.data).path_factors) > 0
-
-
 def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
     """Factors are constant in a call, except if a stage begins an episode within it."""
 
@@ -191,20 +166,6 @@ def test_factors_are_drawn_at_the_reset():
     assert np.all(again[1] != observations_by_count[1]["randomize.factors"][1])
     sim.remove(plugin)
     assert list(sim.reset_pipeline) == ["reset"]
-
-
-def test_a_factor_of_the_drag_acts_on_rotor_aerodynamics():
-    """A factor of two acts as twice the coefficient of rotor drag, whose moment tips the drone back."""
-    velocities = []
-    for factor, drag in ((2.0, 1e-6), (1.0, 2e-6)):
-        sim, _ = build(1, 1, drag=(factor, factor))
-        sim.add(RotorAerodynamics(drag=drag, inflow=0.0))
-        sim.data = with_states(sim.data, vel=[2.0, 0, 0])
-        sim.rotor_vel_control(sim.data.states.rotor_vel)
-        sim.step(10)
-        velocities.append(np.concatenate([sim.data.states.vel[0, 0], sim.data.states.ang_vel[0, 0]]))
-    assert velocities[0][0] < 2.0 - 1e-4
-    np.testing.assert_allclose(velocities[0], velocities[1], rtol=1e-5, atol=1e-6)
 
 
 PATHS = {
@@ -294,29 +255,6 @@ def test_law_10_numbers_of_a_path_do_not_depend_on_other_paths_or_worlds():
     np.testing.assert_array_equal(factors[:2], one_path.data.plugins["randomize"].path_factors[..., 0])
     observed = all_paths.plugins.observations(all_paths.data)["randomize.path_factors"]
     np.testing.assert_array_equal(observed, all_paths.data.plugins["randomize"].path_factors)
-
-
-def test_episodes_begin_with_drawn_numbers():
-    """Numbers are drawn before all plugins begin an episode, whichever was added first."""
-
-    class Start(Plugin):
-        height: Param = param(default=2.0)
-        start: Array = state()
-        name: str = "start"
-
-        def reset_episode(self, data):
-            return self.write(data, self.replace(start=self.height))
-
-    sim = Sim(3, 2, engine="interpret")
-    start = sim.add(Start())
-    plugin = sim.add(Randomize({"plugins.start.height": 0.5}))
-    for _ in range(2):
-        sim.reset()
-        height = 2.0 * np.asarray(plugin.read(sim.data).path_factors)
-        np.testing.assert_allclose(start.read(sim.data).start, height, rtol=1e-6)
-        sim.step()
-        np.testing.assert_allclose(start.read(sim.data).start, height, rtol=1e-6)
-    assert np.unique(height).size == 6
 
 
 def test_factors_survive_other_numbers_and_edits_of_the_scene():

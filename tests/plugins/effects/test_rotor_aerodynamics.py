@@ -8,7 +8,7 @@ import pytest
 from cases import hover_rotor_state, vectors, with_states
 from hypothesis import given
 
-from crazysim import RotorAerodynamics, Sim, Wind, load_airframe
+from crazysim import RotorAerodynamics, Sim, load_airframe
 from crazysim.dynamics import inflow
 
 R, RHO = 0.0275, 1.225
@@ -182,18 +182,6 @@ def test_the_wrench_is_that_of_rotorpy_where_both_models_are_linear(crazyflie_20
     np.testing.assert_allclose(ours[:, 2], force[:, 2], rtol=0.03)
     np.testing.assert_allclose(moment - flapping, torque + flapping, rtol=0.04, atol=1e-8)
     assert np.abs(flapping[1:, :2] / torque[1:, :2]).max() > 0.1
-
-
-def test_wind_acts_as_the_opposite_velocity_of_the_drone(quad):
-    """In wind, a drone at rest has the drag and the change of thrust of one that flies with the opposite velocity."""
-    air = np.array([3.0, -1.0, 0.5])
-    calm, plugin = quad
-    windy, in_wind = hover()
-    windy.add(Wind(air))
-    force, torque = wrench(calm, plugin, vel=-air)
-    force_in_wind, torque_in_wind = wrench(windy, in_wind)
-    np.testing.assert_allclose(force_in_wind[0], force[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(torque_in_wind[0], torque[0], rtol=1e-4, atol=1e-9)
 
 
 def test_a_drone_tips_back_in_forward_flight_and_is_lifted_below_a_ceiling():

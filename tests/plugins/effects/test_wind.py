@@ -43,15 +43,6 @@ def test_a_steady_wind_pushes_with_the_drag_by_hand(steady_wind_sim):
     sim.data = before
 
 
-def test_a_drone_that_drifts_with_the_wind_has_no_drag(steady_wind_sim):
-    sim, before = steady_wind_sim, steady_wind_sim.data
-    sim.data = with_states(sim.data, vel=np.asarray(sim.data.plugins["wind"].velocity))
-    sim.step()
-    fall = np.asarray(sim.data.plugins["wind"].velocity) - [0, 0, DT * 9.81]
-    np.testing.assert_allclose(sim.data.states.vel, fall, rtol=1e-6, atol=1e-8)  # float32
-    sim.data = before
-
-
 N, LAGS = 32768, (0, 8, 20, 40)
 """Number of worlds, and lags of the samples of their gusts, steps."""
 WIND = np.array([12.0, 16.0, 0.0])

@@ -52,19 +52,6 @@ def test_displacements_are_drawn_for_each_world_and_episode():
     assert not np.isclose(redrawn[0], shift[0]).all(axis=-1).any()
 
 
-def test_displacements_follow_the_setting_spread():
-    sim = build()
-    for spread in ((1.0, 2.0, 0.0), None):
-        before = [*sim.step_pipeline]
-        sim.replace(WindField(SHEAR, spread=spread))
-        has_shift = spread is not None
-        assert ("wind_field" in sim.reset_pipeline) == ("wind_field_begin" in sim.step_pipeline) == has_shift
-        assert len(sim.step_pipeline) == len(before) + (1 if has_shift else -1)
-        sim.reset()
-        assert (sim.data.plugins["wind_field"].shift is not None) == has_shift
-        assert not has_shift or np.ptp(np.asarray(sim.data.plugins["wind_field"].shift)[:, 0, 0]) > 0
-
-
 def test_loads_feel_the_air_at_their_own_positions():
     """A load 1.6 m below drones at 3 m is at 1.4 m, in (0.8, 0, 0.4) m/s, and drones in (4, 0, 2)."""
     sim = build()

@@ -109,19 +109,6 @@ def test_slack_and_released_cables_do_not_pull(x64):
     np.testing.assert_allclose(moved[2, :2], 0, atol=1e-12)
 
 
-def test_a_load_falls_with_the_mean_gravity_of_its_drones(x64):
-    sim, load = build(2, "symplectic_euler", "interpret")
-    gravity = np.zeros((1, 2, 3))
-    gravity[0, :, 2] = [-8.0, -10.0]
-    sim.data = with_params(sim.data, gravity_vec=gravity)
-    sim.data = load.release(sim.data)
-    start = np.asarray(load.read(sim.data).vel)
-    sim.step(10)
-    np.testing.assert_allclose(
-        (np.asarray(load.read(sim.data).vel) - start)[0, 0], [0, 0, -9.0 * 10 / 500], rtol=1e-9, atol=1e-12
-    )
-
-
 def test_a_shared_load_is_fused_and_drawn():
     sim = Sim(2, 3, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler", strict=True)
     load = sim.add(SharedLoad(mass=0.3))

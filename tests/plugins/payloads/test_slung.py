@@ -70,21 +70,6 @@ def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
     assert np.abs(length - 0.4).max() < 1e-4
 
 
-def test_law_08_energy_below_a_joint_off_the_centre_grows_with_the_step(x64):
-    """Euler in free fall for 10 s: the error of the energy is of order 1, below 1% at 500 Hz for swings of 1 m/s."""
-    growth = []
-    for freq in (500, 2000):
-        sim = build(8, freq=freq, height=1000.0)
-        load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
-        sim.data = with_load(load, sim.data, vel=np.random.default_rng(0).normal(size=(8, 1, 3)))
-        sim.step(freq // 10)
-        start = relative_energy(load, sim.data)
-        sim.step(10 * freq)
-        growth.append(np.max(relative_energy(load, sim.data) / start - 1))
-    assert growth[0] < 0.01
-    assert growth[0] / growth[1] == pytest.approx(4, rel=0.2)
-
-
 @pytest.mark.parametrize(("integrator", "cable"), [*((integrator, False) for integrator in INTEGRATORS), ("rk4", True)])
 def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
     """A pendulum below a hovering body of 1e9 kg: 60 s at 500 Hz in float32, with amplitudes up to 2.5 rad."""
@@ -221,17 +206,6 @@ def test_a_released_load_comes_to_rest_on_the_floor(x64):
     assert 0.1 < pos[0] < 0.3  # it fell for 0.34 s at 0.5 m/s, and friction stopped it
 
 
-def test_direction_and_its_rate(x64):
-    sim = build()
-    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
-    sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
-    sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
-    q, rate = (np.asarray(x) for x in jax.jit(direction)(sim.data))
-    np.testing.assert_allclose(q[0, 0], [0, 0, -1], atol=1e-12)
-    lever = np.cross([1.0, 2.0, 3.0], OFFSET)
-    np.testing.assert_allclose(rate[0, 0], (np.array([0.3, 0.2, 0]) - lever * [1, 1, 0]) / 0.4, atol=1e-12)
-
-
 def test_wind_and_downwash_push_the_load():
     sim = build(drone="cf21B_500", height=2.0)
     load = sim.add(SlungLoad(mass=0.01, drag=0.01, in_scene=False))
@@ -265,16 +239,12 @@ def test_loads_are_objects_of_the_scene():
     np.testing.assert_allclose(sim.mj_data.mocap_pos[body], np.asarray(load.read(sim.data).pos)[1, 0], atol=1e-6)
 
 
-def test_zeros_of_an_attachment_cost_no_operations_until_they_change():
+def test_direction_and_its_rate(x64):
     sim = build()
-    load = SlungLoad(mass=LOAD, attach=(0.0, 0.0, -0.03), in_scene=False)
-    sim.add(load)
-
-    def n_operations():
-        return sum(s.n_operations for s in sim.step_fn.plan(sim.data).program.fused_segments)
-
-    n_with_zeros = n_operations()
-    sim.data = with_load(load, sim.data, attach=(0.0, 0.0, -0.02))
-    assert n_operations() == n_with_zeros
-    sim.data = with_load(load, sim.data, attach=OFFSET)
-    assert n_operations() > n_with_zeros + 40
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
+    sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
+    sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
+    q, rate = (np.asarray(x) for x in jax.jit(direction)(sim.data))
+    np.testing.assert_allclose(q[0, 0], [0, 0, -1], atol=1e-12)
+    lever = np.cross([1.0, 2.0, 3.0], OFFSET)
+    np.testing.assert_allclose(rate[0, 0], (np.array([0.3, 0.2, 0]) - lever * [1, 1, 0]) / 0.4, atol=1e-12)

@@ -8,10 +8,7 @@ import pytest
 from cases import with_states
 from scipy import ndimage
 
-from crazysim import ConfigError, Forest, Sim, StagePlacement, stage
-from crazysim.core.plugin import FunctionPlugin
-from crazysim.engine.pytree import PyTree, leaf
-from crazysim.envs import AutoReset, Task, flying, make
+from crazysim import Forest, Sim
 
 SMALL_FOREST = {"size": (20.0, 16.0), "center": (4.0, -2.0), "free": [[4.0, -2.0, 2.0]]}
 """Settings of a forest of 20 cells with a free disc in its middle."""
@@ -55,13 +52,6 @@ def test_trees_stand_in_their_cells_at_the_requested_density():
     assert np.abs(scaled.mean(axis=(0, 1))).max() < 0.05
     np.testing.assert_allclose(np.std(scaled[..., 0]), 1 / np.sqrt(3), rtol=0.02)  # of a uniform distribution
     assert abs(np.corrcoef(scaled[:, 0, 0], scaled[:, 1, 0])[0, 1]) < 0.25
-
-
-def test_worlds_that_were_not_reset_draw_in_their_first_step():
-    sim = Sim(3, control="rotor_vel", rng_key=5)
-    forest = sim.add(Forest(**SMALL_FOREST))
-    sim.step(2)
-    assert len(np.unique(forest.read(sim.data).words[..., 0])) == 3
 
 
 def test_clearance_points_away_from_the_nearest_tree(half_forest):
@@ -143,83 +133,3 @@ def test_rays_meet_the_trees_of_each_world(half_forest):
                 n_trees += model.geom_type[geom[0]] == mujoco.mjtGeom.mjGEOM_CYLINDER
                 assert d == pytest.approx(expected, abs=1e-4)
     assert n_trees > 5
-
-
-class Gap(PyTree):
-    """Distance of each drone to the nearest tree."""
-
-    value: jax.Array = leaf("drone", 0)
-
-
-def test_a_stage_of_one_drone_can_compute_the_clearance():
-    sim = Sim(3, 2, control="rotor_vel", rng_key=5, engine="fused")
-    forest = sim.add(Forest(**SMALL_FOREST))
-    sim.reset()
-    sim.data = with_states(sim.data, pos=np.random.default_rng(2).uniform([-4, -8, 1], [12, 4, 3], (3, 2, 3)))
-
-    @stage("drone")
-    def measure_gap(data):
-        return data.replace(
-            plugins=data.plugins | {"gap": data.plugins["gap"].replace(value=forest.clearance(data, data.states.pos))}
-        )
-
-    sim.add(FunctionPlugin("gap", Gap(jnp.zeros((3, 2))), [StagePlacement(measure_gap, before="increment_steps")]))
-    expected = np.asarray(forest.clearance(sim.data, sim.data.states.pos))
-    sim.step()
-    assert expected.min() < 3.9
-    np.testing.assert_allclose(sim.data.plugins["gap"].value, expected, atol=0.02)
-
-
-class Wander(Task):
-    """Stay away from trees, which are drawn at the start of an episode."""
-
-    name = "wander"
-    forest = Forest(size=(40.0, 40.0))
-
-    def install(self, sim):
-        sim.add(self.forest)
-
-    def spawn(self, data, key):
-        return flying(self.forest.sample_layout(data, key, jnp.float32(0.75)), jnp.float32([[0, 0, 1.0]]))
-
-    def observe(self, data):
-        return {"gap": self.forest.clearance(data, data.states.pos)[:, None]}
-
-    def rewards(self, data, action, last_action):
-        return {"gap": self.forest.clearance(data, data.states.pos)}
-
-    def terminated(self, data):
-        return jnp.array(False)
-
-    def error(self, data):
-        return self.forest.clearance(data, data.states.pos)
-
-
-@pytest.mark.long("compiles an environment with a task of its own")
-def test_a_task_places_a_forest_in_its_episodes():
-    env = AutoReset(make(Wander(seconds=0.1), n_worlds=4))
-    state = jax.jit(env.reset)(jax.random.key(2))
-    words = np.asarray(state.full_data.plugins["forest"].words)
-    assert len(np.unique(words[..., 0])) == 4
-    step = jax.jit(env.step)
-    n_changes = 0
-    for _ in range(12):
-        state = step(state, jnp.zeros((4, 1, 4)))
-        record = state.full_data.plugins["forest"]
-        n_changes += np.any(np.asarray(record.words) != words)
-        words = np.asarray(record.words)
-        forest = Wander().forest
-        np.testing.assert_allclose(
-            np.asarray(state.obs["gap"])[..., 0],
-            forest.clearance(state.full_data, state.full_data.states.pos),
-            atol=1e-5,
-        )
-    assert 1 <= n_changes <= 3
-    np.testing.assert_array_equal(record.difficulty, 0.75)
-    assert "splits the step" not in env.explain()
-
-
-def test_a_forest_with_other_trees_needs_another_name(half_forest):
-    sim, _ = half_forest
-    with pytest.raises(ConfigError, match="use another name="):
-        sim.replace(Forest(**SMALL_FOREST | {"radii": (0.2, 0.4)}))

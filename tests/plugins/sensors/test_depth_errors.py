@@ -164,24 +164,3 @@ def test_engines_agree_on_the_images_of_a_step():
     np.testing.assert_array_equal(result[0]["segmentation"], result[1]["segmentation"])
     np.testing.assert_allclose(result[0]["depth"], result[1]["depth"], atol=1e-3)  # a step of the resolution
     assert np.mean(result[0]["depth"] == result[1]["depth"]) > 0.9
-
-
-def test_a_camera_sees_nothing_in_an_empty_scene_and_the_inside_of_a_geom_around_it(tmp_path):
-    path = tmp_path / "empty.xml"
-    path.write_text("<mujoco><worldbody/></mujoco>")
-    sim = Sim(xml_path=path, control="attitude")
-    camera = Camera(4, 3, outputs=("depth", "normal", "segmentation"), noise=StereoNoise(), max_depth=7.0)
-    images = jax.jit(camera.image_fn(sim))(sim.data)
-    assert (np.asarray(images["depth"]) == 7).all()
-    assert (np.asarray(images["segmentation"]) == -1).all()
-    assert not np.asarray(images["normal"]).any()
-    sim.scene.add("sphere", pos=[0.03, 0, 0], radius=1.0, mocap=False)  # around the camera
-    inner = Camera(4, 3, outputs=("distance", "normal"))
-    images = jax.device_get(jax.jit(inner.image_fn(sim))(sim.data))
-    np.testing.assert_allclose(images["distance"], 1.0, rtol=1e-5)
-    np.testing.assert_allclose(images["normal"][0, 0], inner.rays, atol=1e-5)  # away from the camera
-    sim.scene.sync_one(sim.data, 0)
-    far = mujoco.mj_ray(
-        sim.mj_model, sim.mj_data, [0.03, 0, 0], inner.rays[0, 0], None, 1, 1, np.zeros(1, np.int32), None
-    )
-    assert far == pytest.approx(1.0, rel=1e-5)
