@@ -12,7 +12,7 @@ from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
 from crazysim.lab.control.linear_models import linearize, load_derivative
 from crazysim.lab.control.load_lqr import LoadLQR, load_gain, load_lqr_control
-from crazysim.lab.control.lqr import LQR, flat_reference, hover_gain, lqr_control, state_error, weight_matrix
+from crazysim.lab.control.lqr import LQR, flat_reference, hover_gain, lqr_control, state_error
 from crazysim.lab.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
