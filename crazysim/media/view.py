@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_settings, color, positive_integer, setting
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, expect, require
-from crazysim.media.top_view import TopView
+from crazysim.media.top_view import PATH_SECONDS, draw_map
 from crazysim.media.trail import Trail, choose_drone_colors
 from crazysim.media.worlds import world_indices
 from crazysim.sim.sim import Sim
@@ -80,7 +80,7 @@ class View:
     border: int = setting(default=2, low=0)
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
-    _top_view: TopView | None = field(default=None, init=False, repr=False)
+    _paths: Trail | None = field(default=None, init=False, repr=False)
     _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
     """Time of the last image, s, and aim of its camera: a point and for ``hold`` a distance, by index in ``worlds``."""
 
@@ -111,7 +111,7 @@ class View:
         if self.trail != 0:
             self._trail = Trail(self.trail)
         if self.top_view:
-            self._top_view = TopView()
+            self._paths = Trail(PATH_SECONDS)
         _format_text(self.text, 0, 0.0)
 
     @property
@@ -158,9 +158,9 @@ class View:
                     self._draw_rings(sim, pos[k], config)
                 tile = image[self.tile(k)]
                 tile[:] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
-                if self._top_view is not None:
-                    top_view = self._top_view.draw(sim, k, width // 2, 3 * height // 8, self.rgba)
-                    _draw_top_view(tile, top_view)
+                if self._paths is not None:
+                    path = self._paths.path(k)
+                    _draw_top_view(tile, draw_map(sim, world, path, width // 2, 3 * height // 8, self.rgba))
                 if self.inset is not None:
                     _draw_inset(tile, self.inset(sim, world))
         except Exception:
@@ -192,8 +192,8 @@ class View:
         )
         if self._trail is not None:
             self._trail.add(time, pos)
-        if self._top_view is not None:
-            self._top_view.paths.add(time, pos)
+        if self._paths is not None:
+            self._paths.add(time, pos)
         return time, pos
 
     def _draw(self, sim: Sim, k: int, time: float) -> None:
