@@ -20,7 +20,7 @@ BUDGET = {
     "envs": 3238,
     "geometry": 1089,
     "lab": 14749,
-    "media": 1115,
+    "media": 1070,
     "plugins": 5605,
     "scene": 2576,
     "sim": 895,
