@@ -18,7 +18,7 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(call tests_of,engine,gradient_kernels interpret ir jaxcompat passes plan pytree record rules) \
   $(call tests_of,engine,simplify step symbolic) \
   $(call tests_of,envs,actions brax contract pettingzoo task vector wrappers) \
-  $(call tests_of,geometry,heightfield manifold rays shapes) \
+  $(call tests_of,geometry,heightfield rays shapes) tests/lab/bodies/test_manifold.py \
   $(call tests_of,scene,build contact_report contacts sync) \
   tests/trajectories/test_formation.py
 # What a new JAX can break: derivatives, tracing, lowering, devices and the cache of programs.

@@ -25,15 +25,15 @@ from crazysim.startup import __version__
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
+    from crazysim.lab.bodies.drone_collisions import DroneCollisions
+    from crazysim.lab.bodies.free_bodies import FreeBodies
     from crazysim.lab.control.mppi import MPPI
     from crazysim.lab.estimators.eskf import ESKF
     from crazysim.lab.plugins.radar import Radar
     from crazysim.lab.plugins.rotor_jet import RotorJet
     from crazysim.lab.scene.splats import SplatScene
     from crazysim.lab.vehicles.cars import Bicycles, Cars
-    from crazysim.plugins.bodies import FreeBodies
     from crazysim.plugins.contacts.contact_log import ContactLog
-    from crazysim.plugins.contacts.drone_collisions import DroneCollisions
     from crazysim.plugins.contacts.response import ContactResponse
     from crazysim.plugins.contacts.terrain import Terrain
     from crazysim.plugins.effects import (

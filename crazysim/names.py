@@ -20,13 +20,13 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim": {
         "crazysim.core": "functional",
         "crazysim.envs": "make",
+        "crazysim.lab.bodies.drone_collisions": "DroneCollisions",
+        "crazysim.lab.bodies.free_bodies": "FreeBodies",
         "crazysim.lab.control.mppi": "MPPI",
         "crazysim.lab.plugins.rotor_jet": "RotorJet",
         "crazysim.lab.plugins.radar": "Radar",
         "crazysim.lab.vehicles.cars": "Bicycles Cars",
-        "crazysim.plugins.bodies": "FreeBodies",
         "crazysim.plugins.contacts.contact_log": "ContactLog",
-        "crazysim.plugins.contacts.drone_collisions": "DroneCollisions",
         "crazysim.plugins.contacts.response": "ContactResponse",
         "crazysim.plugins.contacts.terrain": "Terrain",
         "crazysim.plugins.effects": "Battery Downwash GroundEffect Latency MotorFailure Randomize Residual "
@@ -58,6 +58,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.envs.pettingzoo": "make_parallel",
         "crazysim.envs.sb3": "DroneVecEnv",
     },
+    "crazysim.plugins.bodies": {"crazysim.lab.bodies.free_bodies": "FreeBodies FreeBodiesData"},
     "crazysim.plugins.estimators": {
         "crazysim.lab.estimators.complementary": "Complementary",
         "crazysim.lab.estimators.eskf": "ESKF",

@@ -13,6 +13,7 @@ import pytest
 import sweep
 from cases import COMPILED_ENGINES
 
+import crazysim.lab.bodies
 import crazysim.lab.estimators
 import crazysim.lab.plugins
 import crazysim.lab.vehicles
@@ -128,7 +129,7 @@ def test_every_plugin_and_controller_is_in_the_sweep():
     swept = {type(plugin) for factory in sweep.PLUGINS.values() for plugin in factory()}
     found = [
         m
-        for x in (plugins, crazysim.lab.estimators, crazysim.lab.plugins, crazysim.lab.vehicles)
+        for x in (plugins, crazysim.lab.bodies, crazysim.lab.estimators, crazysim.lab.plugins, crazysim.lab.vehicles)
         for m in pkgutil.walk_packages(x.__path__, f"{x.__name__}.")
     ]
     modules = [importlib.import_module(module.name) for module in found]

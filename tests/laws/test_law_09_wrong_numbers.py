@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import crazysim.envs.tasks
+import crazysim.lab.bodies
 import crazysim.lab.estimators
 import crazysim.lab.plugins
 import crazysim.lab.tasks
@@ -109,7 +110,7 @@ def concrete_classes(base, *packages):
 
 
 PLUGINS = concrete_classes(
-    Plugin, crazysim.plugins, crazysim.lab.estimators, crazysim.lab.plugins, crazysim.lab.vehicles
+    Plugin, crazysim.plugins, crazysim.lab.bodies, crazysim.lab.estimators, crazysim.lab.plugins, crazysim.lab.vehicles
 )
 TASKS = concrete_classes(Task, crazysim.envs.tasks, crazysim.lab.tasks)
 OTHER_CLASSES = [

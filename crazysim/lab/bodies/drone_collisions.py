@@ -16,16 +16,16 @@ from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, c
 from crazysim.engine.pytree import device_array
 from crazysim.engine.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
-from crazysim.geometry.manifold import N_BOX_POINTS
-from crazysim.plugins.contacts.pairs import Solids, contacts_between, join_contacts
-from crazysim.plugins.contacts.rigid_bodies import (
+from crazysim.lab.bodies.manifold import N_BOX_POINTS
+from crazysim.lab.bodies.pairs import Solids, contacts_between, join_contacts
+from crazysim.lab.bodies.rigid_bodies import (
     drone_box_extents,
     drones_as_bodies,
     drones_as_boxes,
     require_few_contacts,
     states_after_contact,
 )
-from crazysim.plugins.contacts.solver import Impulses, solve_contacts
+from crazysim.lab.bodies.solver import Impulses, solve_contacts
 
 
 class DroneCollisions(Plugin):

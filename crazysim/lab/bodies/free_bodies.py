@@ -22,7 +22,7 @@ from crazysim.engine.pytree import device_array, host_array
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
-from crazysim.plugins.contacts.rigid_bodies import BodyContacts, require_few_contacts
+from crazysim.lab.bodies.rigid_bodies import BodyContacts, require_few_contacts
 from crazysim.plugins.effects.ground import HeightField
 from crazysim.plugins.payloads.colliders import load_shape
 from crazysim.scene.contact_report import ObjectSelection

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from oracle import normalize, rotations
 
-from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
+from crazysim.lab.bodies import manifold
 
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
 """Half sizes of the two boxes, m."""

@@ -18,10 +18,9 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import ConfigError
-from crazysim.geometry.manifold import N_BOX_POINTS
 from crazysim.geometry.small_matrices import matmul, matvec
-from crazysim.plugins.contacts.contact_points import Carrier, find_carriers
-from crazysim.plugins.contacts.pairs import (
+from crazysim.lab.bodies.manifold import N_BOX_POINTS
+from crazysim.lab.bodies.pairs import (
     CORNERS,
     PairContacts,
     Solids,
@@ -30,7 +29,8 @@ from crazysim.plugins.contacts.pairs import (
     contacts_on_surface,
     join_contacts,
 )
-from crazysim.plugins.contacts.solver import Bodies, Impulses, SolvedBodies, solve_contacts
+from crazysim.lab.bodies.solver import Bodies, Impulses, SolvedBodies, solve_contacts
+from crazysim.plugins.contacts.contact_points import Carrier, find_carriers
 from crazysim.plugins.effects.ground import HeightField
 from crazysim.scene.collision import CollisionGeom
 

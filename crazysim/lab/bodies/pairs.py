@@ -12,9 +12,9 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.geometry import Shape, distance, point_distance
-from crazysim.geometry.manifold import Manifold, ball_box_contacts, ball_contacts, box_contacts
 from crazysim.geometry.small_matrices import matvec
-from crazysim.plugins.contacts.solver import Contacts
+from crazysim.lab.bodies.manifold import Manifold, ball_box_contacts, ball_contacts, box_contacts
+from crazysim.lab.bodies.solver import Contacts
 from crazysim.scene.collision import CollisionGeom
 
 GapFn = Callable[[Array], tuple[Array, Array]]

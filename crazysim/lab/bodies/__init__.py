@@ -1,0 +1,1 @@
+"""Rigid bodies that collide: drones with drones, and free balls and boxes."""
