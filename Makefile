@@ -15,7 +15,7 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(patsubst %,tests/test_%.py,eager machine package rotation startup storage utils) \
   $(call tests_of,control,allocation attitude flatness setpoint state) \
   $(call tests_of,docs,first_pages imports site) \
-  $(call tests_of,engine,gradient_kernels interpret ir jaxcompat passes plan pytree record rules) \
+  $(call tests_of,engine,gradient_kernels interpret jaxcompat passes plan pytree record rules) \
   $(call tests_of,engine,simplify step symbolic) \
   $(call tests_of,envs,actions brax contract pettingzoo task vector wrappers) \
   $(call tests_of,geometry,heightfield rays shapes) tests/lab/bodies/test_manifold.py \

@@ -123,13 +123,6 @@ def test_a_full_disk_leaves_nothing(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_picture_of_another_kind_is_refused_first(tmp_path, capsys):
-    assert main(["airframe", "check", "cf21B_500", "--picture", str(tmp_path / "x.exe")]) == 2
-    printed = capsys.readouterr()
-    assert "expected the name of a file that ends with .png, got" in printed.err
-    assert not printed.out
-
-
 def test_a_drone_is_checked_by_hand():
     """The largest torques at hover are the thrust left to the limits of the rotors times their lever arms."""
     airframe = load_airframe("cf21B_500")

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -88,20 +87,6 @@ def test_compile_prints_its_parts_from_a_process_of_its_own():
     assert line["trace_s"] > 0
 
 
-def test_crashed_drones_are_detected(benchmarks):
-    import measure
-
-    from crazysim import Sim
-
-    sim = Sim(n_worlds=2, control="rotor_vel")
-    measure.start_hovering(sim, "rotor_vel")
-    sim.step(100)
-    assert measure.is_flying(sim)
-    sim.rotor_vel_control([[[0.0] * 4]] * 2)
-    sim.step(500)
-    assert not measure.is_flying(sim)
-
-
 @pytest.mark.parametrize(("device", "n_calls"), [("cpu", 2), ("gpu", 20)])
 def test_each_timed_batch_starts_from_the_same_data(benchmarks, device, n_calls):
     import measure
@@ -124,18 +109,6 @@ def test_bytes_and_operations_of_a_step_are_counted(benchmarks):
     read = 3 + 4 + 3 + 3 + 3 + 3 + 4 + 4 + 1
     assert n_bytes == 4 * (2 * read - 6)
     assert limits.count_work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
-
-
-def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
-    import contestant
-
-    loop = contestant.build("crazysim", "loop", {"control": "state", "n_worlds": 2, "n_steps": 5}, "cpu")
-    assert loop.seconds() > 0
-    assert loop._sim.data.core.steps[0, 0] == 5 * loop._iterations
-    loop.require_flying()
-    loop._sim.data = loop._sim.data.replace(states=loop._sim.data.states.replace(pos=jnp.zeros((2, 1, 3))))
-    with pytest.raises(SystemExit, match="crashed"):
-        loop.require_flying()
 
 
 def write_results(train, out, successes, **changes):

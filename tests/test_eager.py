@@ -41,8 +41,3 @@ def test_within_compiled_code_constants_remain_constants(traced):
     assert argument_types[0][1] is np.ndarray
     assert {eqn.primitive.name for eqn in jaxpr.eqns} == {"dot_general"}
     np.testing.assert_allclose(jax.grad(lambda x: rotated(x, table).sum())(jnp.ones(3)), 1.0)
-
-
-def test_it_keeps_name_and_docstring(traced):
-    assert traced[0].__name__ == "rotated"
-    assert traced[0].__doc__ == "Return a product."

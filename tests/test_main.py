@@ -61,13 +61,6 @@ def test_the_help_of_a_command_states_defaults_once(command, capsys):
         assert "random seed; by default 0" in out
 
 
-def test_the_demo_has_the_defaults_of_its_function(monkeypatch):
-    settings = []
-    monkeypatch.setattr(demo_flight, "run_demo_flight", lambda **options: settings.append(options))
-    assert main(["demo"]) == main(["demo", "--worlds", "8", "--no-film"]) == 0
-    assert settings == [{}, {"n_worlds": 8, "film": False}]
-
-
 def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     """A second of 8 worlds of 4 drones: figures are printed and both files are pictures of something."""
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
@@ -138,13 +131,6 @@ def test_every_number_of_a_command_is_checked_before_its_work(parser, action, ca
             parser.parse_args([f"{option}={text}"] if action.nargs is None else [option, *[text] * action.nargs])
         error = capsys.readouterr().err
         assert re.search(rf"{option}: expected a .*from .*, got '{text}'. Use for example", error), error
-
-
-def test_worlds_in_other_notation_are_refused_with_the_remedy(capsys):
-    with pytest.raises(SystemExit):
-        main(["demo", "--worlds", "1e3"])
-    error = capsys.readouterr().err
-    assert "--worlds: expected a whole number from 1 to 67,108,864, got '1e3'. Use for example 10." in error
 
 
 def test_a_warning_of_a_command_is_its_message_alone(monkeypatch, capsys):

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
-from crazysim.exception import ConfigError, CrazyflowError
 from crazysim.sim.data import SimStateDeriv
 from crazysim.sim.dynamics import first_principles_dynamics, so_rpy_rotor_dynamics
 from crazysim.sim.sim import seed_sim
-from crazysim.utils import enable_cache, grid_2d, leaf_replace, pytree_replace, world_mask
+from crazysim.utils import enable_cache, leaf_replace, pytree_replace, world_mask
 
 
 def test_leaf_replace_changes_the_worlds_of_the_mask_only():
@@ -67,13 +66,6 @@ def test_world_mask_names_the_leaves_of_worlds_and_pytree_replace_writes_them():
     np.testing.assert_array_equal(new.params.mass, data.params.mass)
 
 
-def test_grid_is_centred_and_nearest_first():
-    grid = grid_2d(9)
-    np.testing.assert_allclose(grid.mean(axis=0), 0, atol=1e-12)
-    assert np.all(np.diff(np.linalg.norm(grid, axis=1)) >= -1e-12)
-    np.testing.assert_allclose(grid_2d(9, center=(3, -2)), grid + [3, -2])
-
-
 def test_seed_sim_is_the_pure_twin_of_seed():
     sim = Sim()
     device = jax.devices()[1]
@@ -94,9 +86,3 @@ def test_derivatives_under_the_names_of_crazyflow():
     fitted = Sim(n_worlds=2, dynamics="so_rpy_rotor").data
     acc = np.asarray(jax.jit(so_rpy_rotor_dynamics)(fitted).acc)
     np.testing.assert_allclose(acc[..., 2], -9.81, atol=1e-5)
-
-
-def test_errors_are_caught_under_the_name_of_crazyflow():
-    assert CrazyflowError is ConfigError
-    with pytest.raises(CrazyflowError):
-        Sim(n_worlds=0)

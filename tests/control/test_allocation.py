@@ -9,7 +9,6 @@ from hypothesis.extra.numpy import arrays
 
 from crazysim import load_airframe
 from crazysim.control import AllocationParams, force_torque2rotor_vel
-from crazysim.control.levels import allocation_matrix
 from crazysim.dynamics.rotor import quadratic_curve
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -42,16 +41,3 @@ def test_law_09_every_rotor_stays_within_its_limits_or_stops(cmd):
     else:
         assert np.all(thrusts >= params.thrust_min[0] - 1e-12)
         assert np.all(thrusts <= params.thrust_max[0] + 1e-12)
-
-
-@pytest.mark.parametrize("thrust", [0.0, -0.1])
-def test_fault_06_zero_thrust_stops_the_motors_whatever_the_torque(thrust):
-    """Fault 6 of ``tests/laws/test_faults.py``."""
-    _, params = setup()
-    np.testing.assert_array_equal(allocate(np.array([thrust, 1e-3, 1e-3, 1e-3]), params=params), np.zeros(4))
-
-
-def test_allocation_matrix_of_a_quadrotor_in_x_is_its_signs_over_four():
-    airframe, _ = setup()
-    expected = np.vstack([np.ones(4), airframe.mixing_matrix]).T / 4
-    np.testing.assert_allclose(allocation_matrix(airframe), expected, atol=1e-15)

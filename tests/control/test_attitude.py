@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazysim import load_airframe
-from crazysim.control import AttitudeParams, attitude2force_torque, body_rate2force_torque
+from crazysim.control import AttitudeParams, attitude2force_torque
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 LEVEL, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
 HALF_THRUST = 0.4  # N, half of the largest thrust of the four rotors, far from all limits
 attitude = jax.jit(attitude2force_torque, static_argnames="ctrl_freq")
-body_rate = jax.jit(body_rate2force_torque, static_argnames="ctrl_freq")
 params = functools.partial(controller_params, AttitudeParams)
 
 
@@ -91,34 +90,3 @@ def test_torque_commands_saturate_one_by_one():
     p = params(torque_pwm_max=[100.0, 200.0, 300.0])
     wrench, _ = run_controller([1.0, 1.0, 1.0, HALF_THRUST], p=p)
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(100, 200, 300), atol=1e-12)
-
-
-@pytest.mark.parametrize("thrust", [0.0, -1.0])
-def test_fault_06_no_thrust_means_no_torque_either(thrust):
-    """Fault 6 of ``tests/laws/test_faults.py``."""
-    wrench, _ = run_controller([1.0, 1.0, 1.0, thrust], rates=np.ones(3))
-    np.testing.assert_array_equal(wrench, np.zeros(4))
-
-
-@given(rates=vectors(3, 0.2), cmd=vectors(3, 0.2), yaw=st.floats(-3, 3))
-def test_body_rate_is_the_attitude_controller_at_level_with_the_present_yaw(rates, cmd, yaw):
-    quat = Rotation.from_euler("ZYX", [yaw, 0.1, -0.2]).as_quat()
-    before, cmd_before = 0.5 * rates, np.append(0.5 * cmd, 0.3)
-    out, integral = body_rate(quat, rates, np.append(cmd, HALF_THRUST), before, cmd_before, ZERO, 500, params=params())
-    expected, expected_integral = run_controller(
-        [0, 0, yaw, HALF_THRUST], quat, rates, desired=cmd, before=before, desired_before=cmd_before[:3]
-    )
-    np.testing.assert_allclose(out, expected, atol=1e-12)
-    np.testing.assert_allclose(integral, expected_integral, atol=1e-12)
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_body_rate_without_attitude_gains_does_not_level(axis):
-    """With kR and ki_m zero the attitude does not matter, as the docstring says."""
-    p = params(kR=ZERO, ki_m=ZERO)
-    cmd = np.array([0, 0, 0, HALF_THRUST])
-    cmd[axis] = 0.1
-    tilted = Rotation.from_euler("ZYX", [0.3, 0.8, -0.5]).as_quat()
-    outs = [body_rate(q, ZERO, cmd, ZERO, cmd, ZERO, 500, params=p)[0] for q in (LEVEL, tilted)]
-    np.testing.assert_allclose(outs[0], outs[1], atol=1e-15)
-    assert outs[0][1 + axis] > 5e-5

@@ -13,7 +13,6 @@ from hypothesis import example, given
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe, rotation
-from crazysim.control.allocation import yaw_arm
 from crazysim.control.auto import DAMPING_RATIO, STIFFNESS_RATIO, Auto, quat_error
 from crazysim.control.bandwidth import max_ang_acc, rotor_rate
 from crazysim.dynamics import first_principles
@@ -244,23 +243,6 @@ def test_authority_by_hand():
     p, (roll, _, yaw) = Auto().params(load_airframe(quad)), max_ang_acc(load_airframe(quad))
     np.testing.assert_allclose(p.lead, 1.0)
     np.testing.assert_allclose((p.stiffness / p.damping) ** 2 * [2, 2, 1], [roll, roll, yaw], rtol=1e-5)
-
-
-def test_heavy_rotors_give_yaw_torque_by_their_acceleration():
-    lag, reaction = 25.0, 0.8
-    share = 1 / (1 + lag * reaction)
-    z = np.exp(1j * np.linspace(1e-3, np.pi, 200))  # one tick of 2 ms
-    drag = lag * 0.002 * share / (z - 1 + lag * 0.002 * share)
-    gain = np.abs(drag * (1 + reaction / 0.002 * (z - 1)))
-    assert np.all(gain <= 1 + 1e-9)
-    assert np.all(gain > 0.95 * lag * reaction * share)
-
-
-def test_the_drag_torque_over_thrust_of_the_curves_agrees_with_the_tables():
-    """Derived from thrust and torque curves around hover, within 15% of the firmware's number where there is one."""
-    for name in ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "crazyflie", "bumblebee", "bumblebee_lab"):
-        airframe = load_airframe(name)
-        assert yaw_arm(airframe) == pytest.approx(float(airframe.value("controller.thrust2torque")), rel=0.15)
 
 
 # Laws -------------------------------------------------------------------------------------------------------------

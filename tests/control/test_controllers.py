@@ -175,33 +175,6 @@ def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
     assert np.abs(mellinger - without_switch).max() > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("controller", "error", "drone"), [("pid", 0.02, "cf2x_L250"), ("mellinger", 0.09, "cf21B_500")]
-)
-def test_controllers_of_the_firmware_reach_a_setpoint(controller, error, drone):
-    sim = Sim(drone=drone, control="state", controller=controller)
-    cmd = make_setpoint(sim)
-    sim.state_control(cmd)
-    sim.step(1000)
-    sim.state_control(cmd + np.eye(16, dtype=np.float32)[0])
-    sim.step(5000)
-    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0, 0], [1.0, 0.0, 1.0], atol=error)
-
-
-def test_pid_follows_body_rates_and_does_not_level():
-    for controller in (PID(hold_yaw=False), PID(hold_yaw=True), "crazyflow"):
-        sim = Sim(drone="cf2x_L250", control="body_rate", controller=controller)
-        sim.data = with_states(sim.data, pos=[0, 0, 20.0])
-        sim.body_rate_control(np.array([[[2.0, 0.0, 0.0, 0.3]]], np.float32))
-        sim.step(500)
-        rate, quat = (np.asarray(x)[0, 0] for x in (sim.data.states.ang_vel, sim.data.states.quat))
-        if controller == "crazyflow":
-            assert abs(quat[0]) < 0.3
-        else:
-            np.testing.assert_allclose(rate, [2.0, 0.0, 0.0], atol=0.05)
-            assert abs(quat[0]) > 0.7  # over 90 degrees
-
-
 def test_a_pitch_rate_through_a_flip_disturbs_no_other_axis():
     """Euler angles jump at a pitch of 90 degrees."""
     sim = Sim(drone="cf2x_L250", control="body_rate", controller="pid")
@@ -254,12 +227,6 @@ def test_latency_delays_setpoint_and_feedforward():
     sim.step()
     assert np.asarray(controller_memory(sim).feedforward)[0, 0, 6] == 0.5
     np.testing.assert_array_equal(sim.data.controls.state.cmd, cmd)
-
-
-def test_rates_of_the_simulation_replace_those_of_the_controller():
-    sim = Sim(control="state", controller="pid", state_freq=50, attitude_freq=250)
-    assert (sim.control_freq, sim.data.controls.controller.freq) == (50, 250)
-    assert Sim(control="attitude", controller="mellinger", attitude_freq=125).control_freq == 125
 
 
 def test_a_memory_without_scopes_is_refused():

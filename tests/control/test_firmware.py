@@ -1,7 +1,6 @@
 """The firmware's PID and Mellinger controllers, compared with the compiled firmware, and in flight."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import vectors
@@ -32,21 +31,6 @@ def test_motor_commands_agree_with_the_firmware(name):
     integer_differences = firmware_controllers.pwm_differences(name, whole_numbers=True)
     assert integer_differences.max() < 1.0 + firmware_controllers.MAX_ROUNDING
     assert np.mean(integer_differences < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
-
-
-@pytest.mark.usefixtures("x64")
-def test_rounding_to_whole_numbers_does_not_change_the_gradient(motors):
-    def total(torque, whole):
-        return distribute_power(jnp.array([30000.3]), torque, params=motors, whole_numbers=whole) @ jnp.array(
-            [1.0, 2, 3, 5]
-        )
-
-    torque = np.array([1001.7, -500.2, 300.9])
-    smooth, whole = (jax.jit(jax.grad(total), static_argnums=1)(torque, flag) for flag in (False, True))
-    np.testing.assert_allclose(whole, smooth)
-    # 1001 / 2, 500 / 2 and 300, truncated, with the signs of each rotor.
-    pwm = distribute(np.array([30000.3]), torque, params=motors, whole_numbers=True)
-    np.testing.assert_allclose(sorted(np.asarray(pwm)), [29450, 29550, 29950, 31050], atol=1e-9)
 
 
 @pytest.fixture(scope="module")

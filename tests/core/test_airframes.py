@@ -86,16 +86,6 @@ def test_rotors_of_one_airframe_may_differ_where_numbers_of_rotors_differ(key, n
         np.testing.assert_allclose(result, expected, rtol=3e-5, atol=3e-5)
 
 
-def test_equal_airframes_share_their_parameters():
-    """The data are the same if the airframe is named once or once for each drone."""
-    named_once, named_twice = Sim(2, 2), Sim(2, drone=["cf21B_500", "cf21B_500"])
-    assert named_twice.n_drones == 2
-    assert named_twice.airframe.name == "cf21B_500"
-    shapes = [[x.shape for x in jax.tree.leaves(sim.data)] for sim in (named_once, named_twice)]
-    assert shapes[0] == shapes[1]
-    assert jax.tree.structure(named_once.data) == jax.tree.structure(named_twice.data)
-
-
 def test_only_parameters_that_differ_have_an_axis_of_drones():
     params = Sim(3, drone=FLEET).data.params
     assert params.gravity_vec.shape == (3,)
@@ -179,15 +169,6 @@ def test_contacts_and_rays_meet_the_shape_of_each_drone():
     sim.step()
     np.testing.assert_array_equal(np.asarray(log.read(sim.data).drones)[0], [False, True, True])
     assert sim.contact_report().nearest_drone.shape == (1, 3)
-
-
-def test_a_mixed_fleet_is_drawn():
-    sim = Sim(1, drone=("cf21B_500", "bumblebee", HEXAROTOR))
-    model = sim.mj_model
-    n_geoms = [sum(model.geom_bodyid == model.body(f"drone:{k}").id) for k in range(3)]
-    assert n_geoms[2] == n_geoms[0] + 6  # arm, motor and propeller of two more rotors
-    sizes = [model.geom(f"col_sphere:{k}").size[0] for k in range(2)]
-    assert sizes[1] > 2 * sizes[0]
 
 
 def test_drones_of_a_mixed_fleet_stand_on_the_floor():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import Sim
-from crazysim.core.data import SimState, as_key, command_shape, grid_2d
+from crazysim.core.data import SimState, command_shape, grid_2d
 
 
 @given(n=st.integers(1, 200), spacing=st.floats(0.1, 5))
@@ -54,30 +54,6 @@ def test_nothing_is_commanded_at_the_start(dynamics, control):
         expected[..., 12] = 1
         np.testing.assert_array_equal(data.controls.state.staged_cmd, expected)
     assert command_shape(data, control) == (2, 2, {"state": 16}.get(control, 4))
-
-
-def test_default_rates_are_100_hz_for_state_and_500_below_or_the_next_divisor():
-    ctrl = Sim(control="state", controller="crazyflow").data.controls
-    assert (ctrl.state.freq, ctrl.attitude.freq, ctrl.force_torque.freq) == (100, 500, 500)
-    for freq, rates in ((500, (100, 500)), (240, (80, 240)), (1000, (100, 500))):
-        cascade, auto = (Sim(control="state", controller=name, freq=freq) for name in ("crazyflow", "auto"))
-        assert (cascade.control_freq, cascade.data.controls.attitude.freq) == rates
-        assert (auto.control_freq, auto.data.controls.controller.freq) == rates
-    assert Sim(control="rotor_vel", freq=240).control_freq == 240
-
-
-def test_a_seed_becomes_a_key_and_a_key_stays():
-    key = jax.random.key(3)
-    assert as_key(key) is key
-    for seed in (3, np.int32(3), jnp.int32(3)):
-        np.testing.assert_array_equal(jax.random.key_data(as_key(seed)), jax.random.key_data(key))
-
-
-def test_everything_is_float64_under_x64(x64):
-    data = Sim(control="state").data
-    types = {x.dtype.name for x in jax.tree.leaves(data) if jnp.issubdtype(x.dtype, jnp.floating)}
-    assert types == {"float64"}
-    assert data.core.steps.dtype == jnp.int32
 
 
 def test_no_two_leaves_share_a_buffer_that_a_rollout_may_give_away():

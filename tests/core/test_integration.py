@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim
-from crazysim.core.data import SimState, SimStateDeriv
+from crazysim.core.data import SimStateDeriv
 from crazysim.core.integration import INTEGRATORS, Integrator
 from crazysim.core.stages import first_principles_derivative
 
@@ -149,20 +149,3 @@ def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(d
     np.testing.assert_allclose(old.pos[0, 0], [dt, 0, 10], rtol=1e-14)
     np.testing.assert_allclose(new.pos[0, 0], np.array([dt, 0, 10]) + dt * dt * acc, rtol=1e-14)
     np.testing.assert_array_equal(old.vel, new.vel)
-
-
-def test_integrators_change_only_the_states(data, x64):
-    def check(data):
-        for integrate in INTEGRATORS.values():
-            after = integrate(data, first_principles_derivative)
-            assert after.controls is data.controls
-            assert after.params is data.params
-            assert after.core is data.core
-            assert after.states.force is data.states.force
-            assert isinstance(after.states, SimState)
-
-    jax.eval_shape(check, data)
-
-
-def test_orders_are_those_that_are_promised():
-    assert {i.value: i.order for i in Integrator} == {"euler": 1, "symplectic_euler": 1, "rk4": 4}

@@ -5,7 +5,6 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import with_states
 
 from crazysim import Sim, stage
 from crazysim.core.pipeline import (
@@ -57,11 +56,6 @@ def test_every_change_keeps_the_order_of_the_rest(pipeline, change, order):
     assert change(pipeline) is None
     assert " ".join(pipeline) == order
     assert original is pipeline, "changed in place"
-
-
-def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
-    replace_fn(pipeline, third, "first")
-    assert list(pipeline.items()) == [("first", third), ("second", second)]
 
 
 @pytest.mark.parametrize(
@@ -125,10 +119,6 @@ def lift(data):
     return data.replace(states=data.states.replace(pos=data.states.pos + jnp.asarray([0, 0, 1.0])))
 
 
-def double(data):
-    return data.replace(states=data.states.replace(pos=data.states.pos * 2))
-
-
 EDITS = {
     "append": lambda sim: append_fn(sim.step_pipeline, lift),
     "replace": lambda sim: replace_fn(sim.step_pipeline, lift, "still"),
@@ -162,19 +152,6 @@ def test_an_edit_takes_effect_at_the_next_step(sim, edit, is_rebuilt):
 def heights(data):
     """Return the heights of all drones. (2, 2)"""
     return np.asarray(data.states.pos)[..., 2]
-
-
-def test_the_order_and_the_end_of_a_pipeline_are_edits(sim):
-    sim.data = with_states(sim.data, pos=0.0)
-    sim.step_pipeline = {"lift": lift, "double": double}
-    sim.step()
-    np.testing.assert_array_equal(heights(sim.data), 2.0)
-    sim.step_pipeline = {"double": double, "lift": lift}
-    sim.step()
-    np.testing.assert_array_equal(heights(sim.data), 5.0)
-    remove_fn(sim.step_pipeline, "double")
-    sim.step()
-    np.testing.assert_array_equal(heights(sim.data), 6.0)
 
 
 def test_law_06_an_edit_compiles_once_and_an_undone_one_not_at_all(sim):

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from crazysim import (
-    ESKF,
     Battery,
     ConfigError,
     Integrator,
@@ -24,7 +23,6 @@ from crazysim import (
     Sim,
     StagePlacement,
     Wind,
-    WindField,
     leaf,
     stage,
 )
@@ -33,11 +31,7 @@ from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin, Param, param, state
 from crazysim.core.settings import setting
 from crazysim.core.stages import first_principles_derivative
-from crazysim.engine.stage import is_first_step
 from crazysim.errors import UnknownNameError
-from crazysim.plugins.effects.grid import Grid
-from crazysim.plugins.estimators import Complementary
-from crazysim.plugins.sensors import Barometer
 
 DURATION = 0.5
 STEPS = np.array([32, 64, 128])
@@ -289,30 +283,6 @@ def test_episodes_begin_at_resets_or_in_front_of_a_stage_of_their_first_step():
     np.testing.assert_array_equal(late_start.read(sim.data).pos[0], 0.0)
 
 
-def test_all_parts_of_the_package_begin_episodes_by_one_method():
-    sim = Sim(engine="interpret", estimator="kalman")
-    imu = sim.plugins["imu"]
-    sim.add(ESKF([imu, sim.plugins["motion_capture"]], False))
-    sim.add(Complementary([imu, sim.add(Barometer())], False))
-    sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
-    begin_stages = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
-    names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
-    assert {key: fn.plugin for key, fn in begin_stages.items()} == {
-        f"{name}_begin": sim.plugins[name] for name in names
-    }
-    assert all(fn.method is type(fn.plugin).reset_episode for fn in begin_stages.values())
-    assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"
-
-
-def test_new_data_has_new_records():
-    sim = make_hovering_sim(engine="interpret")
-    sim.add(Wake())
-    fly_on(sim)
-    sim.build_data()
-    np.testing.assert_array_equal(sim.data.plugins["wake"].vel, 0.0)
-    sim.step()
-
-
 @pytest.mark.parametrize(
     ("observe", "message"),
     [
@@ -536,13 +506,6 @@ def test_law_09_impossible_additions_replacements_and_removals_are_refused(act, 
     assert list(pipeline) == stages
     assert list(sim.plugins) == names
     assert set(sim.data.plugins) == {"wind", "latency", "mine"}
-
-
-def test_law_09_a_plugin_has_a_name():
-    with pytest.raises(TypeError, match="plugin Anonymous has no field 'name'"):
-
-        class Anonymous(Plugin):
-            """A plugin without a name."""
 
 
 class Discs(Plugin):

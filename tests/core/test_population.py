@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from springs import KINDS, STIFFNESS, Crowd, Springs, Tied, Tying, build_springs
+from springs import KINDS, STIFFNESS, Springs, Tied, Tying, build_springs
 
 from crazysim import ConfigError, Sim, stage
 from crazysim.core.pipeline import insert_fn_before
-from crazysim.core.plugin import Param, nested, param
+from crazysim.core.plugin import Param, param
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
-from crazysim.engine.pytree import PyTree, check_axes, leaf, scopes
+from crazysim.engine.pytree import check_axes, scopes
 from crazysim.errors import EngineWarning
 
 COUNTS = [(2, 2, 2), (3, 2, 4), (4, 3, 1)]
@@ -50,22 +50,6 @@ def test_law_02_axes_are_as_declared_for_any_counts(n_worlds, n_drones, n_member
         assert np.ptp(values) > 0 or name.startswith("ticks")
     for kind in ("springs", "crowd", "tied", "tying"):
         np.testing.assert_array_equal(states_by_name(sim.data)[f"ticks of {kind}"], 2)  # 100 Hz: steps 0 and 5
-
-
-def test_a_member_moves_like_a_single_member():
-    sim = keep_mass_stages(build_springs(Springs, 3, 2, 4, engine="interpret"))
-    sim.step(9)
-    record = jax.device_get(sim.data.plugins["springs"])
-    single_sim = Sim(engine="interpret")
-    single_sim.add(Springs(1))
-    keep_mass_stages(single_sim)
-    mass, start = single_sim.data.plugins["springs"], jax.device_get(sim.default_data.plugins["springs"])
-    for world, member in ((0, 0), (2, 1), (1, 3)):
-        member_record = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
-        single_sim.data = single_sim.plugins["springs"].write(single_sim.default_data, member_record)
-        single_sim.step(9)
-        pos = np.asarray(single_sim.data.plugins["springs"].pos)[0, 0]
-        np.testing.assert_allclose(pos, record.pos[world, member], rtol=1e-6)
 
 
 @pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
@@ -144,12 +128,6 @@ def test_random_numbers_are_those_of_world_and_member():
     assert world_key(member_data, "kick") != member_key(member_data, "springs", "kick")
 
 
-def test_populations_that_depend_on_each_other_share_a_program():
-    for kind, n in ((Springs, 2), (Crowd, 2), (Tied, 1), (Tying, 1)):
-        sim = build_springs(kind, engine="lanes")
-        assert len(sim.step_fn.plan(sim.data).programs) == n, kind
-
-
 def test_two_populations_are_two_programs():
     sim = Sim(2, 2, engine="fused")
     sim.add(Springs(3))
@@ -183,20 +161,6 @@ def test_many_members_that_read_the_drones_run_unfused_without_a_warning():
         assert sim.step_fn.plan(sim.data).program.unfused_stages
 
 
-def test_a_stage_that_no_engine_supports_is_reported_once():
-    @stage("springs")
-    def orthonormalise(data):
-        record = data.plugins["springs"]
-        q, _ = jnp.linalg.qr(jnp.eye(3) + jnp.outer(record.pos, record.pos))
-        return data.replace(plugins=data.plugins | {"springs": record.replace(vel=record.vel + 0 * q[0])})
-
-    sim = build_springs(Springs, engine="interpret")
-    insert_fn_before(sim.step_pipeline, "integration", orthonormalise)
-    with pytest.warns(EngineWarning, match="'orthonormalise' is not fused") as caught:
-        sim.step(2)
-    assert len(caught) == 1
-
-
 def test_a_population_is_added_replaced_and_removed():
     sim = Sim(2, 2, engine="lanes")
     before, leaves = list(sim.step_pipeline), len(jax.tree.leaves(sim.data))
@@ -219,11 +183,6 @@ def test_a_population_is_added_replaced_and_removed():
     sim.remove("springs")
     assert list(sim.step_pipeline) == before
     assert len(jax.tree.leaves(sim.data)) == leaves
-
-
-def test_names_are_those_given_or_numbers():
-    assert Springs(2).names == ("Mass_0", "Mass_1")
-    assert Springs(["Mass_7", "Mass_2"]).names == ("Mass_7", "Mass_2")
 
 
 @pytest.mark.parametrize(
@@ -304,17 +263,6 @@ def test_leaves_have_the_axes_of_their_population():
     for wrong in (record.replace(pos=few), record.replace(stiffness=np.ones((2, 2, 1), np.float32))):
         with pytest.raises(ConfigError, match=r"begin with \(2, 3\).*for 2 worlds of 3 springs"):
             check_axes(sim.plugins["springs"].write(sim.data, wrong), 2, 2)
-
-
-def test_records_within_a_record_belong_to_its_population():
-    class Inner(PyTree):
-        x: jax.Array = leaf("member")
-
-    class Outer(Springs):
-        inner: Inner | None = nested(default=None)
-
-    record = build_springs(Outer).data.plugins["springs"]
-    assert scopes(record.replace(inner=Inner(record.ticks))).inner.x == "springs"
 
 
 def test_a_rate_of_something_else_is_refused():

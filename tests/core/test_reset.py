@@ -104,13 +104,6 @@ def test_a_parameter_of_each_drone_returns_to_the_shared_default_and_stays_of_ea
     np.testing.assert_array_equal(sim.data.params.mass, np.broadcast_to(mass, mass_of_each.shape))
 
 
-def test_a_plugin_that_the_default_data_lack_stays():
-    sim = Sim()
-    sim.data = sim.data.replace(plugins={"late": jnp.ones(2)})
-    sim.reset()
-    np.testing.assert_array_equal(sim.data.plugins["late"], 1)
-
-
 def test_the_default_data_outlive_a_flight_that_began_from_them():
     """Law 11: a full reset copies the buffers of the default data, since a rollout may donate those of its data."""
     sim = Sim(control="rotor_vel")

@@ -191,44 +191,6 @@ def test_a_users_dict_is_not_changed_and_an_airframe_cannot_be_changed():
         airframe.value("rigid_body.inertia")[0] = 1.0
 
 
-def hexacopter():
-    """Return a drone of 60 g with six rotors of a Crazyflie on a circle of radius 60 mm, the first of them ahead."""
-    tables = plain_tables("cf21B_500") | {"name": "hexa"}
-    angle = np.pi / 3 * np.arange(6)
-    position = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-    rotors = tables["rotors"] | {"position": position.tolist(), "yaw_torque_sign": [1, -1, 1, -1, 1, -1]}
-    del tables["fitted"]
-    return tables | {"rotors": rotors, "rigid_body": {"mass": 0.06, "inertia": [6e-5, 6e-5, 1e-4]}}
-
-
-@pytest.mark.parametrize("control", ["rotor_vel", "attitude"])
-def test_a_hexacopter_from_a_dict_hovers(control):
-    sim = Sim(n_worlds=2, drone=hexacopter(), control=control)
-    assert sim.data.states.rotor_vel.shape == (2, 1, 6)
-    rotor_vel = first_principles.hover_rotor_vel(sim.data.params)
-    assert rotor_vel.shape == (6,)
-    pos = sim.data.states.pos.at[..., 2].set(1.0)
-    rotors = np.broadcast_to(rotor_vel, (2, 1, 6))
-    # World 1 begins turned by 5 degrees about every axis, which its attitude controller has to undo.
-    tilted = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (2, 1, 4)).copy()
-    if control == "attitude":
-        tilted[1] = [0.0427, 0.0427, 0.0427, 0.9973]
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos, rotor_vel=rotors, quat=tilted))
-    if control == "rotor_vel":
-        sim.rotor_vel_control(rotors)
-    else:
-        sim.attitude_control(np.broadcast_to([0, 0, 0, 0.06 * 9.81], (2, 1, 4)))
-    sim.step(250)
-    states = sim.data.states
-    # Rotor speeds in float32 are known to 1e-3 rpm, the thrust to 1e-6 of the weight: micrometres in half a second.
-    np.testing.assert_allclose(states.pos[0, 0], [0, 0, 1], atol=1e-4)
-    np.testing.assert_allclose(states.quat[0, 0], [0, 0, 0, 1], atol=1e-4)
-    # From 5 degrees of tilt the controller settles to below 1 degree of yaw, its slowest axis, and 0.2 of the others.
-    np.testing.assert_allclose(states.quat[1, 0], [0, 0, 0, 1], atol=8e-3)
-    np.testing.assert_allclose(states.quat[1, 0, :2], [0, 0], atol=2e-3)
-    np.testing.assert_allclose(states.pos[1, 0], [0, 0, 1], atol=0.2)
-
-
 def test_a_toml_file_anywhere_on_disk_flies(tmp_path):
     """No file of the package changes, and only the user's file is needed."""
     path = tmp_path / "heavy.toml"

@@ -108,25 +108,3 @@ def test_external_wrench_acts_in_the_world_frame():
     )  # fmt: skip
     np.testing.assert_allclose(acc, [0, 1, -9.81], atol=1e-12)
     np.testing.assert_allclose(ang_acc, [-40, 0, 0], atol=1e-10)
-
-
-def test_every_rotor_can_have_constants_of_its_own():
-    """Four equal rows change nothing; half a thrust curve on one rotor halves only that rotor's thrust."""
-    params = first_principles.Params.create(load_airframe("cf21B_500"))
-    rows = {
-        name: jnp.broadcast_to(getattr(params, name), shape)
-        for name, shape in {
-            "L": (4,), "prop_inertia": (4,), "rotor_vel_min": (4,), "rotor_vel_max": (4,),
-            "rpm2thrust": (4, 3), "rpm2torque": (4, 3), "rotor_dyn_coef": (4, 4),
-        }.items()
-    }  # fmt: skip
-    args = (np.zeros(3), np.array([0.0, 0, 0, 1]), np.ones(3), np.ones(3), np.full(4, 2e4), np.full(4, 15e3))
-    same = params.replace(**rows)
-    for a, b in zip(model(*args, params=params), model(*args, params=same), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-    weak = same.replace(rpm2thrust=same.rpm2thrust.at[2].multiply(0.5))
-    thrust = float(quadratic_curve(jnp.asarray(15e3), params.rpm2thrust[0]))
-    difference = model(*args, params=weak)[1] - model(*args, params=same)[1]
-    np.testing.assert_allclose(difference, [0, 0, -0.5 * thrust / 0.0434], atol=1e-12)
-    hover = first_principles.hover_rotor_vel
-    np.testing.assert_allclose(hover(same), hover(params), rtol=1e-14)

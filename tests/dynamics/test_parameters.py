@@ -1,6 +1,5 @@
 """Parameters as dicts, under the names and with the shapes of Crazyflow 0.4.0."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,10 +9,7 @@ from crazysim.control import state2attitude
 from crazysim.drones import load_airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted, load_fn_params, load_params, supported_dynamics
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.sim.sim import rotor_vel_limits
 
-COMMON = {"gravity_vec": (3,), "mass": (), "J": (3, 3), "J_inv": (3, 3), "thrust_min": (), "thrust_max": ()}
-"""Shapes of the parameters of all models."""
 SHAPES = {
     "first_principles": {
         "L": (), "prop_inertia": (), "rpm2thrust": (3,), "rpm2torque": (3,), "rotor_dyn_coef": (4,),
@@ -25,13 +21,6 @@ SHAPES["so_rpy_rotor"] = SHAPES["so_rpy"] | {"thrust_dyn_coef": ()}
 SHAPES["so_rpy_rotor_drag"] = SHAPES["so_rpy_rotor"] | {"drag_matrix": (3, 3)}
 
 
-@pytest.mark.parametrize("dynamics", Dynamics)
-def test_names_and_shapes_of_a_model(dynamics):
-    params = load_params(dynamics, "cf2x_L250")
-    assert {name: np.shape(x) for name, x in params.items()} == COMMON | SHAPES[dynamics.value]
-    assert all(isinstance(x, np.ndarray) and x.dtype == np.float64 for x in params.values())
-
-
 def test_values_are_those_of_the_airframe_and_of_the_dynamics():
     params = load_params("first_principles", "cf2x_L250")
     assert float(params["mass"]) == 0.0328
@@ -40,18 +29,6 @@ def test_values_are_those_of_the_airframe_and_of_the_dynamics():
     record = first_principles.Params.create(load_airframe("cf2x_L250"))
     for name, value in load_fn_params(first_principles.dynamics, "cf2x_L250").items():
         np.testing.assert_allclose(np.squeeze(getattr(record, name)), np.squeeze(value), rtol=1e-6, err_msg=name)
-
-
-def test_values_of_another_array_module():
-    assert isinstance(load_params("so_rpy", "cf2x_L250", xp=jnp)["mass"], jnp.ndarray)
-    assert isinstance(load_control_params("mellinger", "cf2x_L250", xp=jnp)["core"]["mass"], jnp.ndarray)
-
-
-def test_limits_of_the_rotors():
-    low, high = rotor_vel_limits("first_principles", "cf2x_L250")
-    k0, k1, k2 = load_params("first_principles", "cf2x_L250")["rpm2thrust"]
-    np.testing.assert_allclose([k0 + k1 * w + k2 * w**2 for w in (low, high)], [0.012817578393, 0.12], rtol=1e-5)
-    np.testing.assert_allclose(rotor_vel_limits("so_rpy", "cf2x_L250"), [4 * 0.012817578393, 0.48], rtol=1e-9)
 
 
 def test_tables_of_the_controller():

@@ -335,14 +335,6 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
     assert remaining() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
 
 
-def test_long_work_is_announced_once_for_each_kind(settings, capsys):
-    for work in ("compiling this", "compiling this", "compiling that"):
-        announce(work, "5 s")
-    printed = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in printed] == ["compiling this", "compiling that"]
-    assert all("5 s on two cores, less in later runs" in line for line in printed)
-
-
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):
     with announce_if_slow("compiling what is cached", "5 s", delay=3600.0):
         pass

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim import ConfigError, Downwash, Kalman, Sim
+from crazysim import ConfigError, Downwash, Sim
 from crazysim.engine import Step
 from crazysim.engine.backends import cuda, kernel, native
-from crazysim.engine.backends.exchange import make_exchange
-from crazysim.engine.backends.source import Writer
 from crazysim.engine.errors import KernelError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder
 from crazysim.engine.ir.program import Leaf, Program, Segment
@@ -53,12 +51,6 @@ def test_each_architecture_has_its_own_code(source):
     assert targets == ["sm_90", "sm_86", "sm_86", "sm_90"]
 
 
-def test_without_nvrtc_the_kernel_is_unsupported(source, monkeypatch):
-    monkeypatch.setattr(cuda, "nvrtc", lambda: None)
-    with pytest.raises(KernelError, match="NVRTC was not found"):
-        cuda.compile_source(source.text, cuda.DEFAULT_ARCHITECTURE, "PTX")
-
-
 def test_a_source_that_nvrtc_refuses_is_unsupported(source):
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here")
@@ -80,24 +72,6 @@ def test_worlds_whose_drones_act_on_each_other_fill_warps_or_blocks(n_drones, th
     assert code.count("bar.sync") == (2 if in_block else 0)
 
 
-def test_a_wider_block_has_more_whole_worlds():
-    """Worlds of three drones: 20 of them in 64 threads, 80 in 256."""
-    sim = Sim(n_worlds=2, n_drones=3, control="attitude", engine="lanes")
-    sim.add(Downwash())
-    gpu_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
-    wide_kernel = gpu_kernel.with_threads(256)
-    assert (wide_kernel.threads, wide_kernel.lanes) == (256, 240)
-    assert ".maxntid 256" in cuda.ptx(wide_kernel, cuda.DEFAULT_ARCHITECTURE)
-
-
-def test_long_kernels_on_a_gpu_read_shared_numbers_where_they_use_them(source):
-    sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
-    long_kernel = kernel.write_kernel(sim.build_step_fn().plan(sim.data).program, "cuda")
-    texts = [k.text[k.text.index(" advance(") :] for k in (long_kernel, source)]
-    assert ["SHARED(p" in text for text in texts] == [True, False]
-    assert cuda.ptx(long_kernel, cuda.DEFAULT_ARCHITECTURE).count("ld.global.nc.f32 %f") > 100
-
-
 def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
     sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel", engine="lanes")
     sim.add(Downwash())
@@ -106,14 +80,6 @@ def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
         UnsupportedError, match="the 1025 drones of a world read each other's numbers; on a GPU at most 1024 can"
     ):
         kernel.write_kernel(program, "cuda")
-
-
-def test_records_that_do_not_fit_into_a_block_are_refused():
-    exchange = make_exchange("cuda", 1024)
-    with pytest.raises(
-        UnsupportedError, match=r"the drones of a block publish 65536 bytes .* block's static shared memory has 49152"
-    ):
-        exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)
 
 
 def lowered_text(sim, planned_for, platform):

@@ -151,38 +151,6 @@ def test_donating_arrays_that_were_read_does_not_change_the_simulation(sim):
     assert trees_equal(sim.data.states, twin.data.states)
 
 
-def test_a_command_on_the_device_may_be_donated_later(sim):
-    command = jax.device_put(COMMAND.astype(np.float32), sim.device)
-    sim.attitude_control(command)
-    jax.jit(lambda x: x * 0 + 7, donate_argnums=0)(command)
-    expected = step_on_xla(sim, 3)
-    sim.step(3)
-    assert trees_equal(sim.data, expected)
-    np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, COMMAND.astype(np.float32))
-
-
-def test_threads_read_consistent_records_while_another_steps(sim):
-    samples, stopped = [], threading.Event()
-
-    def read():
-        while not stopped.is_set():
-            data = sim.data
-            samples.append((int(data.core.steps[0, 0]), float(data.states.pos[0, 0, 2])))
-
-    threads = [threading.Thread(target=read) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    heights = {int(sim.data.core.steps[0, 0]): float(sim.data.states.pos[0, 0, 2])}
-    for _ in range(200):
-        sim.step()
-        heights[int(sim.data.core.steps[0, 0])] = float(sim.data.states.pos[0, 0, 2])
-    stopped.set()
-    for thread in threads:
-        thread.join()
-    assert len(samples) > 10
-    assert all(heights[steps] == height for steps, height in samples)
-
-
 def test_other_devices_and_engines_keep_the_compiled_step():
     for sim in (Sim(2, engine="lanes"), Sim(2, mesh=world_mesh(jax.devices("cpu")[:2]))):
         assert sim.step_fn.plan(sim.data).host_call is None

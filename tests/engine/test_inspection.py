@@ -10,7 +10,7 @@ from differences import first_difference
 
 from crazysim.engine.backends import source
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.ir import dump, listing, ops
+from crazysim.engine.ir import listing, ops
 from crazysim.engine.ir.blocks import Builder
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
@@ -65,17 +65,6 @@ def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data)
     assert "  writes states.torque\n" in text
 
 
-@stage("drone")
-def halve(data):
-    return data.replace(states=jax.lax.fori_loop(0, 70, lambda _, s: s.replace(force=0.5 * s.force), data.states))
-
-
-def test_blocks_of_operations_are_indented(data):
-    text = listing.list_program(lower_stages([halve], data))
-    assert "length=70) {\n" in text
-    assert "\n    return " in text
-
-
 # Dumps ---------------------------------------------------------------------------------------------------------------
 
 
@@ -89,16 +78,6 @@ def test_a_dump_has_the_jaxprs_and_the_program_after_each_pass(data, tmp_path, m
     assert names == ["sway.jaxpr", *(f"program.{name}" for name in passes)]
     jaxpr = next((tmp_path / "out").glob("*sway.jaxpr")).read_text()
     assert "sin" in jaxpr
-
-
-def test_nothing_is_dumped_where_no_folder_is_set(tmp_path, monkeypatch):
-    monkeypatch.delenv("CRAZYSIM_DUMP", raising=False)
-    assert dump.write("a", "text") is None
-    monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path))
-    file = dump.write("kernel of 'x'/command", "text")
-    assert file is not None
-    assert file.read_text() == "text"
-    assert file.name.endswith("kernel_of_x_command")
 
 
 # Source --------------------------------------------------------------------------------------------------------------
@@ -140,10 +119,6 @@ def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
 @pytest.fixture
 def moving_data(data):
     return with_states(data, pos=[0.1, 0.2, 0.7], vel=[0.3, -0.2, 0.1])
-
-
-def test_equal_engines_do_not_differ(moving_data):
-    assert first_difference({"sway": sway, "mine": undeclared_stage}, moving_data, engines=("plain", "lanes")) is None
 
 
 def test_the_first_difference_has_stage_field_element_and_operation(moving_data, monkeypatch):

@@ -29,15 +29,6 @@ def test_lanes_leave_a_loop_one_by_one():
     np.testing.assert_array_equal(n, [0, 2, 6])
 
 
-def test_an_observer_gets_every_operation_with_its_results():
-    seen = []
-    block = lower_function(lambda x: jnp.exp(x) + 1, SCALAR)
-    interpret.run_block(
-        block, [np.zeros(2, np.float32)], (2,), observe=lambda op, out: seen.append((op.name, float(out[0][0])))
-    )
-    assert seen == [("exp", 1.0), ("add", 2.0)]
-
-
 def test_outside_of_a_trace_nothing_is_compiled():
     """Results equal those of a traced call, and are on the device of the data."""
     sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret", device="cpu:1")

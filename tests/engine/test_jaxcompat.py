@@ -1,6 +1,5 @@
 """JAX beyond its public interface: each name that the engine relies on, on every version that is supported."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -42,35 +41,6 @@ def test_other_errors_of_a_rule_do_not_become_unsupported_errors(mistake, kind):
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
     with pytest.raises(kind), jaxcompat.read_equation(eqn) as read:
         mistake(read)
-
-
-def test_a_call_keeps_its_own_derivative():
-    @jax.custom_jvp
-    def f(x):
-        return 2.0 * x
-
-    f.defjvp(lambda primals, tangents: (f(primals[0]), 100.0 * tangents[0]))
-    eqn = equation(lambda x: f(x), 1.0)
-    for read in (eqn, dataclasses.replace(jaxcompat.Equation(eqn.primitive, eqn.invars, eqn.outvars,
-                                                             jaxcompat.Parameters("f", eqn.params)))):  # fmt: skip
-        call_f = jaxcompat.as_function(read)
-        (out,), (slope,) = jax.jvp(lambda x, f=call_f: jax.tree.leaves(f(x)), (3.0,), (1.0,))
-        assert (out, slope) == (6.0, 100.0)
-
-
-def test_primitives_written_in_terms_of_others_are_expanded():
-    """JAX has ``call_hi_primitive`` from 0.12 on. Its expansion computes the same."""
-    result = []
-    for fn in (jax.nn.relu, jax.nn.silu, jax.nn.softplus, jnp.linalg.det, jax.scipy.special.logsumexp):
-        x = jnp.eye(3) + 0.1
-        for eqn in jax.make_jaxpr(fn)(x).jaxpr.eqns:
-            if eqn.primitive.name == "call_hi_primitive":
-                result.append(eqn)
-                args = [jnp.ones(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-                expected = jax.tree.leaves(eqn.primitive.bind(*args, **eqn.params))
-                for a, b in zip(jaxcompat.expand_primitive(eqn)(*args), expected, strict=True):
-                    np.testing.assert_allclose(a, b, rtol=1e-6)
-    assert not result or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
 
 
 # Arrays --------------------------------------------------------------------------------------------------------------
@@ -157,33 +127,6 @@ def test_tangents_that_are_zero_by_construction_are_recognised():
     assert jax.grad(f)(2.0, 3.0) == 3.0
     assert seen == [False, True]
     assert jaxcompat.is_symbolic_zero(None)
-
-
-def test_a_barrier_is_reversed_if_only_some_tangents_depend_on_the_input():
-    """The tangents of a loop are constants or depend on the input; JAX 0.12 cannot reverse its own barrier then."""
-
-    @jax.custom_jvp
-    def constant(x):
-        return 2.0 * x
-
-    constant.defjvp(lambda primals, tangents: (constant(primals[0]), jnp.zeros_like(primals[0])))
-
-    def body(x, _):
-        a, b, _, _ = jaxcompat.barrier([constant(x), jnp.sin(x), jax.random.key(0), jnp.arange(3)])
-        return a * b, None
-
-    def loss(x):
-        return jnp.sum(jax.lax.scan(jax.checkpoint(body), x, length=2)[0])
-
-    x = jnp.array([0.5, 1.0, 1.5])
-    y = 2 * x * jnp.sin(x)
-    expected = 2 * y * jnp.cos(y) * 2 * x * jnp.cos(x)
-    for gradient in (jax.grad(loss), jax.jit(jax.grad(loss)), jax.jacfwd(loss)):
-        np.testing.assert_allclose(gradient(x), expected, rtol=1e-6)
-    batched = jax.vmap(jax.grad(loss))(jnp.stack([x, x]))
-    np.testing.assert_allclose(batched, np.stack([expected] * 2), rtol=1e-6)
-    curvature = jax.hessian(lambda x: jnp.sum(jaxcompat.barrier([x**2, x**3])[1]))(x)
-    np.testing.assert_allclose(curvature, np.diag(6 * x), rtol=1e-6)
 
 
 # Compilation ---------------------------------------------------------------------------------------------------------

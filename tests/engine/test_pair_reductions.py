@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import with_states
 
-from crazysim import ConfigError, Downwash, Plugin, Sim, reduce_over_others, stage
+from crazysim import ConfigError, Plugin, Sim, reduce_over_others, stage
 from crazysim.core import insert_fn_before
 from crazysim.engine import Step
 from crazysim.engine.ir.program import UnfusedStage
@@ -45,11 +45,6 @@ def crowd_forces(pos):
     return force
 
 
-def as_float64(data):
-    """Return the data with all floating-point numbers in float64."""
-    return jax.tree.map(lambda x: np.asarray(x, np.float64) if x.dtype == np.float32 else x, data)
-
-
 def random_positions(n_worlds, n_drones, seed=0):
     """Return positions in a cube of 2 m above the floor. (n_worlds, n_drones, 3)"""
     return np.random.default_rng(seed).uniform(-1, 1, (n_worlds, n_drones, 3)) + [0, 0, 2]
@@ -85,44 +80,6 @@ def test_all_pairs_are_computed(n_drones):
     result = step(sim.data, jnp.int32(1))
     np.testing.assert_allclose(result.states.force, expected, rtol=2e-5, atol=1e-9)
     assert not step.plan(sim.data).program.unfused_stages
-
-
-@pytest.mark.parametrize("n_drones", [9])
-def test_law_08_gradients_equal_central_differences(n_drones, x64):
-    """In float64, in forward and in reverse mode."""
-    sim = make_crowd_sim(2, n_drones, Downwash())
-    data = as_float64(sim.data)
-    pos, direction = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
-    step = Step(sim.step_pipeline)
-
-    def score(after):
-        return jnp.sum(after.states.vel[..., 2]) * 1e3 + jnp.sum(after.plugins["downwash"].air_vel ** 2)
-
-    def loss(size):
-        return score(step(data.replace(states=data.states.replace(pos=pos + size * direction)), 2))
-
-    forward, reverse = (jax.jit(fn) for fn in (lambda size: jax.jvp(loss, (size,), (1.0,)), jax.value_and_grad(loss)))
-    slope, h = float(forward(0.0)[1]), 1e-6
-    difference = (float(forward(h)[0]) - float(forward(-h)[0])) / (2 * h)
-    assert abs(slope) > 1e-3
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
-    np.testing.assert_allclose(reverse(0.0)[1], slope, rtol=1e-9)
-
-
-def test_a_condition_selects_what_a_stage_computes():
-    """Drones publish at every step, but a stage that acts at every third step changes forces only then."""
-    sim = make_crowd_sim(2, 9)
-    rare_crowd = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
-    rare_crowd.__name__ = "crowd"
-    sim.step_pipeline["crowd"] = rare_crowd
-    data, step, forces = sim.data, Step(sim.step_pipeline), []
-    for _ in range(4):
-        before, data = data, step(data, jnp.int32(1))
-        forces.append(np.asarray(data.states.force))
-    np.testing.assert_array_equal(forces[0], forces[2])
-    assert np.any(forces[3] != forces[2])
-    expected = np.stack([crowd_forces(pos) for pos in np.asarray(before.states.pos, np.float64)])
-    np.testing.assert_allclose(forces[3], expected, rtol=1e-4, atol=1e-9)
 
 
 class Push(Plugin):

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim
@@ -14,9 +13,8 @@ from crazysim.engine.ir.program import Leaf, Program, Segment
 from crazysim.engine.ir.verify import VerificationError, verify
 from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lowering.stages import lower_stages
-from crazysim.engine.optimise import apply_passes
 from crazysim.engine.passes import schedule
-from crazysim.engine.stage import as_stages, stage
+from crazysim.engine.stage import as_stages
 
 N_WORLDS = 5
 F32 = np.float32
@@ -226,29 +224,7 @@ def test_verification_finds_phases_out_of_order():
         verify(Program(LEAVES, 1, (late, early)))
 
 
-def test_every_pass_is_verified_if_that_is_asked_for(monkeypatch):
-    monkeypatch.setenv("CRAZYSIM_VERIFY", "1")
-    with pytest.raises(VerificationError):
-        apply_passes(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken_program(writes=(Y, Z))])
-
-
 # Stages to programs -------------------------------------------------------------------------------------------------
-
-
-def test_a_guarded_stage_reads_what_it_may_leave_as_it_is():
-    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control="rotor_vel")
-
-    @stage("drone", when=lambda data: data.core.steps % 2 == 0)
-    def jump(data):
-        pos = jnp.stack([jnp.sin(data.states.vel[0]), data.states.pos[1], data.states.pos[2]])
-        return data.replace(states=data.states.replace(pos=pos))
-
-    program = verify(lower_stages([jump], sim.data))
-    (only,) = program.segments
-    names = {program.leaves[i].name for i, _ in only.reads}
-    assert names == {"core.steps", "states.pos", "states.vel"}
-    assert [program.leaves[i].name + str(k) for i, k in only.writes] == ["states.pos0"]
-    assert [x.name for x in only.block.walk()][-2:] == ["when", "sin"]
 
 
 def test_zeros_of_shared_parameters_are_no_inputs():

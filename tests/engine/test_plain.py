@@ -53,34 +53,6 @@ def test_leaves_that_no_stage_writes_are_returned_as_the_same_arrays(data, step)
         assert after.core.episode is data.core.episode
 
 
-@pytest.mark.parametrize(
-    "stage, fragments",
-    [
-        (
-            lambda d: d.replace(states=d.states.replace(vel=d.states.vel[..., :2])),
-            ("'mine'", "shape (3, 2, 3) and type float32 into shape (3, 2, 2)"),
-        ),
-        (
-            lambda d: d.replace(core=d.core.replace(steps=d.core.steps.astype(float))),
-            ("'mine'", "type int32 into shape (3, 1) and type float32"),
-        ),
-        (
-            lambda d: d.replace(plugins={"new": jnp.zeros(3)}),
-            ("'mine'", "structure", "make such changes before the step"),
-        ),
-        (lambda d: d.replace(states=d.states.replace(force=None)), ("'mine'", "structure")),
-        (lambda d: d.replace(params=d.params.replace(mass=jnp.ones((3, 2, 1)))), ("'mine'", "shape (1,)")),
-        (lambda d: None, ("'mine'",)),
-    ],
-)
-def test_law_09_a_stage_that_does_not_keep_the_record_is_named(sim, stage, fragments):
-    step = Step(sim.step_pipeline | {"mine": stage}, "plain")
-    with pytest.raises(ValueError) as error:
-        step(sim.data, jnp.int32(1))
-    for fragment in fragments:
-        assert fragment in str(error.value)
-
-
 def test_a_reset_runs_its_stages_in_order_with_default_and_mask(sim, data):
     seen = []
 

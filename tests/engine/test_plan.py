@@ -110,13 +110,6 @@ def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
         assert Step(sim.step_pipeline).plan(sim.data).engine == "plain"
 
 
-def test_planning_traces_what_the_first_call_runs(sim):
-    for n_steps in (jnp.int32(2), 2):
-        step = Step(sim.step_pipeline)
-        step(sim.data, n_steps)
-        assert step._cache_size() == 1
-
-
 def test_an_error_of_a_stage_is_raised_unchanged(sim):
     """No engine could run the stage, so its error is raised unchanged, without a warning."""
 
@@ -280,11 +273,6 @@ class Push:
 
     def __call__(self, data):
         return data.replace(states=data.states.replace(force=self.force + 0 * data.states.pos))
-
-
-def test_callable_objects_without_a_hash_are_planned(sim):
-    plan = Step(make_pipeline(sim, Stage(Push(0.01), "drone", name="push")), "lanes", strict=True).plan(sim.data)
-    assert "push" in {name for segment in plan.program.segments for name in segment.stages}
 
 
 @stage("drone")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import ConfigError, PyTree, leaf, static
-from crazysim.engine.pytree import as_parameter, check_axes, map_batched, scopes, select_worlds
+from crazysim.engine.pytree import check_axes, map_batched, scopes, select_worlds
 
 
 class Rotor(PyTree):
@@ -89,16 +89,3 @@ def test_select_worlds_takes_the_new_value_where_the_mask_says(n_worlds, n_drone
     expected = np.where(mask[:, None, None], -1.0 - old, old)
     for shape in ((n_worlds,), (n_worlds, 1)):
         np.testing.assert_array_equal(select_worlds(jnp.asarray(mask.reshape(shape)), -1.0 - old, old), expected)
-
-
-def test_select_worlds_widens_a_shared_value_and_takes_all_without_a_mask():
-    old = jnp.arange(6.0).reshape(3, 2, 1)
-    out = select_worlds(jnp.array([True, False, True]), jnp.array([9.0]), old)
-    np.testing.assert_array_equal(out[..., 0], [[9, 9], [2, 3], [9, 9]])
-    np.testing.assert_array_equal(select_worlds(None, jnp.array([9.0]), old), np.full((3, 2, 1), 9.0))
-
-
-def test_as_parameter_is_floating_and_never_a_bare_scalar():
-    assert as_parameter(3).shape == (1,)
-    assert as_parameter(3).dtype == jnp.float32
-    assert as_parameter(np.ones((3, 3), np.float64)).dtype == jnp.float32

@@ -9,7 +9,6 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from crazysim import ConfigError, Sim
 from crazysim.core import functional as F
-from crazysim.core.pipeline import append_fn
 from crazysim.engine.pytree import scopes
 from crazysim.engine.sharding import WORLD_AXIS, shard, shardings_of, world_mesh
 
@@ -72,23 +71,6 @@ def test_steps_commands_and_resets_keep_the_sharding_and_give_the_same_numbers(s
             getattr(sharded_sim.data.states, name), getattr(single_sim.data.states, name), rtol=1e-5, atol=1e-6
         )
     np.testing.assert_array_equal(sharded_sim.data.core.steps[:, 0], [20, 50, 50, 20])
-
-
-def test_law_06_sharded_steps_trace_once(sharded_sim):
-    traces = []
-
-    def count(data):
-        traces.append(None)
-        return data
-
-    append_fn(sharded_sim.step_pipeline, count)
-    sharded_sim.build_step_fn()
-    for k in range(3):
-        sharded_sim.attitude_control(COMMAND if k else COMMAND.tolist())
-        sharded_sim.step(k + 1)
-        sharded_sim.reset(np.array([True, False, False, False]))
-        sharded_sim.data = with_states(sharded_sim.data, pos=[0, 0, 1.0])
-    assert len(traces) == 1
 
 
 def test_a_step_needs_no_communication_between_devices(sharded_sim):

@@ -50,10 +50,6 @@ def test_the_function_is_applied_to_every_world(n_worlds, n_drones):
     assert after.opaque is record.opaque
 
 
-def test_a_shared_leaf_may_be_returned_for_every_world():
-    np.testing.assert_array_equal(vmap_worlds(lambda world: world.shared)(numbers(3, 1)).shape, (3, 2))
-
-
 @pytest.mark.parametrize("name", ["shared", "opaque"])
 def test_leaves_that_all_worlds_share_cannot_be_changed(name):
     def greedy(world):

@@ -24,7 +24,7 @@ from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.random import drone_key
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, explain
-from crazysim.engine.backends import cuda, kernel, lanes, native
+from crazysim.engine.backends import cuda, kernel, lanes
 from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.engine.sharding import put_on_device
@@ -214,11 +214,6 @@ def test_a_stage_of_one_world_is_in_the_kernel():
     result = step(data, jnp.int32(1)).states.force
     assert np.abs(result).max() > 1e-4
     np.testing.assert_allclose(result, separation(data).states.force, rtol=2e-5, atol=2e-6)
-
-
-def test_a_stage_of_one_world_splits_a_large_swarm():
-    sim, data = make_sim_with_stages(MAX_UNROLLED_DRONES + 1, separation)
-    assert f"unrolled for at most {MAX_UNROLLED_DRONES} drones" in explain(Step(sim.step_pipeline), data)
 
 
 @pytest.mark.parametrize("fn, words", [
@@ -420,32 +415,7 @@ def test_a_rollout_stages_commands_like_the_setter():
     np.testing.assert_allclose(result.states.pos, expected.states.pos, rtol=1e-5)
 
 
-def test_a_rollout_has_a_gradient():
-    sim = Sim(n_worlds=1, n_drones=1, dynamics="so_rpy", control="attitude", attitude_freq=100)
-    data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 0.5))
-    step = sim.build_step_fn()
-
-    def height(gain):
-        return rollout(step, data, climb_policy, gain, 20, 5)[0].states.pos[0, 0, 2]
-
-    value_and_slope = jax.jit(jax.value_and_grad(height))
-    (low, _), (_, slope), (high, _) = (value_and_slope(jnp.float32(gain)) for gain in (0.29, 0.3, 0.31))
-    central = float(high - low) / 0.02
-    assert slope > 0.01
-    np.testing.assert_allclose(slope, central, rtol=2e-2)  # float32: 1e-7 m over 0.02
-
-
 # Choice --------------------------------------------------------------------------------------------------------------
-
-
-def test_auto_takes_the_kernel_and_says_so():
-    if native.compiler() is None:
-        pytest.skip("no C++ compiler here")
-    sim = shared_sim(n_worlds=1, n_drones=1, control="state")
-    text = sim.explain()
-    assert text.startswith("engine: fused")
-    assert "fused, for one drone: state_controller, attitude_controller" in text
-    assert "compiled by" in text
 
 
 def select_controller(state, setpoint, time):

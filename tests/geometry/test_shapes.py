@@ -22,15 +22,6 @@ def test_shapes_are_equal_by_content():
     assert hull(CUBE) != hull(2 * CUBE)
 
 
-def test_a_shape_does_not_change_with_the_array_it_was_made_of():
-    vertices = CUBE.copy()
-    shape = hull(vertices)
-    vertices[:] = 0
-    np.testing.assert_array_equal(shape.vertices, CUBE)
-    with pytest.raises(ValueError, match="read-only"):
-        shape.vertices[0, 0] = 1
-
-
 @pytest.mark.parametrize("n", [4, 12, 40])
 def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     vertices = rng.normal(size=(n, 3))

@@ -13,19 +13,16 @@ from cases import (
     hover_command,
     hover_rotor_state,
     hover_thrust,
-    leaf_on_host,
     repeat_command,
     send,
     shared_sim,
     trees_equal,
-    with_params,
     with_states,
     zero_thrust_command,
 )
 
-from crazysim import PyTree, Sim, leaf
+from crazysim import Sim
 from crazysim.core.integration import FLOOR_HEIGHT
-from crazysim.engine.pytree import n_batch_axes, scopes
 
 
 @functools.cache
@@ -243,87 +240,3 @@ def test_fault_13_a_drone_that_has_fallen_stays_where_it_came_down(integrator):
     np.testing.assert_array_equal(later.states.pos, down.states.pos)
     np.testing.assert_allclose(later.states.quat, down.states.quat, atol=1e-5)  # rounding of 250 normalisations
     np.testing.assert_array_equal(later.states.ang_vel, 0.0)
-
-
-class Queue(PyTree):
-    """A record of a user, with a leaf per drone, a leaf per world, and a shared leaf."""
-
-    waiting: jax.Array = leaf("drone", 2)
-    seen: jax.Array = leaf("world")
-    table: jax.Array = leaf("shared", 1)
-
-
-@pytest.fixture(scope="module")
-def used_data():
-    data, step, reset = build_program("first_principles", "state")
-    queue = Queue(jnp.zeros((3, 2, 4, 16)), jnp.zeros((3, 1)), jnp.arange(5.0))
-    default = data.replace(plugins={"queue": queue, "undeclared": jnp.zeros((3, 2))})
-    drawn = np.random.default_rng(3).uniform(0.03, 0.05, (3, 2, 1)).astype(np.float32)
-    used = with_params(default, mass=drawn, gravity_vec=np.float32([0, 0, -1.62]))
-    command = np.tile(np.float32([1, 1, 1, *np.zeros(9), 1, 0, 0, 0]), (3, 2, 1))
-    used = run_steps(step, send(used, command), 30)
-    used_queue = Queue(jnp.ones((3, 2, 4, 16)), jnp.full((3, 1), 9.0), 2 * jnp.arange(5.0))
-    return default, used.replace(plugins={"queue": used_queue, "undeclared": jnp.ones((3, 2))}), reset
-
-
-def named_leaves(data):
-    return {jax.tree_util.keystr(k): leaf_on_host(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
-
-
-def test_fault_16_a_full_reset_restores_all_worlds_and_shared_leaves(used_data):
-    default, used, reset = used_data
-    full, masked = reset(used, default), reset(used, default, jnp.ones(3, bool))
-    assert jax.tree.structure(full) == jax.tree.structure(masked)
-    per_world = dict(zip(named_leaves(full), (n_batch_axes(s) > 0 for s in jax.tree.leaves(scopes(full))), strict=True))
-    masked, full, start, before = (named_leaves(x) for x in (masked, full, default, used))
-    assert len(full) > 40
-    n_changed = 0
-    for name, value in full.items():
-        if per_world[name]:
-            np.testing.assert_array_equal(masked[name], value, err_msg=name)
-        elif name not in (".core.rng_key", ".core.mjx_synced"):
-            np.testing.assert_array_equal(value, start[name], err_msg=name)
-            np.testing.assert_array_equal(masked[name], before[name], err_msg=name)
-            n_changed += not np.array_equal(before[name], start[name])
-    assert n_changed >= 2, "gravity and an undeclared array were changed"
-    one_by_one = used
-    for world in range(3):
-        one_by_one = reset(one_by_one, default, jnp.arange(3) == world)
-    for name, value in named_leaves(one_by_one).items():
-        if per_world[name]:
-            np.testing.assert_array_equal(full[name], value, err_msg=name)
-
-
-def test_fault_16_a_masked_reset_changes_its_worlds_only(used_data):
-    default, used, reset = used_data
-    mask = np.array([True, False, True])
-    before, after, default_leaves = (
-        named_leaves(used),
-        named_leaves(reset(used, default, jnp.asarray(mask))),
-        named_leaves(default),
-    )
-    world_leaves = [
-        name
-        for name, x in before.items()
-        if x.shape[:2] in ((3, 2), (3, 1)) and name not in (".plugins['undeclared']",)
-    ]
-    assert {".params.mass", ".plugins['queue'].waiting", ".plugins['queue'].seen", ".states.pos"} <= set(world_leaves)
-    assert len(world_leaves) > 20
-    for name in world_leaves:
-        np.testing.assert_array_equal(after[name][~mask], before[name][~mask], err_msg=name)
-        if name != ".core.episode":
-            default_value = np.broadcast_to(default_leaves[name], before[name].shape)
-            np.testing.assert_array_equal(after[name][mask], default_value[mask], err_msg=name)
-    np.testing.assert_array_equal(after[".core.episode"][:, 0], mask)
-    for name in set(before) - set(world_leaves) - {".core.mjx_synced"}:
-        np.testing.assert_array_equal(
-            after[name], before[name], err_msg=f"{name} is shared or opaque: no masked reset changes it"
-        )
-    # These leaves must differ from their defaults, or the test would prove nothing.
-    for name in (
-        ".params.gravity_vec",
-        ".plugins['undeclared']",
-        ".plugins['queue'].table",
-        ".plugins['queue'].waiting",
-    ):
-        assert not np.array_equal(before[name], default_leaves[name]), name

@@ -18,7 +18,7 @@ from crazysim.core import functional as F
 from crazysim.scene import mjx_scene
 from crazysim.scene.sync import poses_of, sync_poses
 from crazysim.sim import Sim
-from crazysim.sim.sim import sync_sim2mjx, use_box_collision
+from crazysim.sim.sim import sync_sim2mjx
 
 FREE_HEIGHT = 1.0
 """Height, m, at which a drone touches nothing."""
@@ -110,20 +110,6 @@ def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
     sim.mjx_data = scene_with_ball(sim, 5, FREE_HEIGHT)
     assert drone_touches(sim) == [True, True]
     assert len(syncs) == 4
-
-
-def test_contacts_after_box_collision_are_those_of_boxes(one_world_sim):
-    """At a height of 5 cm, the sphere of 8.6 cm touches the floor, and the box of 2 cm half height does not."""
-    sync_scene(one_world_sim, 0.05)
-    assert drone_touches(one_world_sim) == [True]
-    slots = one_world_sim.contacts().shape
-    use_box_collision(one_world_sim)
-    try:
-        assert one_world_sim.contacts().shape != slots
-        assert drone_touches(one_world_sim) == [False]
-    finally:
-        use_box_collision(one_world_sim, False)
-    assert drone_touches(one_world_sim) == [True]
 
 
 def assign_synced(sim):

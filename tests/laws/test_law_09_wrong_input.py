@@ -301,9 +301,3 @@ def test_a_simulation_in_place_of_its_data_is_refused_by_pure_functions(sim, cal
     for data in (sim, None):
         with pytest.raises(ConfigError, match=r"expected the data of a simulation, got .*sim\.data"):
             call(sim, data)
-
-
-def test_default_data_of_another_simulation_are_refused_by_a_reset(sim):
-    for other in (Sim(n_worlds=2), Sim(n_worlds=3, control="state")):
-        with pytest.raises(ConfigError, match="of one simulation"):
-            sim.reset_fn(sim.data, other.default_data)

@@ -79,22 +79,6 @@ def test_the_seed_of_construction_and_of_seed_are_one(four_world_sim):
     np.testing.assert_array_equal(sim.data.params.mass[..., 0], masses_after_resets(four_world_sim, None, seed=7))
 
 
-def test_resets_and_steps_leave_the_seeds_key(four_world_sim):
-    """Stages of the batch may split the key. A reset that changed it would make worlds depend on each other."""
-    masses_after_resets(four_world_sim, None, [True, False, False, True])
-    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(7)))
-    four_world_sim.step(2)
-    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(7)))
-
-
-def test_seed_survives_new_data(four_world_sim):
-    four_world_sim.seed(11)
-    before = four_world_sim.data
-    four_world_sim.build_data()
-    np.testing.assert_array_equal(leaf_on_host(four_world_sim.data.core.rng_key), leaf_on_host(jax.random.key(11)))
-    four_world_sim.data = before
-
-
 def key_numbers(data, name="wind"):
     """Return the numbers of the keys of a stage: of worlds (n_worlds, 2) and of drones (n_worlds, n_drones, 2)."""
     return leaf_on_host(world_keys(data, name)), leaf_on_host(drone_keys(data, name))

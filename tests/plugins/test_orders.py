@@ -350,19 +350,6 @@ def test_law_09_a_plugin_that_another_one_needs_cannot_be_removed(needed, plugin
     assert list(sim.plugins) == ["motion_capture"]
 
 
-def test_a_removed_load_is_forgotten_and_stays_where_it_was():
-    sim = Sim(plugins=[SlungLoad(0.01, length=0.3)])
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.full((1, 1, 3), (1, 2, 1), np.float32)))
-    load = sim.data.plugins["load"]
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {"load": load.replace(pos=load.pos + 1.0)})
-    sim.contact_report()
-    pos = np.asarray(sim.data.plugins["load"].pos[:, 0])
-    sim.remove("load")
-    sim.step()
-    np.testing.assert_array_equal(sim.data.objects.pos[:, 0, sim.data.objects.names.index("load:0")], pos)
-    assert "load" not in sim.plugins._move_objects
-
-
 PLUGINS = {
     "battery": Battery,
     "battery_voltage": BatteryVoltage,

@@ -320,15 +320,6 @@ def test_after_a_spec_that_does_not_compile_the_old_scene_stays():
     assert sim.mj_model.geom("wrong").size[0] == 0.1
 
 
-def test_a_spec_that_has_lost_a_drone_is_refused():
-    sim = Sim(n_drones=2)
-    model = sim.mj_model
-    sim.spec.body("drone:1").mocap = False
-    with pytest.raises(ValueError, match="expected a mocap body 'drone:1', got none"):
-        sim.build_mjx()
-    assert sim.mj_model is model
-
-
 @pytest.fixture(scope="module")
 def unsupported_by_mjx():
     """Return a world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""

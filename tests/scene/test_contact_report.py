@@ -9,7 +9,6 @@ import pytest
 from crazysim import ConfigError, ContactLog, Sim
 from crazysim.engine import Step
 from crazysim.engine.stage import stage
-from crazysim.scene.contact_report import DRONES_PER_CHUNK
 from crazysim.sim.sim import use_box_collision
 
 N_WORLDS, N_DRONES = 40, 3
@@ -138,20 +137,6 @@ def test_reports_of_one_drone_one_world_and_all_worlds_agree(scattered_course):
     )
     np.testing.assert_allclose(states.force, expected, atol=1e-5)
     np.testing.assert_allclose(states.torque, full_report.object_distance[..., :3], atol=1e-5)
-
-
-def test_distances_in_a_large_swarm_are_computed_in_chunks():
-    n = DRONES_PER_CHUNK + 9
-    sim = Sim(n_worlds=2, n_drones=n, control="attitude")
-    rng = np.random.default_rng(1)
-    pos = np.float32(rng.uniform(0, 3, (2, n, 3)))
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-    report = sim.contact_report(())
-    centres = pos.astype(np.float64) + np.asarray(sim.airframe.value("shape.collision_sphere"))[:3]
-    distances = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 1e9 * np.eye(n)
-    radius = float(np.asarray(sim.airframe.value("shape.collision_sphere"))[3])
-    np.testing.assert_allclose(report.drone_distance, distances.min(axis=-1) - 2 * radius, atol=SPHERE_TOLERANCE)
-    np.testing.assert_array_equal(report.nearest_drone, distances.argmin(axis=-1))
 
 
 @pytest.mark.long("builds a scene of 4,096 drones")

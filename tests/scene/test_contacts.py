@@ -169,10 +169,6 @@ def test_contacts_of_a_body_are_its_own_slots(scattered_scene, body):
     np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & belongs_to_body)
 
 
-def test_a_body_without_geoms_touches_nothing(scattered_scene):
-    assert not np.asarray(scattered_scene[0].contacts("_dummy")).any()
-
-
 def test_a_closed_over_scene_gives_the_same_contacts(scattered_scene):
     """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
     sim = scattered_scene[0]

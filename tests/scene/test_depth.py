@@ -12,7 +12,6 @@ import pytest
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.engine.backends import native
 from crazysim.errors import EngineWarning
-from crazysim.scene.depth import pixel_directions
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
 HIT_FIELDS = ("body_index", "distance", "normal", "point")
@@ -24,12 +23,6 @@ def place_drones(sim, pos, quat=None):
     if quat is not None:
         states = states.replace(quat=np.float32(quat))
     sim.data = sim.data.replace(states=states)
-
-
-def pixel_directions_in_world(width=WIDTH, height=HEIGHT, fovy=FOVY):
-    """Return the directions of the pixels of a level drone's camera, world frame: ahead is x, right is -y."""
-    d = pixel_directions(fovy, width, height)
-    return np.stack([-d[..., 2], -d[..., 0], d[..., 1]], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -47,44 +40,6 @@ def room():
 def front_depth(room):
     """Return a function from data to hits of the first drone's camera, other drones left out."""
     return jax.jit(room[0].scene.depth_fn("fpv_cam:0", WIDTH, HEIGHT, drones=False, along="ray"))
-
-
-def test_rays_hit_wall_floor_and_ball_at_the_exact_distances(room, front_depth):
-    sim, _, _ = room
-    camera_pos = np.asarray(sim.airframe.value("shape.fpv_camera")) + [0, 0, 1]
-    direction = pixel_directions_in_world()
-    with np.errstate(divide="ignore"):
-        wall = (3 - 0.025 - camera_pos[0]) / direction[..., 0]
-        floor = np.where(direction[..., 2] < 0, -camera_pos[2] / direction[..., 2], np.inf)
-    to_ball = np.array([1.5, 0.2, 1.1]) - camera_pos
-    ball_depth = direction @ to_ball
-    square = 0.2**2 - (to_ball @ to_ball - ball_depth**2)
-    ball = np.where(square > 0, ball_depth - np.sqrt(np.maximum(square, 0)), np.inf)
-    expected = np.minimum(np.minimum(wall, floor), ball)
-    hits = jax.device_get(front_depth(sim.data))
-    np.testing.assert_allclose(hits.distance[0, 0], expected, rtol=1e-5)
-    nearest = np.stack([floor, wall, ball]).argmin(axis=0)
-    names = np.array(hits.names)[hits.body_index[0, 0]]
-    np.testing.assert_array_equal(names, np.array(["floor", "wall:0", "sphere:0"])[nearest])
-    assert set(nearest.ravel()) == {0, 1, 2}
-    normal = hits.normal[0, 0]
-    np.testing.assert_allclose(
-        normal[nearest == 0], np.broadcast_to([0, 0, 1.0], normal[nearest == 0].shape), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        normal[nearest == 1], np.broadcast_to([-1.0, 0, 0], normal[nearest == 1].shape), atol=1e-6
-    )
-    point = camera_pos + direction * expected[..., None]
-    np.testing.assert_allclose(normal[nearest == 2], ((point - [1.5, 0.2, 1.1]) / 0.2)[nearest == 2], atol=1e-4)
-
-
-def test_depth_along_the_axis_is_constant_on_a_wall(room):
-    sim, _, _ = room
-    depth = np.asarray(sim.depth("fpv_cam", WIDTH, HEIGHT, drones=False))
-    assert depth.shape == (2, 2, HEIGHT, WIDTH)
-    camera_x = np.asarray(sim.airframe.value("shape.fpv_camera"))[0]
-    np.testing.assert_allclose(depth[:, 0, 0], 3 - 0.025 - camera_x, rtol=1e-5)  # the upper row sees only the wall
-    np.testing.assert_allclose(depth[:, 1, 0], 3 - 0.025 - camera_x - 0.5, rtol=1e-5)
 
 
 def test_depth_follows_the_objects_of_each_world(room, front_depth):
@@ -253,29 +208,6 @@ def test_a_range_finder_finds_the_first_of_many_objects(x64, rng):
     for k, shift in enumerate(h * np.eye(3)):
         sums = [np.sum(weight * np.asarray(weighted_distance(start + sign * shift)[1][0]), axis=-1) for sign in (1, -1)]
         np.testing.assert_allclose(gradient[..., k], (sums[0] - sums[1]) / (2 * h), atol=1e-7)
-
-
-def test_a_range_finder_measures_many_movable_objects_like_fixed_ones(rng):
-    """A stage of all worlds measures them at the same steps, and at their poses in each world."""
-    pos, quat = rng.uniform([-2, -2, 0.2], [2, 2, 2], (20, 3)), rng.normal(size=(20, 4))
-    start = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (6, 2, 3))
-    distance = []
-    for mocap in (False, True):
-        sim = Sim(6, 2, control="attitude")
-        boxes = sim.scene.add("box", count=20, pos=pos, quat=quat, size=(0.5, 0.5, 0.5), mocap=mocap)
-        sim.add(RangeFinder(freq=250, drones=True, max_range=2.0))
-        place_drones(sim, start)
-        sim.step(5)
-        distance.append(np.asarray(sim.data.plugins["range_finder"].distance))
-        assert ("'range_finder' is not fused: rays among 22 movable" in sim.explain()) == mocap
-    np.testing.assert_allclose(distance[1], distance[0], atol=1e-5)
-    assert 0.1 < np.mean(distance[0] < 2.0) < 0.9
-    sim.data = boxes.set_pose(sim.data, pos - [0, 0, 50])
-    sim.step(1)
-    np.testing.assert_array_equal(sim.data.plugins["range_finder"].distance, distance[1])  # not at odd steps
-    sim.step(1)
-    later_distance = np.asarray(sim.data.plugins["range_finder"].distance)
-    assert np.mean(later_distance < 2.0) < np.mean(distance[1] < 2.0)
 
 
 def test_a_range_finder_measures_at_its_rate():
@@ -468,14 +400,6 @@ def test_rays_return_the_right_one_of_many_equal_geoms(forest, rng, platform):
         hit_names.add(body.name)
     assert len(hit_names) > 50
     assert kernels.last_used.startswith("one kernel" if platform else "XLA")
-
-
-def test_explain_names_the_kernel_of_an_image(forest):
-    forest.depth("fpv_cam", 8, 6)
-    line = forest.explain().splitlines()[-1]
-    assert line.startswith(
-        "rays: one kernel with a lane for each ray; 111 fixed geoms in a hierarchy, 52 movable geoms"
-    )
 
 
 def test_rays_whose_kernel_is_refused_are_cast_by_xla_with_a_warning(monkeypatch):

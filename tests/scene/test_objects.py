@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from pictures import encode_png
 
 from crazysim import Sim
-from crazysim.engine.stage import stage
 from crazysim.scene import build
 from crazysim.scene.objects import PRIMITIVES
 
@@ -103,23 +101,6 @@ def test_set_pose_is_pure_masked_and_differentiable(course):
     assert gradient == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
 
 
-def test_a_stage_of_one_world_moves_objects():
-    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
-    pad = sim.scene.add("landing_pad", pos=np.array([[[0, 0, 0.5]], [[1, 0, 0.5]]]))
-
-    @stage("world")
-    def drift(data):
-        pos, _ = pad.pose(data)
-        return pad.set_pose(data, pos + jnp.array([0.001, 0, 0]), vel=jnp.array([0.5, 0, 0]))
-
-    sim.step_pipeline["drift"] = drift
-    sim.build_step_fn()
-    sim.step(100)
-    assert "splits the step" not in sim.explain()
-    np.testing.assert_allclose(sim.data.objects.vel, np.broadcast_to([0.5, 0, 0], (2, 1, 1, 3)))
-    np.testing.assert_allclose(np.asarray(pad.pose(sim.data)[0])[:, 0, 0], [0.1, 1.1], atol=1e-5)
-
-
 @pytest.mark.parametrize("primitive", PRIMITIVES)
 def test_every_primitive_is_touched_by_drones_only(primitive):
     sim = Sim()
@@ -133,24 +114,3 @@ def test_every_primitive_is_touched_by_drones_only(primitive):
         assert (contype[drone] & conaffinity[g]) | (contype[g] & conaffinity[drone])
         assert not (contype[floor] & conaffinity[g]) | (contype[g] & conaffinity[floor])
         np.testing.assert_allclose(model.geom_rgba[g], (1, 0, 0, 1))
-
-
-def test_a_scene_loads_with_mesh_texture_and_height_field(tmp_path):
-    """An MJCF of a user with files in its folder, to which an object is added."""
-    (tmp_path / "hill.png").write_bytes(encode_png(np.arange(16).reshape(4, 4) * 16))
-    scene = tmp_path / "scene.xml"
-    scene.write_text("""
-    <mujoco><asset>
-      <hfield name="hill" size="2 2 0.5 0.1" file="hill.png"/>
-      <mesh name="rock" vertex="0 0 0.3  0.2 0 0  -0.2 0.2 0  -0.2 -0.2 0"/>
-      <texture name="paint" type="2d" file="hill.png"/><material name="paint" texture="paint"/>
-    </asset><worldbody>
-      <geom name="ground" type="hfield" hfield="hill"/>
-      <body name="rock" pos="1 1 1"><geom type="mesh" mesh="rock" material="paint"/></body>
-    </worldbody></mujoco>""")
-    sim = Sim(xml_path=scene, n_worlds=2, engine="lanes")
-    sim.scene.add("gate", pos=[0, 0, 2])
-    assert sim.scene.object_names == ("rock", "gate:0")
-    report = sim.contact_report(drones=False)
-    assert np.isfinite(report.object_distance).all()
-    assert np.isfinite(report.floor_distance).all()

@@ -5,7 +5,6 @@ import pytest
 from cases import CAMERA_HEIGHT, FOVY
 from pictures import has_colour
 
-from crazysim.scene.overlays import Overlays
 from crazysim.sim import Sim
 from crazysim.sim.visualize import (
     change_material,
@@ -89,15 +88,6 @@ def test_overlays_are_kept_through_steps_and_failed_images(sim):
         take_picture(sim, camera="nobody")
     assert has_colour(take_picture(sim), GREEN).any()
     sim.data = data
-
-
-def test_drawing_uses_no_global_random_numbers(sim):
-    """Crazyflow's draw_line draws from NumPy's global generator, so that images change a flight with random numbers."""
-    before = np.random.get_state()  # noqa: NPY002
-    draw_line(sim, np.zeros((5, 3)))
-    take_picture(sim)
-    for result, expected in zip(np.random.get_state(), before, strict=True):  # noqa: NPY002
-        np.testing.assert_array_equal(result, expected)  # the position in the generator's block of numbers, too
 
 
 # Text and setpoints ---------------------------------------------------------------------------------------------
@@ -190,48 +180,6 @@ def test_an_led_lights_up_on_its_drone_only(sim):
     assert lit.any()
     assert bright[lit][:, 0].mean() > dull[lit][:, 0].mean() + 10
     np.testing.assert_array_equal(take_picture(sim), before)
-
-
-def test_colours_may_be_one_for_each_drone(sim):
-    before = take_picture(sim)
-    change_material(sim, "led_top", [0, 1], rgba=[RED, BLUE], emission=[1.0, 1.0])
-    picture = take_picture(sim)
-    change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
-    (east, _), (west, _) = (
-        positions_of_pixels(has_colour(picture, rgba) & ~has_colour(before, rgba)) for rgba in (RED, BLUE)
-    )  # the noses of the drones are red, too
-    assert len(east) > 0
-    assert len(west) > 0
-    assert east.min() > 0 > west.max()
-    np.testing.assert_array_equal(take_picture(sim), before)
-
-
-def test_the_lower_led_is_visible_from_below(opengl):
-    sim = Sim(n_worlds=2)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.ones((2, 1, 3), np.float32)))
-    shot = {"mode": "rgb_array", "width": 256, "height": 192}
-    counts = {}
-    for side, elevation in (("above", -60), ("below", 60)):
-        for led in ("led_top", "led_bot"):
-            change_material(sim, led, [0], rgba=GREEN, emission=1.0)
-            view = {"lookat": [1, 1, 1], "distance": 0.2, "azimuth": 0, "elevation": elevation}
-            counts[side, led] = has_colour(sim.render(**shot, cam_config=view).astype(int), GREEN).sum()
-            change_material(sim, led, [0], rgba=[1, 1, 1, 0.15], emission=0.0)
-    sim.close()
-    assert counts["above", "led_top"] > 10 > counts["above", "led_bot"]
-    assert counts["below", "led_bot"] > 10 > counts["below", "led_top"]
-
-
-def test_the_limit_of_overlays_can_be_raised():
-    """An image takes as many geoms as the limit allows."""
-    overlays = Overlays(limit=3)
-    overlays.points(np.zeros((3, 3)), RED, 0.1)
-    with pytest.raises(ValueError, match=r"at most 3 overlays in one image, got 4. Increase sim\.max_visual_geom"):
-        overlays.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(overlays) == 3
-    overlays.limit = 4
-    overlays.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(overlays) == 4
 
 
 def test_as_many_overlays_as_allowed_fit_into_an_image(sim):

@@ -175,14 +175,6 @@ def test_every_call_uses_its_own_arguments(sim, empty_image):
     np.testing.assert_array_equal(sim.render(**SHOT), first)
 
 
-def test_images_of_many_sizes_are_drawn_in_turn(sim):
-    """There are more sizes than OpenGL contexts are kept for, and some are larger than all before them."""
-    sizes = [(48, 32), (2000, 40), (64, 64), (33, 17), (40, 1100), (160, 120), (48, 32)]
-    for width, height in sizes:
-        assert sim.render(**SHOT | {"width": width, "height": height}).shape == (height, width, 3)
-    np.testing.assert_array_equal(sim.render(**SHOT), sim.render(**SHOT | {"width": np.int64(WIDTH)}))
-
-
 def test_a_second_simulation_draws_beside_the_first(sim):
     """Two simulations draw in turns, each its own drones; a closed one can draw again."""
     before = sim.render(**SHOT)
@@ -215,12 +207,6 @@ def test_depth_is_the_distance_along_the_axis_in_metres(sim):
     outside = depth.copy()
     outside[row - 12 : row + 13, column - 12 : column + 13] = CAMERA_HEIGHT
     np.testing.assert_allclose(outside, CAMERA_HEIGHT, atol=2e-3)
-
-
-def test_colour_and_depth_of_one_call_equal_those_of_two_calls(sim):
-    color, depth = sim.render(**SHOT | {"mode": "rgbd_tuple"})
-    np.testing.assert_array_equal(color, sim.render(**SHOT))
-    np.testing.assert_array_equal(depth, sim.render(**SHOT | {"mode": "depth_array"}))
 
 
 # Windows --------------------------------------------------------------------------------------------------------
@@ -413,21 +399,3 @@ def test_a_program_that_does_not_close_its_simulation_exits_without_errors(openg
     assert done.returncode == 0
     assert not done.stderr
     assert not done.stdout
-
-
-def test_the_floor_casts_no_shadow_on_itself(opengl, rng):
-    """No pixel of the empty floor is darker with shadows than without; a shadow takes 40 of 255 levels."""
-    model = mujoco.MjModel.from_xml_path(str(SCENE_FILE))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    with mujoco.Renderer(model, 180, 320) as renderer:
-        for _ in range(40):
-            camera.lookat[:] = *rng.uniform(-0.5, 0.5, 2), 0.4
-            camera.distance, camera.azimuth, camera.elevation = rng.uniform([1, 0, -60], [4, 360, -15])
-            images = []
-            for casts_shadow in (True, False):
-                model.light_castshadow[:] = casts_shadow
-                renderer.update_scene(data, camera)
-                images.append(renderer.render().astype(int))
-            assert (images[1] - images[0]).max() < 15, f"{camera.azimuth} {camera.elevation} {camera.distance}"

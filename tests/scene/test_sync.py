@@ -131,14 +131,6 @@ def test_a_sync_leaves_bodies_of_users_unchanged(sim, synced_data):
         np.testing.assert_array_equal(getattr(mjx_data, name), getattr(sim.mjx_data, name), err_msg=name)
 
 
-def test_a_sync_only_sets_the_flag_in_the_data(sim, synced_data):
-    data, _ = synced_data
-    assert bool(data.core.mjx_synced)
-    assert not bool(sim.data.core.mjx_synced), "the original data are unchanged"
-    before, after = (d.replace(core=d.core.replace(mjx_synced=None, rng_key=None)) for d in (sim.data, data))
-    jax.tree.map(np.testing.assert_array_equal, before, after)
-
-
 @pytest.mark.long("compiles MJX's kinematics and contacts in a scan")
 @pytest.mark.parametrize("sim", [JOINT], ids=["joint"], indirect=True)
 def test_a_sync_works_in_jit_and_scan(sim, synced_data):

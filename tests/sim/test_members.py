@@ -41,12 +41,6 @@ def write_fleet(folder, vehicles=VEHICLES):
     return path
 
 
-def test_names_are_prefixes_with_numbers():
-    assert build_fleet().names == ("Crazyflie_0", "Bumblebee_0", "Crazyflie_1", "Mass_0", "Mass_1")
-    airframe = {"base": "cf21B_500", "name": "my hexa-rotor"}
-    assert Sim(drone=[airframe, "crazyflie"]).names == ("MyHexaRotor_0", "Crazyflie_0")
-
-
 def test_a_view_reads_the_data():
     sim = build_fleet()
     np.testing.assert_array_equal(sim["Bumblebee_0"].pos, sim.data.states.pos[:, 1])
@@ -169,9 +163,3 @@ def test_cars_of_a_file_are_adopted(tmp_path):
 def test_files_with_other_names_are_refused(tmp_path, vehicles, error, message):
     with pytest.raises(error, match=message):
         Sim.from_mjcf(write_fleet(tmp_path, vehicles))
-
-
-def test_a_name_twice_in_a_file_is_refused(tmp_path):
-    twice = [("Crazyflie_0", "0 0 1", "1 0 0 0")] * 2
-    with pytest.raises(ConfigError, match="Crazyflie_0"):
-        Sim.from_mjcf(write_fleet(tmp_path, twice))

@@ -28,16 +28,6 @@ def stepper(sim):
     return stepper
 
 
-def test_a_record_is_created_once_when_it_is_read(stepper):
-    assert stepper.data is stepper.data
-    before = stepper.data
-    stepper.advance(2)
-    assert stepper.data is not before
-    assert stepper.data is stepper.data
-    assert trees_equal(stepper.data, stepper.step(before, jnp.int32(2)))
-    np.testing.assert_array_equal(before.core.steps, 0)
-
-
 def test_a_step_that_compiles_for_long_is_announced_once(sim, stepper, monkeypatch):
     """The first step of a pipeline compiles, which takes most of a minute with a filter of many states."""
     announced = []

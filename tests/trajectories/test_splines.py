@@ -45,13 +45,6 @@ def test_a_natural_spline_equals_that_of_scipy(x64):
     np.testing.assert_allclose(positions(spline(TIMES, POINTS, 3, at_rest=False), times), expected(times), atol=1e-12)
 
 
-@pytest.mark.parametrize("start", [-2.0, 5.0])
-def test_the_first_time_is_the_start(start):
-    trajectory = spline(TIMES + start, POINTS)
-    np.testing.assert_allclose(positions(trajectory, np.array([0.7])), POINTS[1:2], atol=1e-5)
-    assert float(trajectory.duration) == 4.0
-
-
 def test_yaw_turns_the_shorter_way(x64):
     trajectory = spline([0.0, 1.0], [[0, 0, 1], [1, 0, 1]], 3, yaw=[3.0, -3.0])
     np.testing.assert_allclose(evaluate(trajectory, np.array([1.0, 0.5])).yaw, [[2 * np.pi - 3.0], [np.pi]])
@@ -76,10 +69,6 @@ def test_bezier_curves_equal_those_of_scipy(counts, n_axes, seed):
         expected = BPoly(curve[:, None], [begin, end])
         np.testing.assert_allclose(values[k], expected(times[k]), atol=2e-5)
         np.testing.assert_allclose(rates[k] * (end - begin), expected(times[k], 1) * (end - begin), atol=5e-4)
-
-
-def test_bezier_without_yaw_faces_along_x():
-    assert float(of_bezier([1.0], [np.ones((4, 3))]).evaluate(0.5).yaw[0]) == 0.0
 
 
 def test_bezier_repeats_on_request():

@@ -1,7 +1,6 @@
 """The record of a trajectory, against polynomials of NumPy and SciPy in float64."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import PPoly
@@ -172,15 +171,3 @@ def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
         s = jax.jit(jax.vmap(trajectory.evaluate))(t.astype(np.float32))
         assert s.snap.dtype == np.float32
         np.testing.assert_allclose(s.pos, exact, atol=1e-5)
-
-
-@pytest.mark.parametrize("order", [0, 2])
-def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
-    trajectory = Trajectory.of_pieces(*random_pieces(n_pieces=20))
-    times = np.linspace(-0.5, float(trajectory.duration) + 0.5, 60)
-    result = np.asarray(jax.jit(jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order))))(times))
-    setpoints = evaluate(trajectory, times)
-    assert result.shape == (60, order + 1, 4)
-    for k in range(order + 1):
-        np.testing.assert_allclose(result[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(result[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)

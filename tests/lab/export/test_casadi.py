@@ -238,20 +238,3 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
     sim.add(Downwash())
     with pytest.raises(ValueError, match=r"(?s)'downwash'.*all drones of its world"):
         to_casadi(sim)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"parameters": ["mass"]}, "got 'mass'; use one of .*params.mass"),
-        ({"parameters": ["states.pos"]}, "got 'states.pos'"),
-        ({"parameters": ["controls.rotor_vel"]}, "got 'controls.rotor_vel'"),
-        ({"parameters": "params.mass"}, "a list of distinct names"),
-        ({"parameters": ["params.mass", "params.mass"]}, "a list of distinct names"),
-        ({"world": 1}, "got world 1 and drone 0"),
-        ({"drone": -1}, "got world 0 and drone -1"),
-    ],
-)
-def test_wrong_input_is_an_error(options, words):
-    with pytest.raises(ValueError, match=words):
-        to_casadi(Sim(control="rotor_vel"), **options)

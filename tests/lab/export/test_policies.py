@@ -151,18 +151,6 @@ def test_onnx_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta,
     np.testing.assert_allclose(memory, last_memory, atol=2e-5)
 
 
-def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(
-    tmp_path, policy, meta, observations_and_actions
-):
-    obs, actions = observations_and_actions
-    path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
-    np.testing.assert_allclose(compile_header(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
-    in_cpp = tmp_path / "both.cpp"
-    in_cpp.write_text(f'#include "{to_c(policy, tmp_path / "policy.h", meta)}"\n#include "{path}"\n#include "{path}"\n'
-                    "void fly(const float *x, float *a) { policy(x, a); hover_v2(x, a); }\n")  # fmt: skip
-    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", in_cpp], check=True)
-
-
 def test_the_header_describes_inputs_and_outputs(tmp_path, policy, meta):
     text = to_c(policy, tmp_path / "policy.h", meta).read_text()
     assert "[0..2] ang_vel: angular velocity, body frame, rad/s" in text

@@ -424,12 +424,6 @@ def test_csv_files_with_few_faults_are_repaired(flights, tmp_path):
         read_log(tmp_path / "log.csv", Columns(voltage=("mode",)))
 
 
-def test_a_damaged_archive_is_refused(tmp_path):
-    (tmp_path / "log.npz").write_bytes(b"PK torn")
-    with pytest.raises(ConfigError, match=r"which is damaged or a file of another kind .* Copy or export it again\."):
-        read_log(tmp_path / "log.npz")
-
-
 @pytest.mark.long("compiles the gradient of a flight of 0.5 s, and trains")
 @pytest.mark.parametrize(
     "n_hidden", [4, pytest.param(0, marks=pytest.mark.slow("with hidden units the linear terms are trained too"))]

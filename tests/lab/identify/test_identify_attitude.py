@@ -9,7 +9,7 @@ from crazysim.__main__ import main
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import FittedModel, identify_attitude, prediction_errors, read_log
-from crazysim.lab.identify.attitude_logs import derivatives_svf, preprocessing, state_variable_filter
+from crazysim.lab.identify.attitude_logs import derivatives_svf, preprocessing
 from crazysim.lab.identify.fitted import sys_id_rotation, sys_id_translation
 from crazysim.sim import Sim
 
@@ -167,13 +167,6 @@ def test_a_residual_of_a_fitted_model_is_refused(flight, tmp_path, capsys):
     assert not out.exists()
 
 
-def test_the_longest_piece_without_gaps_is_named(flight):
-    log = read_log({key: np.delete(x, [*range(300, 330), *range(900, 940)]) for key, x in flight.items()})
-    first, last = flight["t"][[940, -1]]
-    with pytest.raises(ConfigError, match=f"expected no gaps, got 2.*from t = {first:.6g} to {last:.6g} s"):
-        identify_attitude([log], "cf2x_L250", MODEL, "flight")
-
-
 def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, capsys):
     path = tmp_path / "flight.npz"
     np.savez(path, **{key: x for key, x in flight.items() if not key.endswith("command")})
@@ -195,12 +188,3 @@ def test_outliers_are_interpolated_and_fast_turns_are_not():
     spoiled[40:42] += 1.0
     # The error of a straight line over three intervals of 10 ms at an acceleration of 40 m/s^2.
     np.testing.assert_allclose(preprocessing(data | {"pos": spoiled})["pos"], pos, atol=40 * 0.03**2 / 8)
-
-
-def test_filter_keeps_slow_signals_and_their_derivatives():
-    t = np.arange(0, 6, 0.01)
-    result = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)
-    inner = slice(100, -100)
-    # Twice a Butterworth low-pass at 1/19 of its cutoff: flat to (1/19)^8; linear interpolation costs 4e-5.
-    for x, true in zip(result, (np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)), strict=True):
-        np.testing.assert_allclose(x[inner], true[inner], atol=1e-3)

@@ -22,7 +22,6 @@ from log_files import (
     write_ulog,
 )
 
-from crazysim.__main__ import main
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
 from crazysim.lab.identify.readers import Stream, resample
@@ -104,11 +103,6 @@ def test_compressed_attitudes_are_unpacked():
     result = decompress_quat(np.array(packed, np.uint32))
     np.testing.assert_allclose(result[1], expected[1], atol=1e-12)
     np.testing.assert_allclose(result[0, [0, 1, 3]], expected[0, [0, 1, 3]], atol=1e-12)
-
-
-def test_a_malformed_interval_is_refused(tmp_path, capsys):
-    assert main(["identify", "flight.csv@a:b", "--out", str(tmp_path / "mine.toml")]) == 2
-    assert "expected LOG@START:END with times in s, got 'flight.csv@a:b'. Use" in capsys.readouterr().err
 
 
 def test_other_files_are_refused(tmp_path):

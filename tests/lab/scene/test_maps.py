@@ -192,28 +192,6 @@ def test_a_mesh_is_hollow_for_drones_and_cameras(tmp_path):
     np.testing.assert_allclose(depth, 2.0 - 0.05 - ahead, atol=1e-4)
 
 
-@pytest.mark.parametrize("box", [False, True])
-def test_distances_to_many_boxes_of_different_sizes_are_exact(box, rng):
-    """Boxes of a map differ in size; a report computes their distances side by side."""
-    sim = Sim(n_worlds=3)
-    if box:
-        use_box_collision(sim)
-    pos, size = rng.uniform([-2, -2, 0.5], [2, 2, 2.5], (18, 3)), rng.uniform(0.1, 0.6, (18, 3))
-    geoms = "".join(
-        f"<geom type='box' pos='{' '.join(map(str, p))}' size='{' '.join(map(str, s / 2))}' conaffinity='2'/>"
-        for p, s in zip(pos, size, strict=True)
-    )
-    sim.scene.add(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", "many", mocap=False)
-    teleport(sim, rng.uniform([-2, -2, 0.5], [2, 2, 2.5], (3, 1, 3)))
-    result = np.asarray(jax.jit(sim.scene.contact_fn(floor=False, drones=False))(sim.data).object_distance)
-    drone = sim.scene.collision_model.drones[0].geoms[0]
-    half, radius = (np.array(drone.shape.size), 0.0) if box else (np.zeros(3), drone.shape.size[0])
-    gap = np.abs(np.asarray(sim.data.states.pos) + drone.pos - pos) - size / 2 - half  # (3, 18, 3)
-    outside = np.linalg.norm(np.maximum(gap, 0), axis=-1)
-    expected = np.where((gap > 0).any(axis=-1), outside, gap.max(axis=-1)) - radius
-    np.testing.assert_allclose(result[:, 0, 0], expected.min(axis=1), atol=1e-4)
-
-
 @pytest.mark.parametrize("kind", ["upright", "turned", "balls", "balls and a box"])
 def test_code_of_one_drone_finds_the_nearest_of_many_geoms(kind, rng):
     """The search in a hierarchy, used in steps, gives the distance to the nearest geom, and its slope."""

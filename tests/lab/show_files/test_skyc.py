@@ -75,11 +75,6 @@ def test_poly4d_show():
     np.testing.assert_array_equal(show.lights.colors([0.5, 1.0, 9.0])[:, 0], [[0, 0, 1], [1, 1, 0], [1, 1, 0]])
 
 
-def test_show_without_lights_is_white():
-    show = parse_show(skyc_files.pack_archive(skyc_files.create_older_lab_show()))
-    np.testing.assert_array_equal(show.lights.colors([0.0, 1.0]), np.ones((2, 2, 3)))
-
-
 def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
     show = parse_show(skyc_files.pack_archive(skyc_files.create_studio_show()))
     assert show.names == ("drone_0",)
@@ -89,11 +84,6 @@ def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
     np.testing.assert_allclose(values[:3, :3], [[17.5, 10, 1]] * 3, atol=1e-5)
     np.testing.assert_allclose(values[3, :3], [17.5, 10, 1.36], atol=1e-4)
     np.testing.assert_allclose(np.rad2deg(values[:, 3]), [0, 45, 87.45, 89.325, 90, 70.8, -90, -90], atol=1e-3)
-
-
-def test_only_a_show_is_saved(tmp_path):
-    with pytest.raises(ConfigError, match="expected show as Show, got 3"):
-        save_show(3, tmp_path / "a.skyc")
 
 
 @pytest.mark.parametrize("create_files", skyc_files.SHOW_CREATORS.values(), ids=skyc_files.SHOW_CREATORS)
@@ -141,13 +131,6 @@ def test_saved_files_have_the_structure_of_skybrush(tmp_path):
     assert [len(point[2]) for point in trajectory["points"]] == [0, 0, 2, 6]
     assert trajectory["points"][0][0] == 0
     assert [point[0] for point in trajectory["points"]] == [0.0, 1.0, 3.0, 4.5]
-
-
-def test_curves_without_yaw_are_written_without(tmp_path):
-    save_show(parse_show(skyc_files.pack_archive(skyc_files.create_older_lab_show())), tmp_path / "a.skyc")
-    with zipfile.ZipFile(tmp_path / "a.skyc") as file:
-        points = json.loads(file.read("drones/drone_0/trajectory.json"))["points"]
-    assert {len(point[1]) for point in points} == {3}
 
 
 TRAJECTORY = "drones/drone_0/trajectory.json"

@@ -9,7 +9,6 @@ import time
 import jax
 import numpy as np
 import pytest
-from live_loops import no_compilation
 from screens import screen_pixels, virtual_screen
 
 from crazysim.__main__ import main
@@ -250,11 +249,6 @@ def test_a_live_show_has_lights():
         np.testing.assert_allclose(live.sim.data.states.pos[0], [[1, 0, 1], [0, 0.02, 1], [0.5, 2, 1.5]], atol=0.1)
         live.go_to(0.5)
         np.testing.assert_allclose(live.lights[0], SHOW.lights.colors([live.time - 0.01])[0], atol=0.05)
-
-
-def test_the_colours_are_compiled_before_the_clock_starts(caplog):
-    with live_show(SHOW, speed="max") as live, no_compilation(live, caplog):
-        live.run(0.2)
 
 
 def test_the_live_command(tmp_path, capsys):

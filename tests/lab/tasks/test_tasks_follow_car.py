@@ -126,9 +126,3 @@ def test_only_the_critic_observes_the_position_of_the_car(env, start_state):
     privileged = jax.eval_shape(PrivilegedObservation(env).reset, jax.random.key(0)).obs["privileged"]
     hover = jax.eval_shape(PrivilegedObservation(make("hover", 2)).reset, jax.random.key(0)).obs["privileged"]
     assert privileged.shape[-1] - hover.shape[-1] == 12
-
-
-def test_each_drone_has_its_own_car():
-    env = make("follow_car", 2, n_drones=2, engine="interpret")
-    state = jax.jit(env.reset)(jax.random.key(0))
-    assert np.asarray(state.obs["segmentation"]).any(axis=-1).all()

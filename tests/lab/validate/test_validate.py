@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 
 from crazysim.__main__ import main
-from crazysim.errors import ConfigError
-from crazysim.lab.validate import Row, closed_forms, validate
+from crazysim.lab.validate import Row, closed_forms
 from crazysim.lab.validate.page import format_page
 from crazysim.lab.validate.pictures import draw_section
 from crazysim.lab.validate.rows import measure_sections
@@ -20,14 +19,6 @@ def test_quick_rows_hold_and_the_page_has_them(tmp_path, capsys):
     assert "| free body under a wrench, 0.5 s: position |" in text
     assert "Not measured: give `--data FOLDER`." in text
     assert "left out idsia: give `--data FOLDER`" in capsys.readouterr().out
-
-
-def test_the_function_returns_the_rows_of_the_command():
-    rows = validate(only=["mujoco", "idsia"])
-    assert [row.section for row in rows] == ["mujoco"] * 4
-    assert not any(row.failed for row in rows)
-    with pytest.raises(ConfigError, match="got 'mujocho'"):
-        validate(only=["mujocho"])
 
 
 def test_rows_with_a_series_are_drawn_and_shown(tmp_path):

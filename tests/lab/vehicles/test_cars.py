@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import with_states
 
 from crazysim import ConfigError, Sim, Terrain
 from crazysim.lab.vehicles.car_params import CarParams
@@ -143,20 +142,6 @@ def test_wheels_roll_and_steer_in_the_scene():
     deck = data.body("cars_trailer:0").xmat.reshape(3, 3)
     np.testing.assert_allclose(np.arctan2(deck[1, 0], deck[0, 0]), record.joints[0, 0, 1], atol=1e-6)
     assert model.nbody > 2 * (1 + 4 + 1 + 1 + 4)
-
-
-def test_contacts_of_drones_name_the_car():
-    sim, _ = build(2, pos=(0, 0))
-    pos = np.array(sim.data.states.pos)
-    pos[1, 0] = [0.0, 0.0, 0.1]
-    sim.data = with_states(sim.data, pos=pos)
-    report = sim.contact_report()
-    assert "cars:0" in report.object_names
-    touched = np.asarray(report.objects)[..., report.object_names.index("cars:0")]
-    assert touched[1].all()
-    pos[1, 0, 2] = 1.0
-    sim.data = with_states(sim.data, pos=pos)
-    assert not np.asarray(sim.contact_report().objects)[1].any()
 
 
 def test_cars_roll_down_a_slope():

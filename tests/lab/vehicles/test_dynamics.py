@@ -145,33 +145,6 @@ def test_a_sliding_vehicle_loses_energy(name):
         assert power < 0
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_a_mirrored_state_has_mirrored_rates(model):
-    """Left and right are equivalent."""
-    rng = np.random.default_rng(1)
-    speed, side, turn, steer, d = rng.uniform(-1, 1, 5) * [5, 2, 5, 0.4, 0.3]
-    car = params()
-    left = RATES[model](create_state(speed, side, turn, steer), np.array([d, steer / 2]), car)
-    right = RATES[model](create_state(speed, -side, -turn, -steer), np.array([d, -steer / 2]), car)
-    left, right = jax.tree.map(np.asarray, (left, right))
-    np.testing.assert_allclose(left.body_vel * [1, -1], right.body_vel, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(left.yaw_rate, -right.yaw_rate, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(left.steer, -right.steer)
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_reversing_retraces_the_circle(model):
-    """A slow vehicle rolls backwards along the same circle."""
-    car, radius = params(), 0.331 / np.tan(0.3)
-    for d in (0.02, -0.02):
-        path = jax.tree.map(np.asarray, path_of(model, car, create_state(steer=0.3), np.array([d, 0.3]), 3000))
-        assert path.body_vel[-1, 0] * d > 0
-        # The middle of the rear axle, around the point beside it.
-        axle = path.pos[:, :2] - 0.168 * np.concatenate([np.cos(path.yaw), np.sin(path.yaw)], axis=-1)
-        distance = np.linalg.norm(axle - np.array([-0.168, radius]), axis=-1)
-        np.testing.assert_allclose(distance, radius, rtol=0.03)
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def slopes_of(model, s, command, car):
     """Return the gradients of the sum of all rates by state and command."""

@@ -7,7 +7,6 @@ import pytest
 
 from crazysim import ContactResponse, Sim
 from crazysim.engine import Step
-from crazysim.engine.stage import stage
 
 HALF_HEIGHT = 0.02
 """Half the height of the collision box of a cf21B_500, m."""
@@ -122,39 +121,6 @@ def test_a_contact_creates_no_energy(rng):
     assert (now < 0.9 * before).sum() > n // 20
     push = 0.5 * float(sim.data.params.mass[0]) * 0.25**2
     assert (now - (1 + 1e-4) * before - push).max() < 0
-
-
-@pytest.mark.long("compiles contacts with a box and two cylinders")
-def test_drones_bounce_off_a_wall_and_a_pole_and_ride_on_a_moving_pad():
-    """A drone in each of three worlds; the last one lands on the pad."""
-    course = [("wall", {"pos": [1, 0, 0], "height": 6}), ("pole", {"pos": [-1, 0, 0], "height": 6.0})]
-    sim = build(3, course)
-    pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5], radius=0.4)
-    numbers = {"restitution": [0.5, 0.5, 0.2], "friction": [0.0, 0.0, 0.8]}
-    response = sim.data.plugins["contact_response"]
-    response = response.replace(**{k: np.float32(x)[:, None, None] for k, x in numbers.items()})
-    sim.data = sim.data.replace(plugins={"contact_response": response})
-    speed = 0.3
-
-    @stage("world")
-    def drive(data):
-        pos, _ = pad.pose(data)
-        dt = 1.0 / data.core.freq
-        return pad.set_pose(data, pos + jnp.array([speed, 0, 0]) * dt, vel=jnp.array([speed, 0, 0]))
-
-    sim.step_pipeline = {"drive": drive, **sim.step_pipeline}
-    sim.build_step_fn()
-    set_states(sim, pos=[[[0.7, 0, 3]], [[-0.7, 0, 3]], [[0, 0, 0.6]]], vel=[[[2, 0, 0]], [[-2, 0, 0]], [[0, 0, 0]]])
-    sim.step(200)
-    pos, vel = (np.asarray(x)[:, 0] for x in (sim.data.states.pos, sim.data.states.vel))
-    np.testing.assert_allclose(vel[:2, 0], [-1, 1], rtol=0.01)
-    assert pos[0, 0] < 1 - 0.025 - 0.07
-    assert pos[1, 0] > -1 + 0.015 + 0.07
-    sim.step(400)
-    pos, vel = (np.asarray(x)[2, 0] for x in (sim.data.states.pos, sim.data.states.vel))
-    assert pos[2] == pytest.approx(0.5 + HALF_HEIGHT, abs=2e-3)
-    assert vel[0] == pytest.approx(speed, abs=1e-3)
-    assert "not fused" not in sim.explain()
 
 
 def test_drop_and_slide_as_in_mujoco():

@@ -204,16 +204,3 @@ def test_law_09_files_that_are_no_images_are_errors_before_memory_is_allocated(t
             path.write_bytes(content)
         with pytest.raises(ConfigError, match=message):
             Sim().add(Terrain(path, (4, 3, 2.0)))
-
-
-def test_heights_can_be_replaced():
-    sim, _plugin = build(flat(0.5))
-    sim.step()
-    sim.replace(Terrain(flat(0.7), SIZE))
-    np.testing.assert_allclose(ground_height(sim.data, sim.data.states.pos), 0.7)
-    assert sum(g.name == "terrain" for g in sim.scene.spec.worldbody.geoms) == 1
-    sim.step(1000)
-    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2], 0.7 + FLOOR_HEIGHT, rtol=1e-6)
-    assert float(np.asarray(sim.contact_report(drones=False).floor_distance).max()) < 0
-    sim.remove("terrain")
-    assert "clip_floor_pos" in sim.step_pipeline

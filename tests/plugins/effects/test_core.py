@@ -78,19 +78,6 @@ def test_effects_without_strength_change_nothing():
         np.testing.assert_allclose(b, a, rtol=1e-5, atol=1e-5)  # float32 over 50 steps
 
 
-def signature(tree):
-    """Return structure, shapes and types of a tree."""
-    return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
-
-
-def test_float64_stays_float64(x64):
-    sim = Sim(2, 2, engine="lanes")  # random numbers in float64 come from integers of 64 bits, which kernels lack
-    add_effects(sim)
-    assert all(x.dtype != jnp.float32 for x in jax.tree.leaves(sim.data.plugins))
-    after = jax.eval_shape(lambda d: sim.step_fn(d, 1), sim.data)
-    assert signature(after) == signature(sim.data)
-
-
 def test_docstrings_of_records_give_the_shapes(sim_with_effects):
     sizes = {
         "n_worlds": 3,

@@ -244,19 +244,6 @@ def test_numbers_drawn_by_path_act_as_numbers_set_by_hand(drone, position):
         last_factors = factors
 
 
-def test_law_10_numbers_of_a_path_do_not_depend_on_other_paths_or_worlds():
-    all_paths, one_path = (
-        fly([Randomize(paths), *physical_plugins()], n_worlds)
-        for paths, n_worlds in ((PATHS, 3), ({"plugins.wind.velocity": 0.5}, 2))
-    )
-    for sim in (all_paths, one_path):
-        sim.reset()
-    factors = all_paths.data.plugins["randomize"].path_factors[..., list(PATHS).index("plugins.wind.velocity")]
-    np.testing.assert_array_equal(factors[:2], one_path.data.plugins["randomize"].path_factors[..., 0])
-    observed = all_paths.plugins.observations(all_paths.data)["randomize.path_factors"]
-    np.testing.assert_array_equal(observed, all_paths.data.plugins["randomize"].path_factors)
-
-
 def test_factors_survive_other_numbers_and_edits_of_the_scene():
     """A replaced plugin has new nominal numbers; ranges that are replaced act from the next episode on."""
     sim = fly([Randomize(PATHS), *physical_plugins()])

@@ -9,7 +9,6 @@ from consistency import assert_chi_squared, errors, normalised_square
 
 from crazysim import Plugin, Sim, rotation
 from crazysim.core.random import drone_key
-from crazysim.envs import make
 from crazysim.lab.validate import firmware_filters
 from crazysim.plugins.estimators import Kalman, error_state
 from crazysim.plugins.sensors import IMU, MotionCapture, Triad
@@ -118,17 +117,3 @@ def test_every_kind_of_controller_flies_on_the_estimate(controller, control):
     sim.step(2000)
     pos = np.asarray(sim.data.states.pos)[0, 0, :2]
     np.testing.assert_allclose(pos, [-0.1 if control else 0.0, 0.0], rtol=0, atol=0.02)
-
-
-def test_a_task_observes_the_estimate():
-    """Without a sensor of the position, an estimate that is moved moves the observed position, and not the reward."""
-    env = make("hover", n_worlds=4, estimator=Kalman([IMU()]), engine="interpret")
-    state = jax.jit(env.reset)(jax.random.key(0))
-    action = jnp.zeros_like(state.action)
-    state = env.step(state, action)
-    record = state.data.plugins["kalman"]
-    moved = record.replace(estimate=record.estimate.replace(pos=record.estimate.pos + 1.0))
-    moved_state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"kalman": moved}))
-    after, after_move = env.step(state, action), env.step(moved_state, action)
-    np.testing.assert_allclose(after_move.obs["pos"] - after.obs["pos"], 1.0, rtol=0, atol=1e-5)
-    np.testing.assert_array_equal(after.reward, after_move.reward)

@@ -10,9 +10,8 @@ import pytest
 from cases import INTEGRATORS, broadcast_like, build_stagewise_step, with_params, with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim import Downwash, Sim, Wind
+from crazysim import Sim
 from crazysim.plugins.payloads import SlungLoad, direction
-from crazysim.plugins.payloads.link import LinkParams, end_relative_motion
 
 MASS, LOAD = 0.605, 0.2
 """Masses of drone and load, kg."""
@@ -129,26 +128,6 @@ def test_a_cable_that_becomes_taut_ends_the_relative_motion_along_it(x64):
     np.testing.assert_allclose(v - u, -restitution, atol=1e-3)
 
 
-def test_impulse_by_hand():
-    """P = q.(u - v) / (1/m + 1/m_L), which changes v by P q / m and u by -P q / m_L."""
-    sim = build()
-    s = jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)
-    s = s.replace(vel=np.float32([0.1, 0.2, 0.3]))
-    q, p = np.array([0.6, 0.0, -0.8]), sim.data.params
-    u = np.array([1.0, -1.0, 0.5])
-
-    @jax.jit
-    def end(s, pos, vel):
-        link = LinkParams(None, jnp.full(1, 0.4), jnp.full(1, LOAD))
-        return end_relative_motion(s, p.mass, p.J_inv, link, pos, vel)
-
-    after, vel = jax.tree.map(np.asarray, end(s, s.pos + 0.4 * q, u))
-    impulse = q @ (u - [0.1, 0.2, 0.3]) / (1 / MASS + 1 / LOAD)
-    np.testing.assert_allclose(after.vel, np.array([0.1, 0.2, 0.3]) + impulse * q / MASS, rtol=1e-4)
-    np.testing.assert_allclose(vel, u - impulse * q / LOAD, rtol=1e-4)
-    np.testing.assert_allclose(q @ (vel - after.vel), 0, atol=1e-4)
-
-
 def test_the_order_of_convergence_is_that_of_the_integrator(x64):
     """With a load Runge-Kutta has order four and Euler's scheme order one; both converge to the same flight.
 
@@ -204,19 +183,6 @@ def test_a_released_load_comes_to_rest_on_the_floor(x64):
     np.testing.assert_allclose(pos[2], 0.03, atol=1e-12)
     np.testing.assert_allclose(vel, 0, atol=1e-12)
     assert 0.1 < pos[0] < 0.3  # it fell for 0.34 s at 0.5 m/s, and friction stopped it
-
-
-def test_wind_and_downwash_push_the_load():
-    sim = build(drone="cf21B_500", height=2.0)
-    load = sim.add(SlungLoad(mass=0.01, drag=0.01, in_scene=False))
-    sim.add(Downwash())
-    sim.add(Wind(velocity=(1.0, 0.0, 0.0)))
-    sim.rotor_vel_control(np.full((1, 1, 4), 15000.0))
-    sim.step(100)
-    record = load.read(sim.data)
-    air, vel, drone = (np.asarray(x)[0, 0] for x in (record.air_vel, record.vel, sim.data.states.vel))
-    assert air[2] < -1.0, "the drone's own jet"
-    assert vel[0] - drone[0] > 0.05
 
 
 def test_loads_are_objects_of_the_scene():
