@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from crazysim.lab.control.mppi import MPPI
     from crazysim.lab.estimators.eskf import ESKF
     from crazysim.lab.plugins.radar import Radar
+    from crazysim.lab.plugins.residual import Residual
     from crazysim.lab.plugins.rotor_jet import RotorJet
+    from crazysim.lab.plugins.shared_load import SharedLoad
     from crazysim.lab.scene.splats import SplatScene
     from crazysim.lab.vehicles.cars import Bicycles, Cars
     from crazysim.plugins.contacts.contact_log import ContactLog
@@ -43,14 +45,13 @@ if TYPE_CHECKING:
         Latency,
         MotorFailure,
         Randomize,
-        Residual,
         RotorAerodynamics,
         Wind,
         WindField,
     )
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
-    from crazysim.plugins.payloads import Hook, SharedLoad, SlungLoad
+    from crazysim.plugins.payloads import Hook, SlungLoad
     from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
     from crazysim.plugins.sensors import IMU, Camera, Lidar, MotionCapture, RangeFinder, Sensor
 

@@ -29,7 +29,7 @@ from crazysim.lab.identify.rotation import (
     deviation_of_sum,
     fast_rotation,
 )
-from crazysim.plugins.effects.residual import N_INPUTS, Residual
+from crazysim.lab.plugins.residual import N_INPUTS, Residual
 from crazysim.rotation import rotate, rotate_inverse
 
 WINDOW_DURATION = 0.5

@@ -13,7 +13,7 @@ from jax import Array
 from crazysim.errors import optional_import, require
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.prediction import Model, Windows, attitude_error, cut_windows, predict
-from crazysim.plugins.effects.residual import Residual, residual_inputs
+from crazysim.lab.plugins.residual import Residual, residual_inputs
 
 ERROR_SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
 """Scales of errors: m, rad, m/s, rad/s. Larger errors count linearly (Huber)."""

@@ -20,7 +20,7 @@ from crazysim.dynamics.rotor import reaction_torque
 from crazysim.engine.pytree import PyTree
 from crazysim.errors import optional_import, require
 from crazysim.lab.identify.logs import Log
-from crazysim.plugins.effects.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
+from crazysim.lab.plugins.residual import N_INPUTS, Residual, residual_inputs, residual_wrench
 from crazysim.storage import write_figure
 
 HORIZONS = (0.1, 0.25, 0.5)

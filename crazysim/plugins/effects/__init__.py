@@ -1,5 +1,8 @@
 """Effects: optional physics, each a plugin that ``sim.add`` adds."""
 
+from typing import TYPE_CHECKING
+
+from crazysim.names import lazy_getattr
 from crazysim.plugins.effects.battery import Battery
 from crazysim.plugins.effects.downwash import Downwash
 from crazysim.plugins.effects.grid import Grid, load_wind_grid
@@ -8,10 +11,12 @@ from crazysim.plugins.effects.ground_effect import GroundEffect
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.motor_failure import MotorFailure
 from crazysim.plugins.effects.randomize import Randomize
-from crazysim.plugins.effects.residual import Residual
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
 from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
+
+if TYPE_CHECKING:
+    from crazysim.lab.plugins.residual import Residual
 
 __all__ = [
     "Battery",
@@ -29,3 +34,5 @@ __all__ = [
     "ground_height",
     "load_wind_grid",
 ]
+
+__getattr__ = lazy_getattr(__name__)

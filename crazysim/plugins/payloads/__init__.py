@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from crazysim.names import lazy_getattr
 from crazysim.plugins.payloads.hook import Hook
 from crazysim.plugins.payloads.point_load import direction, load_pos, load_vel
-from crazysim.plugins.payloads.shared import SharedLoad
 from crazysim.plugins.payloads.slung import SlungLoad
 
 if TYPE_CHECKING:
     from crazysim.lab.control.load_flatness import LoadedState, load_flat_state
     from crazysim.lab.plugins.jet_table import JetTable, load_jet_table
     from crazysim.lab.plugins.rotor_jet import RotorJet
+    from crazysim.lab.plugins.shared_load import SharedLoad
 
 __all__ = [
     "Hook",

@@ -21,7 +21,7 @@ from crazysim.lab.identify import (
     read_log,
 )
 from crazysim.lab.identify.readers import Stream, resample
-from crazysim.plugins.effects.residual import Residual, residual_inputs, residual_wrench
+from crazysim.lab.plugins.residual import Residual, residual_inputs, residual_wrench
 from crazysim.sim import Sim
 
 FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Residual, Sim
-from crazysim.plugins.effects.residual import N_INPUTS
+from crazysim.lab.plugins.residual import N_INPUTS
 
 RNG = np.random.default_rng(3)
 LINEAR = RNG.normal(size=(6, N_INPUTS)) * np.repeat([1e-2, 1e-5], 3)[:, None]
