@@ -127,28 +127,18 @@ class SceneWindow:
         number = {"left": glfw.MOUSE_BUTTON_LEFT, "right": glfw.MOUSE_BUTTON_RIGHT}[button]
         return glfw.get_mouse_button(self._window, number) == glfw.PRESS
 
-    def pick(self, n: int, tile: Callable[[int], Tile]) -> tuple[int, int, NDArray] | None:
-        """Return index of the tile, id of the geom, and point, world frame, m, at the cursor; None without a geom.
+    def cursor_ray(self, n: int) -> tuple[int, NDArray, NDArray] | None:
+        """Return the tile below the cursor, and origin, m, and direction of the ray through the cursor, world frame.
 
         Args:
             n: Number of tiles.
-            tile: Function from k to the k-th tile.
         """
         size = self._glfw.get_framebuffer_size(self._window)
         x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]
         for k, r in enumerate(self._tile_rectangles(n)):
-            position = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
-            if not all(0 <= part < 1 for part in position):
-                continue
-            data, _ = tile(k)
-            self._update_scene(data)
-            point, geom = np.zeros(3), np.full((1, 1), -1, np.int32)
-            ids = np.full((1, 1), -1, np.int32)
-            mujoco.mjv_select(
-                self._model, data, self._option, r.width / max(r.height, 1), *position, self._scene, point, geom, ids,
-                ids.copy(),
-            )  # fmt: skip
-            return None if geom[0, 0] < 0 else (k, int(geom[0, 0]), point)
+            part = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
+            if all(0 <= u < 1 for u in part):
+                return k, *camera_ray(self._scene, r.width / max(r.height, 1), *part)
         return None
 
     def _update_scene(self, data: mujoco.MjData) -> None:
@@ -195,6 +185,22 @@ class SceneWindow:
 
     def _move(self, action: mujoco.mjtMouse, dx: float, dy: float) -> None:
         mujoco.mjv_moveCamera(self._model, action, dx, dy, self._camera)
+
+
+def camera_ray(scene: mujoco.MjvScene, aspect: float, x: float, y: float) -> tuple[NDArray, NDArray]:
+    """Return origin, m, and direction of the ray through a point of an image, world frame. (3,), (3,)
+
+    Args:
+        scene: Scene that was drawn.
+        aspect: Width of the image divided by its height.
+        x: Position in the image from the left, 0 to 1.
+        y: Position from the bottom, 0 to 1.
+    """
+    left, right = scene.camera  # of the two eyes
+    ahead, up = np.array(left.forward), np.array(left.up)
+    height = left.frustum_top - left.frustum_bottom
+    offset = np.cross(ahead, up) * (x - 0.5) * height * aspect + up * (left.frustum_bottom + y * height)
+    return (np.array(left.pos) + np.array(right.pos)) / 2, left.frustum_near * ahead + offset
 
 
 def require_screen() -> None:

@@ -44,7 +44,6 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fly a show, and write figures, films and pages of it."""
     from crazysim.lab.shows import film, fly_show, page, report, summary
-    from crazysim.lab.shows.view import play
     from crazysim.media.web import require_free_port
     from crazysim.progress import progress_bar
 
@@ -58,7 +57,9 @@ def run(options: argparse.Namespace) -> None:
         require_screen("--browser or --film FILE")
     settings = specified_options(options, *SIMULATION_OPTIONS)
     if options.live:
-        _run_live(show, options, settings)
+        file_option = next((x for x in ("film", "page", "report") if getattr(options, x) is not None), None)
+        require(file_option is None, f"expected --live or --{file_option}, got both. Leave one of them out.")
+        _run_live(show, options, settings, options.browser)
         return
     flight = fly_show(show, options.seconds, progress_bar, **settings)
     figures = report(flight)
@@ -70,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
         film(flight, options.film, options.fps, progress=True)
         print(f"wrote {options.film}")
     if options.window:
-        play(flight)
+        _run_live(show, options, settings, browser=False)
     if options.page is not None or options.browser:
         html = page(flight)
         if options.page is not None:
@@ -82,20 +83,18 @@ def run(options: argparse.Namespace) -> None:
             serve_page(html, options.port, options.host)
 
 
-def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any]) -> None:
+def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any], browser: bool) -> None:
     import numpy as np
 
     from crazysim.lab.live import Browser, Window
     from crazysim.lab.shows.flight import planned_positions
     from crazysim.lab.shows.view import camera_around, live_show
 
-    file_option = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
-    require(file_option is None, f"expected --live or --{file_option}, got both. Leave one of them out.")
     with live_show(show, **settings) as live:
         if options.window:
             planned = planned_positions(show.trajectories, np.linspace(0.0, show.duration, 50))
             live.show(Window(cam_config=camera_around(np.asarray(planned))))
-        if options.browser:
+        if browser:
             print(f"open {live.show(Browser(options.port, options.host)).url}; stop with Ctrl-C", flush=True)
         seconds = show.duration if options.seconds is None else min(options.seconds, show.duration)
         print(live.run(seconds))

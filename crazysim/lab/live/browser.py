@@ -1,4 +1,4 @@
-"""A live simulation in the browser: the scene, and a panel to command it."""
+"""A live simulation in the browser: the scene of recorded flights, and a panel to command it."""
 
 from __future__ import annotations
 
@@ -122,13 +122,8 @@ class Browser(Viewer[Live]):
 
         @scene.on_click()
         def _(event: Any) -> None:
-            origin, direction = event.ray_origin - self._scene.origin, np.asarray(event.ray_direction, float)
-            k, body, point = bodies.pick(self._picture, self._scene.offsets, origin, direction)
-            world = int(self._picture.worlds[k])
-            if body is not None:
-                live.post(lambda live: live.follow(world, body.kind, body.index))
-            elif point is not None:
-                live.post(lambda live: live.click(world, point))
+            origins = event.ray_origin - self._scene.origin - self._scene.offsets
+            live.click_along(bodies, self._picture, origins, np.asarray(event.ray_direction, float))
 
     def update(self, live: Live) -> None:
         if not self._server.get_clients():

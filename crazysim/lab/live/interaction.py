@@ -14,6 +14,7 @@ from crazysim.errors import require
 from crazysim.lab.live.keyboard import Keyboard
 from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
 from crazysim.lab.live.viewer import Button, Slider, Widget
+from crazysim.media.picture import Picture
 from crazysim.sim.sim import Sim
 
 
@@ -153,6 +154,22 @@ class Interaction:
         """
         if self.on_click is not None:
             self.on_click(self, world, point)
+
+    def click_along(self, bodies: SceneBodies, picture: Picture, origins: NDArray, direction: NDArray) -> None:
+        """Follow the body, or click on the ground, that a ray from a viewer's camera hits; from any thread.
+
+        Args:
+            bodies: Bodies of the scene.
+            picture: Picture that the user has seen.
+            origins: Origin of the ray in the frame of each world, m; NaN for worlds elsewhere. (n, 3)
+            direction: Direction of the ray. (3,)
+        """
+        k, body, point = bodies.pick(picture, origins, direction)
+        world = int(picture.worlds[k])
+        if body is not None:
+            self.post(lambda live: live.follow(world, body.kind, body.index))
+        elif point is not None:
+            self.post(lambda live: live.click(world, point))
 
     def post(self, callback: Callable[[Self], object]) -> None:
         """Make the loop call a function between two steps; may be called from any thread."""

@@ -105,29 +105,26 @@ class SceneBodies:
         return match
 
     def pick(
-        self, picture: Picture, offsets: NDArray, origin: NDArray, direction: NDArray
+        self, picture: Picture, origins: NDArray, direction: NDArray
     ) -> tuple[int, SceneBody | None, NDArray | None]:
         """Return what a ray from the camera hits: the index of a shown world, a body, and a point of the floor.
 
         If the ray hits a body, the point is None; if it hits the floor, the body is None. If it hits nothing, both are
-        None and the index is 0. The point is in the frame of the world, m. (3,)
+        None. The point is in the frame of the world, m. (3,)
 
         Args:
             picture: Picture that the user has seen.
-            offsets: Origins of the worlds that are shown, m. (n, 3)
-            origin: Origin of the ray, m. (3,)
+            origins: Origin of the ray in the frame of each world, m; NaN for worlds elsewhere. (n, 3)
             direction: Direction of the ray. (3,)
         """
         direction = direction / np.linalg.norm(direction)
-        distances = self._ray_distances(picture.quat, origin - picture.pos - offsets[:, None], direction)
+        distances = self._ray_distances(picture.quat, origins[:, None] - picture.pos, direction)
         if np.isfinite(distances).any():
             shown_index, mocap = np.unravel_index(distances.argmin(), distances.shape)
             return int(shown_index), self.items[self.owner[mocap]], None
-        if direction[2] > -1e-6:
-            return 0, None, None
-        point = origin - direction * origin[2] / direction[2]
-        shown_index = int(np.linalg.norm(offsets - point, axis=-1).argmin())
-        return shown_index, None, point - offsets[shown_index]
+        points = origins - direction * origins[:, 2:] / min(direction[2], -1e-6)
+        shown_index = int(np.nanargmin(np.linalg.norm(points, axis=-1)))
+        return shown_index, None, points[shown_index] if direction[2] < -1e-6 else None
 
     def _ray_distances(self, quat: NDArray, start: NDArray, direction: NDArray) -> NDArray:
         # The distance is infinite if the ray does not enter the box around the body. Boxes of small and distant bodies

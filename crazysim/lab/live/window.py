@@ -1,4 +1,7 @@
-"""A live simulation in a window of the desktop, drawn by another process."""
+"""A live simulation in a window of the desktop, with the cameras of the scene and without further packages.
+
+Another process draws it, because drawing in the loop, as ``sim.render`` does, would delay the control steps.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +97,7 @@ class Window(Viewer[Live]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(names)}, got {self.plot!r}")
         sim.scene.compile_if_edited()
         sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
-        bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
+        self._bodies = bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
         self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind, self.trail, self.setpoints)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self._process = process = subprocess.Popen(
@@ -102,7 +105,7 @@ class Window(Viewer[Live]):
             env=os.environ | {"PYTHONPATH": path},
         )  # fmt: skip
         settings = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        _send_message(process, {"model": _serialize_model(sim.mj_model), "bodies": bodies, "settings": settings})
+        _send_message(process, {"model": _serialize_model(sim.mj_model), "settings": settings})
         ready_event = threading.Event()
         threading.Thread(target=self._read_actions, args=(live, process, ready_event), daemon=True).start()
         if not ready_event.wait(OPEN_TIMEOUT) or not self.is_open:
@@ -111,7 +114,7 @@ class Window(Viewer[Live]):
         threading.Thread(target=self._send_pictures, args=(process,), daemon=True).start()
 
     def update(self, live: Live) -> None:
-        picture = self._source.take_picture(live, self.plot)
+        self._shown_picture = picture = self._source.take_picture(live, self.plot)
         with self._picture_changed:
             self._next_picture = picture
             self._picture_changed.notify()
@@ -151,10 +154,11 @@ class Window(Viewer[Live]):
                 live.keyboard.press(*values)
             elif kind == "release":
                 live.keyboard.release(*values)
-            elif kind == "follow":
-                live.post(lambda live, body=values: live.follow(*body))
             elif kind == "click":
-                live.post(lambda live, click=values: live.click(click[0], np.array(click[1])))
+                k, origin, direction = values
+                origins = np.full((len(self.worlds), 3), np.nan)
+                origins[k] = origin
+                live.click_along(self._bodies, self._shown_picture, origins, np.array(direction))
         process.stdout.close()
         process.wait()
         live.keyboard.release_all()

@@ -20,7 +20,6 @@ import numpy as np
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import RenderError
 from crazysim.lab.live.chart import Chart
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.picture import WIND_COLOR, WIND_RADIUS, Picture
 from crazysim.media.trail import draw_paths
 from crazysim.scene.overlays import Overlays
@@ -78,8 +77,8 @@ class Leds:
 class Program:
     """The window and its model, trails and lights."""
 
-    def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
-        self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
+    def __init__(self, model: mujoco.MjModel, settings: dict[str, Any], out: TextIO):
+        self._model, self._data, self._settings = model, mujoco.MjData(model), settings
         self._out = out
         self._leds = Leds(model)
         self._overlays = Overlays(limit=100_000)
@@ -120,8 +119,9 @@ class Program:
         self.window.draw_tiles(
             n, lambda k: self._compose_tile(picture, k), self._camera, settings["width"], settings["height"]
         )
-        if self.window.is_open and self._is_double_click():
-            self._report_click(picture, self.window.pick(n, lambda k: self._compose_tile(picture, k)))
+        if self.window.is_open and self._is_double_click() and (ray := self.window.cursor_ray(n)) is not None:
+            k, origin, direction = ray
+            self._send("click", k, origin.tolist(), direction.tolist())
 
     def _compose_tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
         data, overlays = self._data, self._overlays
@@ -160,18 +160,6 @@ class Program:
         self._last_click = (-np.inf if is_double else now, cursor)
         return is_double
 
-    def _report_click(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
-        if hit is None:
-            return
-        k, geom, point = hit
-        root, world = self._model.body_rootid[self._model.geom_bodyid[geom]], int(picture.worlds[k])
-        mocap = int(self._model.body_mocapid[root])
-        if mocap >= 0:
-            followed = self._bodies.items[self._bodies.owner[mocap]]
-            self._send("follow", world, followed.kind, followed.index)
-        else:
-            self._send("click", world, point.tolist())
-
     def _send(self, *message: object) -> None:
         try:
             self._out.write(json.dumps(message) + "\n")
@@ -192,7 +180,7 @@ def main() -> int:
     setup = pickle.load(stream)
     model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": setup["model"]})
     try:
-        program = Program(model, setup["bodies"], setup["settings"], out)
+        program = Program(model, setup["settings"], out)
     except RenderError as error:
         print(error, file=sys.stderr)
         return 2

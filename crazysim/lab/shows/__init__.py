@@ -3,7 +3,7 @@
 from crazysim.lab.show_files import Cue, Lights, Show, load_show, save_show
 from crazysim.lab.shows.flight import ShowFlight, fly_show
 from crazysim.lab.shows.show_report import collisions, report, sampled_approaches, summary, tracking_rms
-from crazysim.lab.shows.view import ShowLights, film, live_show, page, play
+from crazysim.lab.shows.view import ShowLights, film, live_show, page
 
 __all__ = [
     "Cue",
@@ -17,7 +17,6 @@ __all__ = [
     "live_show",
     "load_show",
     "page",
-    "play",
     "report",
     "sampled_approaches",
     "save_show",

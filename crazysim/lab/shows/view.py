@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,14 +12,12 @@ from numpy.typing import NDArray
 
 from crazysim.arguments import check_flag
 from crazysim.drones.body import LED_MATERIALS
-from crazysim.errors import require
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
 from crazysim.lab.show_files.show import Show
 from crazysim.lab.shows.flight import ShowFlight, start_simulation
 from crazysim.lab.shows.show_report import collisions
 from crazysim.media import Film, Flight, View, flight_of, web
-from crazysim.media.flight_recorder import show_flight_at
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_label, draw_points
 
@@ -34,8 +31,6 @@ MARK_DURATION = 0.7
 """Time for which a collision is marked, s."""
 COLLISION_COLOR = (1.0, 0.1, 0.1, 0.55)
 """Colour of the mark of a collision, rgba."""
-MAX_FPS = 60.0
-"""Largest number of images per second of a window."""
 NIGHT_LIGHT = 0.1
 """Brightest light at night, 0 to 1."""
 NIGHT_SKY = (8, 10, 24)
@@ -65,33 +60,6 @@ def film(
         darken(flight.sim)
     with Film(path, create_view(flight, **view), fps=fps, progress=progress) as recording:
         return recording.play(flight.sim, media_flight(flight))
-
-
-def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
-    """Show a flown show in a window, in real time, until it ends or the user closes the window.
-
-    Args:
-        flight: Flight.
-        speed: Seconds of the show per second.
-        view: Settings of ``crazysim.media.View`` that replace the defaults of ``create_view``.
-
-    Raises:
-        RenderError: If there is no screen.
-    """
-    require(np.isfinite(speed) and speed > 0, f"expected a positive speed, got {speed!r}")
-    sim, recorded, camera = flight.sim, media_flight(flight), create_view(flight, **view)
-    data = sim.data
-    try:
-        show_flight_at(sim, recorded, 0.0)
-        camera.show(sim)
-        start = time.perf_counter()  # opening the window can take longer than a short show
-        while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
-            draw_time = time.perf_counter()
-            show_flight_at(sim, recorded, now)
-            camera.show(sim)
-            time.sleep(max(draw_time + 1 / MAX_FPS - time.perf_counter(), 0.0))
-    finally:
-        sim.data = data
 
 
 def page(flight: ShowFlight) -> str:

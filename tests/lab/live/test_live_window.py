@@ -4,17 +4,20 @@ import os
 import subprocess
 import sys
 import textwrap
-from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from screens import screen_pixels, virtual_screen
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Live, Window
+from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
-from crazysim.lab.live.window_program import Leds, Program
+from crazysim.lab.live.window_program import Leds
 from crazysim.plugins.vehicles import Cars
+from crazysim.scene.scene_window import camera_ray
+from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.sim import Sim
 
 
@@ -136,23 +139,37 @@ def test_leds_have_the_colours_of_the_picture():
     np.testing.assert_array_equal(model.mat_rgba, initial_rgba)
 
 
-def test_a_double_click_reports_the_body_below_it():
-    """A click on a wheel reports its car, a click on a fixed geom its point; a click on nothing is not reported."""
-    sim = Sim(n_drones=2, control="state")
+def test_a_ray_through_the_cursor_hits_what_is_drawn_there():
+    """The ray through a point of the image passes through the geom that MuJoCo selects there."""
+    sim = Sim(n_drones=2)
+    sim.sync(0)
+    model, data, option = sim.mj_model, sim.mj_data, mujoco.MjvOption()
+    camera, scene = mujoco.MjvCamera(), mujoco.MjvScene(model, 1000)
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.2, 0.1, 0.0), 1.5, 30.0, -40.0
+    mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+    for x, y in ((0.5, 0.5), (0.2, 0.3), (0.9, 0.1)):
+        point, geom, flex, skin = np.zeros(3), np.full((1, 1), -1, np.int32), *np.full((2, 1, 1), -1, np.int32)
+        mujoco.mjv_select(model, data, option, 1.6, x, y, scene, point, geom, flex, skin)
+        origin, direction = camera_ray(scene, 1.6, x, y)
+        assert geom[0, 0] >= 0
+        to_point = (point - origin) / np.linalg.norm(point - origin)
+        np.testing.assert_allclose(direction / np.linalg.norm(direction), to_point, atol=1e-4)
+
+
+def test_a_click_follows_the_body_below_it():
+    """A click on a wheel follows its car; other worlds are not below the cursor."""
+    sim = Sim(n_worlds=2, n_drones=2, control="state")
     sim.add(Cars(2))
     sim.scene.compile_if_edited()
-    program, messages = Program.__new__(Program), []
-    program._model, program._bodies = sim.mj_model, SceneBodies(sim)
-    program._send = lambda *message: messages.append(message)
-    picture = SimpleNamespace(worlds=np.array([3, 5]))
-
-    def geom_of(body):
-        return int(sim.mj_model.body_geomadr[sim.mj_model.body(body).id])
-
-    for body in ("cars_wheel:7", "cars:0", "drone:1"):
-        program._report_click(picture, (1, geom_of(body), np.zeros(3)))
-    program._report_click(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
-    program._report_click(picture, None)
-    assert messages == [
-        ("follow", 5, "cars", 1), ("follow", 5, "cars", 0), ("follow", 5, "drone", 1), ("click", 3, [1.0, 2.0, 0.0]),
-    ]  # fmt: skip
+    sim.sync(0)
+    live, clicked = Live(sim), []
+    live.on_click = lambda live, world, point: clicked.append((world, *point))
+    bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
+    picture = PictureSource(sim, bodies, [0, 1]).take_picture(live)
+    wheel = picture.pos[1, sim.mj_model.body("cars_wheel:7").mocapid.item()]
+    for target, direction in ((wheel, [0, 0, -1.0]), ([7.0, 8.0, 0.0], [0.1, 0, -1.0]), (wheel, [0, 0, 1.0])):
+        origins = np.stack([np.full(3, np.nan), np.asarray(target) - 2 * np.array(direction)])
+        live.click_along(bodies, picture, origins, np.array(direction))
+    live._run_posted()
+    assert live.followed == (1, "cars", 1)
+    np.testing.assert_allclose(clicked, [(1, 7.0, 8.0, 0.0)])

@@ -1,6 +1,7 @@
 """Recordings of motion capture, which stay readable after a crash, and their replay.
 
-A file is a journal (``crazysim.media.journal``) of names of bodies (JSON) and of polls with their frames.
+A file is a journal (``crazysim.media.journal``) of names of bodies (JSON) and of polls with their frames: what a source
+sent, exactly and with its losses, which the poses of a recorded flight do not tell.
 """
 
 from __future__ import annotations
