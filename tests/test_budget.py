@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3238,
     "geometry": 964,
-    "lab": 15618,
+    "lab": 15591,
     "media": 1070,
     "plugins": 4869,
     "scene": 2576,
