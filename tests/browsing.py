@@ -18,8 +18,6 @@ MAX_PIXEL_DISTANCE = 12
 
 
 class Browser:
-    """A headless browser, controlled by its debugging protocol."""
-
     def __init__(self, program, folder):
         from websockets.sync.client import connect
 
@@ -45,7 +43,6 @@ class Browser:
         self._n = 0
 
     def open(self, url, width, height):
-        """Open a page in a view of some pixels."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Page.navigate", url=url)
 
@@ -62,7 +59,6 @@ class Browser:
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
     def box(self, selector):
-        """Return left, top, width and height of an element, or None while it is not there."""
         return self.value(
             f"(() => {{ const e = document.querySelector('{selector}'); if (!e) return null;"
             f" const b = e.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; }})()"
@@ -78,7 +74,6 @@ class Browser:
         return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).astype(int)
 
     def mask(self, rgb):
-        """Return rows and columns of the pixels with the hue of a colour."""
         return np.nonzero(has_colour(self.picture(), rgb))
 
     def find(self, rgb, expected):

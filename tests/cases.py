@@ -72,19 +72,16 @@ def vectors(n=3, max_abs=10.0, **options):
 
 
 def unit_quats(**options):
-    """Return a strategy for attitudes, xyzw."""
     nonzero_vectors = vectors(4, 1.0, **options).filter(lambda q: np.linalg.norm(q) > 0.1)
     return nonzero_vectors.map(lambda q: q / np.linalg.norm(q))
 
 
 def controller_params(record, **changes):
-    """Return the parameters of a controller for the default airframe, with some changes."""
     params = record.create(load_airframe("cf21B_500"))
     return params.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
 
 
 def send(data, command, **kwargs):
-    """Return the data after a command at the command level of the simulation."""
     return getattr(F, f"{data.controls.mode.value}_control")(data, command, **kwargs)
 
 
@@ -177,7 +174,6 @@ def zero_thrust_command(data):
 
 
 def repeat_command(data, command):
-    """Return a command of one drone for every drone of every world."""
     return np.broadcast_to(command, (*data.states.pos.shape[:2], len(command)))
 
 
@@ -191,14 +187,12 @@ def trees_equal(a, b):
 
 
 def leaf_on_host(x):
-    """Return a leaf on the host, random keys as their data."""
     is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jax.random.key_data(x) if is_key else x)
 
 
 @stage("drone")
 def repulsion(data):
-    """Push a drone away from the others of its world."""
     pos = data.states.pos
 
     def push(other_pos, is_self):
@@ -225,7 +219,6 @@ def gap(data):
 
 @stage("world")
 def centre(data):
-    """Pull the drones of a world to their centre."""
     pos = data.states.pos
     return data.replace(states=data.states.replace(force=1e-2 * (jnp.mean(pos, axis=0) - pos)))
 
@@ -247,7 +240,6 @@ def build_stagewise_step(sim):
 
 
 def make_hovering_sim(n_worlds=3, n_drones=2, **kwargs):
-    """Return a simulation of drones that hover at different positions."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
     grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
     sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))

@@ -72,7 +72,6 @@ def pytest_runtest_protocol(item):
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Report the processor time of a test, and fail skipped tests in CI, where they would hide tests that never run."""
     outcome = yield
     report = outcome.get_result()
     if report.skipped and os.environ.get("CRAZYSIM_NO_SKIP"):
@@ -84,7 +83,6 @@ def pytest_runtest_makereport(item, call):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """List the tests that took long, and why."""
     reports_with_times = (
         r for reports in terminalreporter.stats.values() for r in reports if getattr(r, "user_properties", None)
     )
@@ -120,7 +118,6 @@ def viser():
 
 @pytest.fixture
 def rng():
-    """Return a generator that gives the same numbers in every run."""
     return np.random.default_rng(20261121)
 
 
@@ -154,7 +151,6 @@ def chromium(_chromium, viser, monkeypatch):
 
 
 def can_render():
-    """Return True if this machine can make an OpenGL context."""
     import mujoco
 
     try:

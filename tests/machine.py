@@ -17,7 +17,6 @@ def n_workers(cores: float, memory: float) -> int:
 
 
 def cores(limits: Path = LIMITS) -> float:
-    """Return the number of cores that this process may use, by its affinity and the quota of its container."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota, period = _words(limits / "cpu.max", "max 100000")
     return count if quota == "max" else min(count, int(quota) / int(period))

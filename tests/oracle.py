@@ -155,8 +155,6 @@ def poses(rng, n):
 
 @functools.cache
 def compile_distance_and_slopes(a, b):
-    """Return a function from poses to distances and their gradients with respect to position and rotation."""
-
     def total(pos, rot):
         values = distance(a, b, pos, rot)
         return jnp.sum(values), values

@@ -19,7 +19,6 @@ def raised(node):
 
 
 def pieces(text):
-    """Return the pieces of a text in an f-string."""
     match text:
         case ast.JoinedStr(values=values):
             return values

@@ -11,7 +11,6 @@ import pytest
 
 
 def virtual_screen(folder):
-    """Yield the display of a virtual screen, and the file in a folder that holds its pixels."""
     if shutil.which("Xvfb") is None:
         pytest.skip("no Xvfb")
     read_end, write_end = os.pipe()

@@ -34,7 +34,6 @@ N_STEPS = 20
 
 
 def leaf_digests(tree):
-    """Return a digest of the bits of every leaf by its path."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path): digest(x) for path, x in leaves}
 
@@ -46,7 +45,6 @@ def digest(x):
 
 
 def flights():
-    """Return digests of the data after some steps, and the description of the step, of every case of the sweep."""
     result = {}
     for name, build in sweep.CASES.items():
         sim = build()
@@ -58,7 +56,6 @@ def flights():
 
 
 def environments():
-    """Return digests of observations, rewards and states of every task after some steps with drawn actions."""
     result = {}
     for name in task_names():
         env = make(name, n_worlds=8)
@@ -71,7 +68,6 @@ def environments():
 
 
 def public_names():
-    """Return the names that every module exports, by module."""
     names = {"crazysim": sorted(crazysim.__all__)}
     for module in pkgutil.walk_packages(crazysim.__path__, "crazysim."):
         if module.name.rpartition(".")[2].startswith("_"):
@@ -86,7 +82,6 @@ def public_names():
 
 
 def messages():
-    """Return the messages of all errors and warnings of the package, with their number of places."""
     found = {}
     for path in sorted(Path(crazysim.__file__).parent.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -106,7 +101,6 @@ def write(path, parts):
 
 
 def compare(before, after):
-    """Print every difference, and return their number."""
     n = 0
     for part in before:
         for name in sorted(before[part] | after[part]):

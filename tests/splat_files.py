@@ -25,7 +25,6 @@ def write_splats(path, n=30, n_colors=16, seed=0, **changes):
 
 
 def make_splat(pos, deviation, opacity, color):
-    """Return a round Gaussian that has the same colour from all directions."""
     return Gaussians(
         jnp.asarray([pos], jnp.float32),
         jnp.array([[0, 0, 0, 1.0]]),

@@ -53,8 +53,6 @@ class Springs(Population):
 
 
 class Crowd(Springs):
-    """Springs whose masses also attract each other."""
-
     def derivative(self, data):
         rates, pos = super().derivative(data), self.pos
 
@@ -65,16 +63,12 @@ class Crowd(Springs):
 
 
 class Tied(Springs):
-    """Springs whose masses the drones also pull."""
-
     def derivative(self, data):
         rates = super().derivative(data)
         return rates | {"vel": rates["vel"] + jnp.mean(data.states.pos - self.pos, axis=0)}
 
 
 class Tying(Springs):
-    """Springs whose masses also pull the drones, and exchange momentum with them in each world."""
-
     def stages(self, sim):
         @stage("drone")
         def pull(data):

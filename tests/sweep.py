@@ -173,7 +173,6 @@ PATHS = {"params.rotor_vel_max": 0.2, "plugins.battery.resistance": (0.5, 2.0)}
 
 
 def triad_errors(size):
-    """Return errors of three axes in proportion to the size of the measured quantity."""
     return Triad(noise=1e-3 * size, bias=0.1 * size, bias_spread=0.1 * size, random_walk=0.01 * size,
                  instability=0.1 * size, scale=0.1, scale_spread=0.03, misalignment=0.02, misalignment_spread=0.02,
                  bandwidth=80.0)  # fmt: skip
@@ -233,7 +232,6 @@ def kalman():
 
 
 def eskf():
-    """Return a filter and a sensor of one number."""
     filter_inputs = [biased_imu(), UWB(ANCHORS[:1], noise=0.1)]
     return [*filter_inputs, ESKF(filter_inputs)]
 
@@ -244,7 +242,6 @@ def complementary():
 
 
 def add_drifting_pad(sim):
-    """Add an object that a stage of the user moves."""
     pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5])
 
     @stage("world")
@@ -260,7 +257,6 @@ def add_ball(sim):
 
 
 def let_drones_meet(sim):
-    """Let the two drones of each world meet."""
     pos, vel = [[0, 0, 1.0], [0.12, 0.02, 1.01]], [[0.5, 0, -0.3], [-0.5, 0, -0.3]]
     shape = sim.data.states.pos.shape
     sim.data = with_states(sim.data, pos=np.broadcast_to(pos, shape), vel=np.broadcast_to(vel, shape))
@@ -268,7 +264,6 @@ def let_drones_meet(sim):
 
 @stage("drone")
 def distances(data):
-    """Write distances of a sphere to every kind of shape, and the gradient of one, to the wrenches of the states."""
     s = data.states
     rot = rotation.matrix(s.quat)
     values = jnp.stack([distance(SPHERE, shape, s.pos, rot) for shape in SHAPES])
@@ -296,7 +291,6 @@ def insert_before_integration(*stages):
 
 
 def mean_torque(data):
-    """Add a torque that depends on the drones of all worlds."""
     mean = jnp.mean(data.states.pos, axis=(0, 1))
     return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
 
@@ -311,8 +305,6 @@ def select_controller(state, setpoint, time):
 
 
 def make_builder(plugins=list, **settings):
-    """Return a function that builds a simulation from these and further settings."""
-
     def build(**options):
         return make_flying_sim(plugins=plugins(), **settings | options)
 

@@ -107,7 +107,6 @@ def compare(name, engines):
 
 
 def select_worlds(data, worlds):
-    """Return the numbers of some worlds, by their place in the data."""
     leaves = zip(jax.tree.leaves_with_path(data), jax.tree.leaves(scopes(data)), strict=True)
     return {jax.tree_util.keystr(path): x[worlds] for (path, x), scope in leaves if scope not in ("shared", "opaque")}
 

@@ -14,7 +14,6 @@ REQUIRED_OPTIONS = ("--mass", "1.2", "--propeller", "0.127", "--thrust-to-weight
 
 
 def rows(text):
-    """Return the printed lines by name."""
     return {line[:22].strip(): line[22:] for line in text.splitlines()}
 
 

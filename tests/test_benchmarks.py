@@ -23,7 +23,6 @@ def benchmarks(monkeypatch):
 
 @pytest.fixture
 def run(benchmarks, monkeypatch, capsys):
-    """Return a function that runs a script and its cases in this process, and returns the lines that it printed."""
     import measure
 
     monkeypatch.setattr(measure, "run_in_process", lambda function, *args: function(*args))

@@ -10,12 +10,10 @@ from crazysim.eager import jit_eager_calls
 
 @pytest.fixture
 def traced():
-    """Return a function, and the list of types of its arguments in each run of its Python code."""
     argument_types = []
 
     @jit_eager_calls("is_turned")
     def rotated(x, table, is_turned=False):
-        """Return a product."""
         argument_types.append((type(x), type(table)))
         y = x @ table
         return -y if is_turned else y

@@ -16,7 +16,6 @@ from crazysim.engine.cache import default_folder
 
 
 def lines(text):
-    """Return the printed lines by name."""
     return {name: value.strip() for name, _, value in (line.partition(":") for line in text.splitlines())}
 
 

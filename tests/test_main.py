@@ -110,7 +110,6 @@ def test_wrong_arguments_are_one_line(arguments, word, tmp_path, monkeypatch, ca
 
 
 def options_with_numbers():
-    """Yield the parser and the action of every option that is a number."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
     for module in (demo, replay, show, live, training, airframe, identify, validate, info):

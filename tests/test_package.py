@@ -135,7 +135,6 @@ def test_extras_that_messages_and_pages_name_exist():
 
 
 def undocumented_methods(sources):
-    """Return the public methods of public classes that neither the class nor a base of the package documents."""
     classes = [node for source in sources for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
     methods, bases = collections.defaultdict(dict), collections.defaultdict(set)
     for node in classes:
@@ -182,7 +181,6 @@ def test_every_target_of_make_that_is_named_exists(path):
 
 
 def commands_of_make(*arguments):
-    """Return the commands that make would run."""
     make = ["make", "--dry-run", "--no-print-directory", *arguments]
     return subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
 

@@ -11,8 +11,6 @@ from crazysim.progress import progress_bar
 
 
 class Terminal(io.StringIO):
-    """A text stream that is a terminal."""
-
     def isatty(self):
         return True
 

@@ -27,7 +27,6 @@ angles = st.floats(-3.1, 3.1)
 
 
 def assert_same_rotation(p, q):
-    """Assert that two unit quaternions are the same rotation, up to their sign."""
     np.testing.assert_allclose(np.abs(np.sum(np.asarray(p) * np.asarray(q), axis=-1)), 1.0, atol=1e-14)
 
 
@@ -124,7 +123,6 @@ def test_heading_is_along_the_yaw(q, scale):
 
 @jax.jit
 def heading_and_gradient(q):
-    """Return the direction ahead, and its derivatives by the quaternion."""
     return rot.heading(q)[0], jax.jacobian(lambda q: rot.heading(q)[0])(q)
 
 
@@ -166,13 +164,11 @@ def test_law_07_safe_functions_have_gradient_zero_at_zero():
 @jax.jit
 @jax.vmap
 def values_and_jacobians(q):
-    """Return values and derivatives of functions of one quaternion, by name."""
     return {fn.__name__: (fn(q), jax.jacobian(fn)(q)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis)}
 
 
 @jax.jit
 def jacobians_of_small_turns(rpy, quat, rotvec):
-    """Return the derivatives of quaternions by angles and by a turn."""
     return jax.jacobian(rot.from_rpy)(rpy), *jax.jacobian(rot.integrate_attitude, (0, 1))(quat, rotvec, 1.0)
 
 
@@ -219,8 +215,6 @@ def test_quaternion_of_axes_gives_the_same_rotation_back(q):
 
 @jax.jit
 def quaternion_of_turned_axes(q, rotvec):
-    """Return the quaternion of the axes of a turned quaternion, and its derivatives by the turn."""
-
     def there_and_back(rotvec):
         axes = jnp.moveaxis(rot.matrix(rot.multiply(q, rot.integrate_attitude(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
         return rot.quat_from_axes(*axes)

@@ -27,7 +27,6 @@ HIGH = 50.0
 
 @functools.cache
 def benchmark():
-    """Return the benchmark of controllers, whose flights and generic airframes these tests use."""
     sys.path.insert(0, str(BENCHMARKS))
     try:
         import controllers

@@ -24,8 +24,6 @@ class SpringParams(AirframeParams):
 
 
 class Spring(Controller, params=SpringParams, memory=SpringMemory):
-    """Weight and a spring along z, with a counter of its ticks."""
-
     name = "spring"
     levels = (Control.state,)
     output = Control.force_torque

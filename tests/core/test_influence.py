@@ -11,8 +11,6 @@ from crazysim.errors import UnknownNameError
 
 
 class TiltData(PyTree):
-    """A state, a counter and a parameter."""
-
     angle: Array = leaf("drone", 1)
     """Angle, rad. (n_worlds, n_drones, 2)"""
     count: Array = leaf("drone", 1)
@@ -22,8 +20,6 @@ class TiltData(PyTree):
 
 
 class Tilt(Plugin):
-    """A plugin whose methods call functions of a test."""
-
     act: object = None
     rates: object = None
     name: str = "tilt"
@@ -141,8 +137,6 @@ def test_law_09_a_wrong_rate_names_plugin_and_field(case):
 
 def test_law_09_rates_without_a_record():
     class Recordless(Plugin):
-        """A plugin with a state and no record."""
-
         name: str = "recordless"
 
         def derivative(self, data):

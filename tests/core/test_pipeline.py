@@ -103,7 +103,6 @@ def sim():
 
 @pytest.fixture(autouse=True)
 def restore(request):
-    """Restore the stages and data of the shared simulation after a test."""
     if "sim" not in request.fixturenames:
         yield
         return

@@ -40,8 +40,6 @@ MASS = 0.0434
 
 
 class WakeData(PyTree):
-    """Lagging velocity of the air that a drone drags along."""
-
     vel: Array = leaf("drone", 1)
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
     rate: Array = leaf("parameter", 1, (1,))
@@ -247,8 +245,6 @@ def test_plugins_draw_into_images():
 
 
 class StartRecorder(Plugin):
-    """A plugin that stores where an episode begins."""
-
     pos: Array = state((3,))
     """Position at which the episode began, world frame, m. (n_worlds, n_drones, 3)"""
     name: str = "start"
@@ -258,8 +254,6 @@ class StartRecorder(Plugin):
 
 
 class LateStartRecorder(StartRecorder):
-    """A plugin that stores where a drone is after the integration of the first step."""
-
     reset_before: ClassVar[str | None] = "increment_steps"
     name: str = "late_start"
 
@@ -294,8 +288,6 @@ def test_episodes_begin_at_resets_or_in_front_of_a_stage_of_their_first_step():
 )
 def test_observations_of_another_form_are_named(observe, message):
     class Observer(Plugin):
-        """A plugin that measures."""
-
         name: str = "observer"
 
         def observations(self, data):
@@ -354,8 +346,6 @@ def test_functions_can_be_a_plugin():
 
 
 class DuplicateStage(FunctionPlugin):
-    """A plugin whose stage has the name of another stage."""
-
     name: str = "duplicate"
     order: ClassVar[int] = 3
 
@@ -364,8 +354,6 @@ class DuplicateStage(FunctionPlugin):
 
 
 class FailingPlugin(Plugin):
-    """A plugin that fails after it has put an object into the scene."""
-
     fails: str = "never"
     """Result that is wrong: ``"record"``, ``"stages"``, ``"pipeline"`` or ``"never"``."""
     name: str = "failing"
@@ -432,8 +420,6 @@ class Unstaged(Plugin):
 
 
 class Functional(Plugin):
-    """A plugin whose stage is not a method."""
-
     name: str = "functional"
 
     def stages(self, sim):
@@ -441,8 +427,6 @@ class Functional(Plugin):
 
 
 class Undeclared(Plugin):
-    """A plugin whose record declares nothing."""
-
     name: str = "undeclared"
 
     def record(self, sim):
@@ -450,8 +434,6 @@ class Undeclared(Plugin):
 
 
 class Sail(Plugin, requires=Wind):
-    """A plugin that needs another one."""
-
     name: str = "sail"
 
 
@@ -509,8 +491,6 @@ def test_law_09_impossible_additions_replacements_and_removals_are_refused(act, 
 
 
 class Discs(Plugin):
-    """A plugin with a number, a declared setting and another one."""
-
     level: Param = param(default=1.0)
     discs: ArrayLike = setting(default=((0.0, 1.0),))
     table: Any = ()

@@ -38,8 +38,6 @@ class Counter:
 
 
 class NativeRecord(PyTree):
-    """A record that declares its scopes as this project does."""
-
     count: jax.Array = leaf("world")
     """Steps. (n_worlds, 1)"""
 

@@ -28,8 +28,6 @@ TOLERANCE = 1e-5
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A difference between two engines."""
-
     stage: str
     """First stage after which the engines differ."""
     leaf: str

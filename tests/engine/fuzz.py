@@ -54,8 +54,6 @@ COMPARED_ENGINES = ("lanes", "interpret", "fused")
 
 
 class Inputs(PyTree):
-    """Inputs of the programs, by the letter of their type and their shape."""
-
     numbers: dict = leaf("drone", 0)
     """Scalars. ()"""
     vectors: dict = leaf("drone", 1)
@@ -117,14 +115,11 @@ def input_shapes(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A program as a stage."""
-
     program: Program
     scope: str
 
     @functools.cached_property
     def avals(self) -> list[jax.ShapeDtypeStruct]:
-        """Shapes and types of all values."""
         return jax.eval_shape(self.program.values, input_shapes(self.scope))
 
     def stage(self, name: str) -> Stage:
@@ -150,7 +145,6 @@ class Case:
 
     @functools.cached_property
     def signed(self) -> list[bool]:
-        """True for each line that preserves the sign of zero."""
         n = len(self.program.inputs)
         lines = enumerate(self.program.lines)
         return [keeps_sign_of_zero(functools.partial(_apply_to_values, line), self.avals[: n + j]) for j, line in lines]
@@ -167,7 +161,6 @@ class Case:
 
 
 def pack_values(values: Sequence, n_inputs: int) -> tuple:
-    """Return the values after the inputs as one vector of floats and one of integers."""
     floats, others = [jnp.zeros(0, np.float32)], [jnp.zeros(0, np.int32)]
     for x in values[n_inputs:]:
         x = jnp.ravel(x)
@@ -195,7 +188,6 @@ class Finding:
     description: str
 
     def __str__(self) -> str:
-        """Return the program and the description of the difference."""
         return f"--- {self.engine}, one {self.case.scope}: {self.description}\n{self.case.program}"
 
 

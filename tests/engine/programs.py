@@ -26,8 +26,6 @@ NAMES: dict = {"jax": jax, "jnp": jnp, "lax": lax, "np": np}
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Lines of Python, and the names of the inputs before them."""
-
     inputs: tuple[str, ...]
     """Names of the inputs, which are ``v0``, ``v1``, ..."""
     lines: tuple[str, ...]
@@ -40,7 +38,6 @@ class Program:
         return values
 
     def __str__(self) -> str:
-        """Return the program as Python."""
         input_lines = [f"v{k} = {name}" for k, name in enumerate(self.inputs)]
         return "\n".join(input_lines + [f"v{k} = {line}" for k, line in enumerate(self.lines, len(self.inputs))])
 
@@ -56,10 +53,7 @@ def evaluate(line: str, values: Sequence):
 
 
 class Draw:
-    """Random choices for the templates of one line."""
-
     def __init__(self, rng: np.random.Generator, avals: Sequence[jax.ShapeDtypeStruct]):
-        """Create the choices for values of these shapes and types."""
         self.rng, self.avals = rng, avals
         self.shape: tuple[int, ...] = ()
         """Shape of the value that was chosen last."""
@@ -82,7 +76,6 @@ class Draw:
         return f"v{k}"
 
     def match(self, kinds: str = "biuf") -> str:
-        """Return the name of a value that has the shape of the last chosen value or is a scalar, if there is one."""
         fits = [k for k, a in enumerate(self.avals) if _kind(a.dtype) in kinds and a.shape in (self.shape, ())]
         return f"v{self.choice(fits)}" if fits else self.value(kinds)
 
@@ -91,7 +84,6 @@ class Draw:
         return self.int(-n, n - 1) if n else 0
 
     def real(self) -> str:
-        """Return a random floating-point number, as text."""
         return self.choice(["0.5", "2.0", "-1.0", "3.0", "0.25", "1e-3", "-2.5", "1.0", "7.0"])
 
 
@@ -153,25 +145,21 @@ def _split_names(text: Sequence[str] | str) -> list[str]:
 # Element-wise
 @template("elementwise", 8)
 def unary(d: Draw) -> str:
-    """Functions of one floating-point operand."""
     return f"{d.choice(_split_names(UNARY_FLOAT))}({d.value('f')})"
 
 
 @template("elementwise", 2)
 def unary_int(d: Draw) -> str:
-    """Functions of one integer operand."""
     return f"{d.choice(_split_names(UNARY_INT))}({d.value('iu')})"
 
 
 @template("elementwise", 2)
 def unary_any(d: Draw) -> str:
-    """Functions of one operand of any type."""
     return f"{d.choice(_split_names(UNARY_ANY))}({d.value()})"
 
 
 @template("elementwise", 8)
 def binary_float(d: Draw) -> str:
-    """Functions of two floating-point operands."""
     name = d.choice(_split_names(BINARY_FLOAT))
     first = d.value("f")
     second = d.match("f") if d.rng.random() < 0.7 else d.real()
@@ -186,7 +174,6 @@ def binary_any(d: Draw) -> str:
 
 @template("elementwise", 6)
 def binary_int(d: Draw) -> str:
-    """Functions of two integer operands."""
     kind = d.choice("iu")
     first = d.value(kind)
     second = d.match(kind) if d.rng.random() < 0.7 else str(d.int(0 if kind == "u" else -3, 40))
@@ -195,7 +182,6 @@ def binary_int(d: Draw) -> str:
 
 @template("elementwise", 3)
 def selections(d: Draw) -> str:
-    """Selections and limits."""
     x = d.value()
     return d.choice([
         f"jnp.where({d.match('b')}, {x}, {d.match()})", f"jnp.clip({x}, {d.match()}, {d.match()})",
@@ -209,7 +195,6 @@ def selections(d: Draw) -> str:
 
 @template("elementwise", 3)
 def powers(d: Draw) -> str:
-    """Powers, roundings and precisions with static settings."""
     x = d.value("f")
     return d.choice([
         f"lax.integer_pow({x}, {d.int(-4, 7)})", f"{x} ** {d.int(-3, 5)}", f"{x} ** {d.real()}",
@@ -223,7 +208,6 @@ def powers(d: Draw) -> str:
 
 @template("types", 5)
 def conversions(d: Draw) -> str:
-    """Conversions between types, and of bits."""
     kind = d.choice(["np.float32", "np.int32", "np.uint32", "bool"] * 12 + ["np.int8", "np.uint8", "np.int16",
                     "np.uint16", "np.float16", "jnp.bfloat16"])  # fmt: skip
     return d.choice([
@@ -263,7 +247,6 @@ def movement(d: Draw) -> str:
 
 @template("movement", 1)
 def constants(d: Draw) -> str:
-    """Constants."""
     x = d.value(max_ndim=1)
     return d.choice([
         f"jnp.arange({d.int(1, 5)}) + {x}[..., None]", f"jnp.eye({d.int(1, 3)}, dtype={x}.dtype)",
@@ -296,7 +279,6 @@ REDUCTIONS += "count_nonzero ptp nanmean median sort argsort logical_or.reduce_ 
 
 @template("reductions", 8)
 def reductions(d: Draw) -> str:
-    """Reductions, scans and sorts."""
     x = d.value(min_ndim=1)
     axis, n = d.axis(), len(d.shape)
     back = d.choice(["True", "False"])
@@ -322,7 +304,6 @@ def reductions(d: Draw) -> str:
 
 @template("reductions", 3)
 def sorts(d: Draw) -> str:
-    """Sorts of several operands."""
     x = d.value(min_ndim=1)
     axis = d.axis() % max(len(d.shape), 1)
     y, z = d.match(), d.match()
@@ -340,7 +321,6 @@ def sorts(d: Draw) -> str:
 # Products
 @template("products", 4)
 def products(d: Draw) -> str:
-    """Products of arrays."""
     kind = d.choice(["f", "f", "iu", "biuf"])
     x = d.value(kind, 1)
     y = d.match(kind)
@@ -380,7 +360,6 @@ def systems(d: Draw) -> str:
 # Indexing
 @template("indexing", 8)
 def gathers(d: Draw) -> str:
-    """Reads at known and computed indices."""
     x = d.value(min_ndim=1)
     axis, length = d.axis(), max(d.shape[0], 1)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
@@ -409,7 +388,6 @@ def gathers(d: Draw) -> str:
 
 @template("indexing", 4)
 def tables(d: Draw) -> str:
-    """Reads of constants at computed indices, from tables that are too long for selections."""
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 0)
     kind = d.choice(["np.float32", "np.int32", "np.uint32", "np.bool_"])
     x = f"jnp.asarray(({kind})(np.arange({3 * d.int(9, 80)}) * {d.int(1, 7)} % 11).reshape(-1, 3))"
@@ -423,7 +401,6 @@ def tables(d: Draw) -> str:
 
 @template("indexing", 10)
 def scatters(d: Draw) -> str:
-    """Writes at known and computed indices."""
     x = d.value(min_ndim=1)
     length, n = max(d.shape[0], 1), len(d.shape)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
@@ -477,7 +454,6 @@ def _windowed_scatter(d: Draw, x: str) -> str:
 # Control flow
 @template("control flow", 6)
 def control_flow(d: Draw) -> str:
-    """Branches, loops and calls."""
     x = d.value("f") if d.rng.random() < 0.7 else d.value("iu")
     test, index = d.value("b", 0, 0), d.value("iu", 0, 0)
     length = d.shape[0] if d.shape else 1
@@ -514,7 +490,6 @@ def control_flow(d: Draw) -> str:
 # Random numbers
 @template("random", 2)
 def random_numbers(d: Draw) -> str:
-    """Random numbers from a key of each drone."""
     key = f"jax.random.fold_in(jax.random.key({d.choice(['3', d.value('iu', 0, 0)])}), {d.value('iu', 0, 0)})"
     return d.choice([
         f"jax.random.bits({key}, (3,))", f"jax.random.uniform({key}, (3,))", f"jax.random.key_data({key})",
@@ -551,7 +526,6 @@ def draw_program(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtyp
 
 
 def _draw_line(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str, Any]:
-    """Return a line, and its shape and type, or None if JAX refuses the line or its value is too large."""
     try:
         line = fn(Draw(rng, avals))
         with warnings.catch_warnings():

@@ -50,7 +50,6 @@ def _primitives(jaxpr) -> Iterator[str]:
 
 
 def _inlined(fn, args: Sequence):
-    """Return the jaxpr of a function, with the functions that it calls inlined if JAX can do that."""
     try:
         with jax.disable_jit():
             return jax.make_jaxpr(fn)(*args)
@@ -117,14 +116,12 @@ def _abs_finite(x):
 
 
 def _product_leaves_range(eqn, x):
-    """Return True where an intermediate product overflows or underflows in some order of multiplication."""
     size = jnp.where(np.asarray(x) == 0, 1, _abs_finite(x))
     (largest,), (smallest,) = _apply(eqn, [jnp.maximum(size, 1)]), _apply(eqn, [jnp.minimum(size, 1)])
     return jnp.isinf(largest) | (smallest < TINY)
 
 
 def _sum_leaves_range(eqn, *args: Any):
-    """Return True where an intermediate sum overflows in some order of addition."""
     return jnp.isinf(_apply(eqn, [_abs_finite(x) for x in args])[0])
 
 
@@ -161,8 +158,6 @@ LARGEST_ANGLE = 1e12
 
 
 def allow_gpu_results() -> None:
-    """From now on, allow any sine, cosine and tangent of a very large angle, as kernels on a GPU may return."""
-
     def is_large(eqn, x):
         del eqn
         return jnp.abs(x) > LARGEST_ANGLE
@@ -172,7 +167,6 @@ def allow_gpu_results() -> None:
 
 
 def find_alternatives(eqn, args: Sequence, out) -> tuple[Any, tuple[float, ...]] | None:
-    """Return where the result of an equation is not determined to a few units, and numbers that it may be there."""
     where, numbers = ALTERNATIVES.get((eqn.primitive.name, np.dtype(out.dtype).kind), (None, ()))
     return None if where is None else (where(eqn, *args), numbers)
 

@@ -15,8 +15,6 @@ N_LANES = N_WORLDS * N_DRONES
 
 
 class Inputs(PyTree):
-    """Inputs of a case."""
-
     x: jax.Array = leaf("drone", 1)
     """Numbers of both signs, two of them equal. (6,)"""
     m: jax.Array = leaf("drone", 2)
@@ -304,7 +302,6 @@ TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products tha
 
 
 def assert_agree(actual, expected, name):
-    """Assert that floats differ by no more than rounding, and other numbers not at all."""
     actual, expected = np.asarray(actual), np.asarray(expected)
     assert actual.dtype == expected.dtype
     if expected.dtype.kind != "f":

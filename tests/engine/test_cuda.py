@@ -18,8 +18,6 @@ from crazysim.engine.ir.program import Leaf, Program, Segment
 
 @dataclasses.dataclass(frozen=True)
 class Gpu:
-    """A fake GPU with a compute capability."""
-
     compute_capability: str
     local_hardware_id: int = 0
     platform: str = "gpu"

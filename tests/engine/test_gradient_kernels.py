@@ -196,7 +196,6 @@ def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(x64):
 
 @stage("drone")
 def long_loop(data):
-    """Push a drone by the result of a loop that is too long to be unrolled."""
     x, _ = jax.lax.scan(lambda x, _: (jnp.sin(x) + 1e-3 * x, None), data.states.pos[0], length=3000)
     return data.replace(states=data.states.replace(force=jnp.zeros(3).at[1].set(1e-2 * x)))
 

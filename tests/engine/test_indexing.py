@@ -24,8 +24,6 @@ def fuzzer():
 
 
 class Results(PyTree):
-    """Results of all functions."""
-
     rows: jax.Array = leaf("drone", 2)
     """A vector for each function. (n_worlds, n_drones, k, 3)"""
 

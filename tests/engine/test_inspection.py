@@ -21,7 +21,6 @@ F = np.float32
 
 @stage("drone")
 def sway(data):
-    """Push along x by the sine of the height."""
     force = data.states.force
     x = data.params.mass[0] * jnp.sin(data.states.pos[2])
     return data.replace(states=data.states.replace(force=jnp.stack([x, force[1], force[2]])))
@@ -29,7 +28,6 @@ def sway(data):
 
 @stage("world")
 def follow(data):
-    """Give the second drone the force of the first."""
     force = data.states.force
     return data.replace(states=data.states.replace(force=jnp.stack([force[0], force[0]])))
 

@@ -46,8 +46,6 @@ def test_outside_of_a_trace_nothing_is_compiled():
 
 
 class Draws(PyTree):
-    """A random key of each drone, and the last number drawn."""
-
     key: jax.Array = leaf("drone", 0)
     """Key of the next draw. ()"""
     drawn: jax.Array = leaf("drone", 0)

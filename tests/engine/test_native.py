@@ -51,7 +51,6 @@ def compilations(tmp_path_factory, monkeypatch):
 
 
 def register_anew(source):
-    """Return the name of a kernel, registered as in a new process that has loaded no kernel."""
     native._LIBRARIES.clear()
     native.toolchain.cache_clear()
     return native.register_kernel(source)
@@ -269,7 +268,6 @@ def compile_in_another_process(folder, mode):
 
 
 def compiler_commands(folder):
-    """Return the commands of running compilers whose files are in a folder."""
     done = subprocess.run(["ps", "-eww", "-o", "args"], capture_output=True, text=True, check=True)
     return [line for line in done.stdout.splitlines() if str(folder) in line and "kernel.cpp" in line]
 

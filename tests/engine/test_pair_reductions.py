@@ -14,7 +14,6 @@ from crazysim.engine.ir.program import UnfusedStage
 
 @stage("drone")
 def crowd(data):
-    """Push drones apart. The force also uses a minimum, and reductions of a bool and of an integer."""
     pos = data.states.pos
 
     def pair(other, is_self):
@@ -83,8 +82,6 @@ def test_all_pairs_are_computed(n_drones):
 
 
 class Push(Plugin):
-    """Push drones apart in proportion to their distance."""
-
     name: str = "push"
 
     def influence(self, data):

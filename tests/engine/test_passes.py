@@ -106,7 +106,6 @@ def apply_fn(name):
 
 
 def guarded_segment(name, reads, write, fn):
-    """Return a segment that writes a number where x is positive."""
     b = Builder(stage=name)
     x, old, *rest = [b.input(np.float32) for _ in [X, write, *reads]]
     inner = Builder(b)

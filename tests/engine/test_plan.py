@@ -30,7 +30,6 @@ def sway(data):
 
 @stage("drone")
 def roll(data):
-    """Twist with the sine of the body rate."""
     return data.replace(states=data.states.replace(torque=1e-6 * jnp.sin(data.states.ang_vel)))
 
 
@@ -267,8 +266,6 @@ def test_explaining_runs_nothing_unless_asked_to_measure():
 
 @dataclasses.dataclass
 class Push:
-    """A stage function with settings. It is compared by value, so it has no hash."""
-
     force: float
 
     def __call__(self, data):
@@ -277,7 +274,6 @@ class Push:
 
 @stage("drone")
 def lift(data):
-    """Push upwards."""
     return data.replace(states=data.states.replace(force=data.states.force + jnp.asarray([0.0, 0.0, 1e-3])))
 
 

@@ -36,7 +36,6 @@ def lane_numbers(g):
 
 @pytest.fixture(scope="module")
 def expected_by_case():
-    """Return the results of JAX for all cases, from one program."""
     names = [*CASES, *RANDOM_CASES]
     return jax.jit(lambda g: {name: map_over_drones(name)(g) for name in names})(make_inputs())
 

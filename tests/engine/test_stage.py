@@ -10,8 +10,6 @@ from crazysim.engine.stage import vmap_worlds
 
 
 class Numbers(PyTree):
-    """A record with leaves of every scope."""
-
     of_drone: jax.Array = leaf("drone", 1)
     of_world: jax.Array = leaf("world", 1)
     batched: jax.Array = leaf("batch")

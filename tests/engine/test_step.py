@@ -138,8 +138,6 @@ def pitch_rate(data):
 
 
 class Gust(PyTree):
-    """A random force that changes slowly."""
-
     force: jax.Array = leaf("drone", 1)
     """Force, world frame, N. (3,)"""
     strength: jax.Array = leaf("world", 0)
@@ -154,7 +152,6 @@ class Gust(PyTree):
 
 @stage("drone")
 def gust(data):
-    """Change the force at random, differently for each drone."""
     record = data.plugins["gust"]
     noise = jax.random.normal(drone_key(data, "gust"), (3,))
     force = jnp.where(record.is_on, 0.9 * record.force + record.strength * noise, 0.0)
@@ -166,7 +163,6 @@ def gust(data):
 
 @stage("world")
 def separation(data):
-    """Push drones of a world apart."""
     offsets = data.states.pos[:, None] - data.states.pos[None, :]
     squared = jnp.sum(offsets**2, axis=-1, keepdims=True) + 0.1
     force = 1e-3 * jnp.sum(offsets / squared, axis=1)
@@ -309,8 +305,6 @@ def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
 
 
 class Twins(PyTree):
-    """A record whose leaves share arrays with other leaves."""
-
     flags: jax.Array = leaf("world")
     speeds: jax.Array = leaf("drone", 1)
     synced: jax.Array = leaf("shared")
@@ -340,7 +334,6 @@ def test_leaves_that_share_an_array_are_not_confused():
 
 
 def climb_policy(gain, data):
-    """Climb to one metre."""
     thrust = 0.4258 + gain * (1.0 - data.states.pos[..., 2:]) - 0.2 * data.states.vel[..., 2:]
     return jnp.concatenate([jnp.zeros_like(data.states.pos), thrust], axis=-1)
 

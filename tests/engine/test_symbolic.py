@@ -30,7 +30,6 @@ def g():
 
 
 def casadi_function(fn, *avals):
-    """Return a CasADi function from the arguments, one vector each, to the results as one vector."""
     import casadi
 
     block = lower_function(lambda *args: jnp.ravel(fn(*args)), *avals)

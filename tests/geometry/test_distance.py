@@ -63,7 +63,6 @@ def evaluate_points(kind, points, dtype=np.float64, one_by_one=False):
 
 
 def assert_same_signs(computed, expected, at_least=100):
-    """Assert that signs are equal, with enough separated and enough overlapping samples."""
     assert np.sum(expected > 0) > at_least
     assert np.sum(expected < 0) > at_least
     np.testing.assert_array_equal(computed > 0, expected > 0)

@@ -60,7 +60,6 @@ def distances_to_prisms(a, pos, quat):
 
 
 def draw_poses_near_surface(rng, n):
-    """Return poses around the surface, its rim included."""
     return rng.uniform(-1, 1, (n, 3)) * [0.7, 0.6, 0.4] + [0, 0, 0.3], normalize(rng.normal(size=(n, 4)))
 
 

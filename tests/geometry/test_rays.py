@@ -39,7 +39,6 @@ def trace_rays(kind, origin, direction, dtype=np.float64):
 
 
 def draw_rays(rng, n=N):
-    """Return rays from outside, aimed at the shape or past it, and rays from inside."""
     origin = random_points(rng, n)
     target = np.where(rng.uniform(size=(n, 1)) < 0.7, rng.uniform(-0.4, 0.4, (n, 3)), 10 * rng.normal(size=(n, 3)))
     direction = target - origin

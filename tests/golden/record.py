@@ -93,7 +93,6 @@ LAST_CLIPPED_STEP = 150
 
 
 def variants(dynamics: str, control: str) -> dict[str, tuple[str, dict[str, int]]]:
-    """List the integrator and the controller rates of each variant recorded for a pair."""
     result: dict[str, tuple[str, dict[str, int]]] = {"euler": ("euler", {}), "rk4": ("rk4", {})}
     if (dynamics, control) == ("first_principles", "attitude"):
         result["symplectic_euler"] = ("symplectic_euler", {})
@@ -103,7 +102,6 @@ def variants(dynamics: str, control: str) -> dict[str, tuple[str, dict[str, int]
 
 
 def hover_thrust(params: dict) -> float:
-    """Compute the collective thrust command in N that holds the weight of an airframe."""
     weight = float(params["mass"]) * GRAVITY
     if "cmd_f_coef" in params:
         return (weight - float(params["acc_coef"])) / float(params["cmd_f_coef"])
@@ -111,7 +109,6 @@ def hover_thrust(params: dict) -> float:
 
 
 def force_to_rpm(force: float, params: dict) -> float:
-    """Solve the quadratic thrust curve of one rotor for its speed in rpm."""
     c, b, a = (float(x) for x in np.ravel(params["rpm2thrust"]))
     return (-b + np.sqrt(b * b - 4.0 * a * (c - force))) / (2.0 * a)
 
@@ -141,7 +138,6 @@ def draw_balanced_rotors(rng: np.random.Generator) -> np.ndarray:
 
 
 def draw_world(dynamics: str, control: str, params: dict, world: int) -> dict[str, np.ndarray]:
-    """Draw the start, the external force and torque and the command of one world."""
     rng = np.random.default_rng([SEED, world])
     open_loop = control in OPEN_LOOP
     weight = float(params["mass"]) * GRAVITY
@@ -216,7 +212,6 @@ def draw_flight(dynamics: str, control: str, params: dict) -> dict[str, np.ndarr
 
 
 def check_dtypes(sim, dtype: np.dtype, where: str) -> None:
-    """Raise unless the data of a sim and everything that its step computes have one float type."""
     import jax
     import jax.numpy as jnp
 
@@ -279,7 +274,6 @@ def check_sample(
 def fly(
     dynamics: str, control: str, airframe: str, integrator: str, freqs: dict[str, int], dtype: np.dtype
 ) -> dict[str, np.ndarray]:
-    """Fly one flight with Crazyflow and return its start, its command and its samples."""
     import jax.numpy as jnp
     from crazyflow.control import load_params as load_gains
     from crazyflow.dynamics import load_params
@@ -326,7 +320,6 @@ def fly(
 
 
 def record_pass(pairs: list[tuple[str, str]], path: Path) -> None:
-    """Fly all flights of the given pairs in the float type of this process and save them to one file."""
     import crazyflow
     import jax
 
@@ -377,7 +370,6 @@ def merge(pair: tuple[str, str], double: dict[str, np.ndarray], single: dict[str
 
 
 def main() -> None:
-    """Run one pass per precision and write the files."""
     names = ["-".join(pair) for pair in PAIRS]
     parser = argparse.ArgumentParser(description="Record reference trajectories of Crazyflow.")
     parser.add_argument("pairs", nargs="*", help="which files to remake, such as so_rpy-state (default: all)")

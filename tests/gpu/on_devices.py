@@ -14,6 +14,5 @@ DEVICES = {name: Sim(device=name).device for name in NAMES}
 
 
 def require_device(device, tree):
-    """Return a tree after asserting that all its leaves are on a device."""
     assert {x.device for x in jax.tree.leaves(tree)} == {DEVICES[device]}
     return tree

@@ -45,13 +45,10 @@ def value_and_gradient(sim, n_steps=50, of_params=False):
 
 
 def floating_leaves(tree):
-    """Return the floating-point leaves of a gradient."""
     return [x for x in jax.tree.leaves(tree) if x.dtype != jax.dtypes.float0]
 
 
 def compare_gradients(build, tolerance=ROUNDING, **options):
-    """Compare gradients on the accelerator, in a kernel, with the reference on the CPU."""
-
     def run(device):
         sim = build(device, "plain" if device == "cpu" else "auto")
         fn, point = value_and_gradient(sim, **options)

@@ -22,7 +22,6 @@ FALLBACK_TESTS = "law_01 or law_10 or on_each_other_are_differentiated or tangen
 
 
 def run_on_both(run):
-    """Return the results of a function of a device on the accelerator and on the CPU, after checking their devices."""
     expected, result = (require_device(name, run(name)) for name in NAMES)
     return result, expected
 

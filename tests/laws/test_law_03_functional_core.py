@@ -55,7 +55,6 @@ def shell_rollout(start):
 
 
 def make_rollout(start, step):
-    """Return the same sequence as a pure function of the data and the commands."""
     _, default, _, reset, _ = start
 
     def function(data, commands):

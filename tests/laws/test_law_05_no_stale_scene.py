@@ -86,7 +86,6 @@ def drone_touches(sim):
 
 
 def sync_scene(sim, *heights):
-    """Reset, set the heights of drones, move the ball away, and sync the scene."""
     sim.reset()
     sim.data = with_heights(sim.data, *heights)
     if sim.n_worlds == 2:

@@ -131,7 +131,6 @@ def test_any_bad_value_in_a_state_ends_its_episode_or_vanishes(task, mode):
     paths = jax.tree_util.tree_leaves_with_path(state)
 
     def bad_cases(tree):
-        """Return the arrays and values of the worlds where a tree is not finite, with their flags."""
         leaves = jax.tree.leaves(tree)
         bad = sorted({int(k) for x in leaves for k in np.argwhere(~np.isfinite(x))[:, 0]})
         return [(jax.tree_util.keystr(paths[cases[k][0]][0]), cases[k][1], bool(flagged[k])) for k in bad]
@@ -166,8 +165,6 @@ class Best(PyTree):
 
 
 class KeepBest(Plugin):
-    """Keep the smallest height so far."""
-
     name: str = "best"
     start: object = np.inf
 

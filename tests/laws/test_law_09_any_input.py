@@ -49,8 +49,6 @@ TIME_LIMIT = 60
 
 @dataclasses.dataclass
 class Lazy:
-    """An argument that is made when it is needed."""
-
     make: Callable[[], Any]
 
 
@@ -72,14 +70,11 @@ def adapter(kind):
 
 
 def adapted(kind, method, **arguments):
-    """Call a method of an adapter after a reset."""
     adapter(kind).reset(seed=0)
     return getattr(adapter(kind), method)(**arguments)
 
 
 def on_sim(method):
-    """Return a call of a method of the simulation, whose data it leaves as they were."""
-
     def call(**arguments):
         before = sim().data
         try:
@@ -358,7 +353,6 @@ NO_FILES = ("load_csv", "read_log", "Flight.load", "SplatScene", "from_mjcf")
 
 @pytest.fixture(autouse=True, scope="module")
 def folder(tmp_path_factory):
-    """A recorder and others write files of any name, and the time to build what all calls share is not theirs."""
     for build in (sim, state, functools.partial(env, 1)):
         build()
     with contextlib.chdir(tmp_path_factory.mktemp("any_input")):

@@ -245,7 +245,6 @@ def test_every_setting_of_a_package_has_a_type_that_is_checked():
 
 @pytest.fixture(scope="module")
 def sims():
-    """Return a function from a class to a simulation of two worlds of three drones with the plugins it needs."""
     sims_by_key = {}
 
     def get_sim(kind):

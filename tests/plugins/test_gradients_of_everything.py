@@ -35,7 +35,6 @@ def create_each_plugin():
 
 
 def create_filters_of_all_sensors():
-    """Return effects, all sensors, and filters that use all sensors that they support."""
     imu, tracked = IMU(ERRORS, ERRORS, (0.01, 0.0, 0.0), imbalance=1e-8), MotionCapture(1e-3, 1e-2, delay=0.004)
     aids = [
         OpticalFlow(0.1),
@@ -60,8 +59,6 @@ def differentiable(data):
 
 
 def push_forward(stage, has_slope):
-    """Return a function from the data and the slopes of its leaves to both after a stage."""
-
     def run(data, slopes):
         leaves, tree = jax.tree.flatten(data)
 
@@ -112,7 +109,6 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
         return sim.data.replace(states=sim.data.states.replace(**x | {"quat": quat}))
 
     def fly(x):
-        """Return the numbers of the data after some steps, by name, and their slopes."""
         data = start_data(x)
         _, slopes = jax.jvp(
             lambda x: list(itertools.compress(jax.tree.leaves(start_data(x)), has_slope)), (x,), (directions,)

@@ -71,7 +71,6 @@ def new_sim():
 
 
 def place(sim):
-    """Return a simulation whose drones fly ahead."""
     states = sim.data.states
     pos, vel = np.array([[[0, 0, 0.4], [0, 0.5, 0.4]]], np.float32), np.array([[[1.5, 0, -0.3]] * 2], np.float32)
     sim.data = sim.data.replace(states=states.replace(pos=pos, vel=vel))
@@ -80,7 +79,6 @@ def place(sim):
 
 
 def fly(sim):
-    """Return states and records by name after a reset and a flight, with columns of objects in alphabetical order."""
     sim.reset()
     sim.attitude_control(repeat_command(sim.data, hover_command(sim.data)))
     sim.step(N_STEPS)
@@ -98,7 +96,6 @@ def fly(sim):
 
 
 def require_same_flight(sim, expected):
-    """Require the flight of another simulation, up to the rounding of another order of the bodies of the scene."""
     actual, desired = fly(sim), fly(expected)
     assert actual.keys() == desired.keys()
     for name, x in actual.items():
@@ -106,19 +103,16 @@ def require_same_flight(sim, expected):
 
 
 def add_object(sim, name, pos=None):
-    """Add an object, and return its handle."""
     return sim.scene.add("sphere", name, **OBJECTS[name] | ({} if pos is None else {"pos": pos}))
 
 
 def remove_object(sim, name):
-    """Remove an object that cannot be moved."""
     sim.spec.delete(sim.spec.body(f"{name}:0"))
     sim.build_mjx()
 
 
 @st.composite
 def histories(draw):
-    """Draw plugins and objects, moves and removals of objects, and reads of data and step, in any order."""
     plugins = draw(st.lists(st.sampled_from(list(READERS)), min_size=1, max_size=2, unique=True))
     objects = draw(st.lists(st.sampled_from(list(OBJECTS)), min_size=1, max_size=2, unique=True))
     events = [("plugin", name) for name in plugins] + [("object", name) for name in objects]
@@ -158,7 +152,6 @@ def test_objects_before_between_and_after_plugins_give_the_same_flight(history):
 
 
 def wall_ahead(sim):
-    """Add a wall half a metre ahead of the drones."""
     return sim.scene.add("wall", pos=[0.55, 0, 0], length=4.0, height=3.0, thickness=0.1)
 
 
@@ -325,7 +318,6 @@ def test_law_09_an_environment_refuses_objects_that_are_added_later():
 
 
 def kalman():
-    """Return a filter with its sensors."""
     return Kalman([IMU(), MotionCapture()])
 
 
@@ -403,7 +395,6 @@ def try_orders(sim, names):
 
 
 def rebuilt(sim):
-    """Return a new simulation with the plugins of another one, added in their present order."""
     expected = new_sim()
     for name in sim.plugins:
         expected.add(PLUGINS[name]())

@@ -125,7 +125,6 @@ WITHOUT_BATTERY = {key: load_airframe("cf21B_500").tables[key] for key in ("rigi
 
 
 def drone(**residual):
-    """Return an airframe with the coefficients of a residual."""
     return {"base": "cf21B_500", "residual": {key: x.tolist() for key, x in residual.items()}}
 
 
@@ -142,7 +141,6 @@ def fitted(plugin):
 
 
 def randomized(*plugins, **settings):
-    """Step a simulation, whose plugins need not be added in an order."""
     sim(*plugins, **settings).step()
 
 

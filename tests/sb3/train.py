@@ -84,7 +84,6 @@ def check_contract():
 
 
 def check_named_observations():
-    """Check that a policy of several inputs trains on observations by name, of two drones."""
     env = DroneVecEnv(make("hover", 2, n_drones=2), dict_obs=True, render_mode="rgb_array", render_size=(64, 48))
     assert env.observation_space["pos"].shape == (6,)
     assert env.action_space.shape == (8,)
@@ -96,7 +95,6 @@ def check_named_observations():
 
 
 def check_processes():
-    """Check that SubprocVecEnv trains on worlds in processes of their own, with seeds of their own."""
     make_env = functools.partial(make_single, "hover", seconds=N_STEPS / 50)
     env = SubprocVecEnv([make_env] * 2, start_method="spawn")
     PPO("MultiInputPolicy", env, n_steps=2 * N_STEPS, batch_size=8, device="cpu").learn(32)
@@ -143,7 +141,6 @@ def check_training():
 
 
 def check_example():
-    """Check that the example with SAC runs, and that its actor as a JAX function acts like the model."""
     path = Path(__file__).parents[2] / "docs" / "examples" / "sac.py"
     spec = importlib.util.spec_from_file_location("example_sac", path)
     example = importlib.util.module_from_spec(spec)

@@ -24,7 +24,6 @@ def sim():
 
 
 def write_stl(path, size):
-    """Write a tetrahedron as a binary STL file."""
     corners = size * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     triangles = b"".join(struct.pack("<12fH", *np.zeros(3), *corners[list(face)].ravel(), 0) for face in faces)
@@ -50,7 +49,6 @@ SCENE = """
 
 @pytest.fixture
 def scene_file(tmp_path):
-    """Return a scene file that names a mesh and a texture by relative paths."""
     for folder in ("meshes", "textures"):
         (tmp_path / folder).mkdir()
     write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
@@ -61,7 +59,6 @@ def scene_file(tmp_path):
 
 
 def attach_boxes(sim, positions):
-    """Add boxes as the documentation does."""
     obstacle_spec = mujoco.MjSpec.from_string(BOX)
     frame = sim.spec.worldbody.add_frame()
     for i, pos in enumerate(positions):

@@ -17,7 +17,6 @@ SPHERE_TOLERANCE = 1e-5
 
 
 def build_course():
-    """Return a simulation with objects of every kind, movable and fixed, and the handles."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     handles = {
         "gate": sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]], stand=1.0),
@@ -34,7 +33,6 @@ def build_course():
 
 @pytest.fixture(scope="module")
 def scattered_course(request):
-    """Return the course with drones and boxes at random poses, close to each other."""
     sim, handles = build_course()
     rng = np.random.default_rng(5)
     pos = rng.uniform([-1.5, -1.5, 0], [2.5, 1.5, 1.8], (N_WORLDS, N_DRONES, 3))
@@ -49,7 +47,6 @@ def scattered_course(request):
 
 
 def mujoco_distances(sim, world, names, geom):
-    """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
     sim.scene.sync_one(sim.data, world)
     model, data = sim.mj_model, sim.mj_data
     root = model.body_rootid[model.geom_bodyid]
@@ -217,7 +214,6 @@ def attached_bodies():
 
 
 def move_rocks(sim, shift):
-    """Move the movable rocks through mjx_data, differently in each world, and rotate them."""
     ids = np.array([sim.mj_model.body(f"rock:{k}").mocapid[0] for k in (0, 2)])
     pos = np.float32([[[0, 0, 1], [2, 0, 1]], [[0.2, 0, 1], [2, 0.3, 1]]]) + np.float32(shift)
     turned = np.float32([np.cos(0.3), 0, 0, np.sin(0.3)])  # wxyz, by 0.6 rad about z

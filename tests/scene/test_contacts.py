@@ -43,7 +43,6 @@ def rotate_vector(quat_xyzw, vector):
 
 
 def scatter_poses(sim):
-    """Give the drones and the pole of every world random poses, so close that about half of them touch something."""
     rng = np.random.default_rng(7)
     pos = rng.uniform([-0.25, -0.25, 0], [0.25, 0.25, 0.5], (sim.n_worlds, sim.n_drones, 3))
     quat = random_quats(rng, sim.n_worlds, sim.n_drones)
@@ -59,7 +58,6 @@ def scatter_poses(sim):
 
 @pytest.fixture(scope="module")
 def scattered_scene():
-    """Return worlds of two drones, a fixed ball, and a pole with another pose in every world, and the poses."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2)
     add_obstacles(sim)
     return sim, *scatter_poses(sim)

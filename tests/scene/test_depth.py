@@ -27,7 +27,6 @@ def place_drones(sim, pos, quat=None):
 
 @pytest.fixture(scope="module")
 def room():
-    """Return two worlds of two drones in front of a wall and a ball, and a movable box below the floor."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
     ball = sim.scene.add("sphere", pos=[1.5, 0.2, 1.1], radius=0.2)
@@ -233,7 +232,6 @@ ALL_KINDS = """<mujoco><asset>
 
 @pytest.fixture(scope="module")
 def mixed_scene():
-    """Return two worlds of two drones among geoms of all kinds, some fixed and some movable."""
     sim = Sim(n_worlds=2, n_drones=2)
     sim.scene.add("box", "fixed", pos=[2, 0, 1], quat=[0.1, 0.2, 0.3, 0.9], size=(0.5, 1.0, 1.5), mocap=False)
     quat = np.random.default_rng(1).normal(size=(2, 1, 4))
@@ -359,7 +357,6 @@ def test_rays_hit_geoms_of_every_kind_where_rays_of_c_mujoco_do(mixed_scene, rng
 
 @pytest.fixture(scope="module")
 def forest():
-    """Return a world of many equal geoms, some fixed and some movable, in front of a camera."""
     sim = Sim(n_drones=2)
     rng = np.random.default_rng(5)
     for primitive, name, count, options in (

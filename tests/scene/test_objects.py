@@ -23,7 +23,6 @@ TOWER = """
 
 @pytest.fixture(scope="module")
 def course():
-    """Return three worlds with two movable gates, a fixed pole, and a movable tower, and the handles."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude")
     gates = sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]])
     pole = sim.scene.add("pole", pos=[0, 1, 0], mocap=False)

@@ -26,7 +26,6 @@ RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Return two worlds of two drones near a camera that looks straight down on a plain floor."""
     sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
     pos = np.tile(np.float32(DRONES), (2, 1, 1))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))

@@ -33,7 +33,6 @@ def set_positions(sim, pos):
 
 @pytest.fixture(scope="module")
 def sim(opengl, plain_scene):
-    """Return two worlds, each with a drone elsewhere over a plain floor, and a camera that looks straight down."""
     sim = Sim(n_worlds=2, xml_path=plain_scene)
     set_positions(sim, POSITIONS)
     yield sim
@@ -83,7 +82,6 @@ def test_a_drone_that_rolled_shows_its_side(sim, empty_image):
     """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, but not shorter."""
 
     def turn_and_measure(quat_xyzw):
-        """Turn the drones, and return height and width of the drone in the image, pixels."""
         states = sim.data.states
         sim.data = sim.data.replace(states=states.replace(quat=np.tile(np.float32(quat_xyzw), (2, 1, 1))))
         rows, columns = np.nonzero(difference(sim.render(**SHOT), empty_image))

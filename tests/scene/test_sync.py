@@ -76,13 +76,11 @@ def sim(request):
 
 @pytest.fixture(scope="module")
 def synced_data(sim):
-    """Return the data, and the scene on the host, after a sync."""
     data, mjx_data = sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
     return data, jax.device_get(mjx_data)
 
 
 def c_mujoco_state(sim, world):
-    """Return the state of a world as C MuJoCo computes it from the poses."""
     data = mujoco.MjData(sim.mj_model)
     pos, quat = np.asarray(sim.data.states.pos)[world], np.asarray(sim.data.states.quat)[world]
     for i in range(sim.n_drones):

@@ -11,7 +11,6 @@ from crazysim.sim.sensors.depth import render_depth
 
 @pytest.fixture(scope="module")
 def sim():
-    """Return two worlds with two level drones each, far from each other, at other heights in each world."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     pos = jnp.array([[[0, 0, 1.0], [0, -9, 1]], [[0, 0, 2.0], [0, -9, 1]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))

@@ -34,7 +34,6 @@ assert not {"warp", "trimesh"} & sys.modules.keys()
 
 @pytest.fixture(scope="module")
 def printed_lines():
-    """Return the lines that the program prints."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", PROGRAM], capture_output=True, text=True, env=os.environ, check=False
     )

@@ -35,7 +35,6 @@ def build_fleet(**settings):
 
 
 def write_fleet(folder, vehicles=VEHICLES):
-    """Return the path of an MJCF file with vehicles."""
     path = folder / "fleet.xml"
     path.write_text(MJCF.format(bodies="\n".join(BODY.format(*v) for v in vehicles)))
     return path

@@ -86,7 +86,6 @@ def switch_threads(frame, event, arg):
 
 @pytest.fixture
 def frequent_switches():
-    """Switch threads between any two lines of the engine."""
     threading.settrace(switch_threads)
     yield
     threading.settrace(None)

@@ -12,12 +12,10 @@ on_device = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
 
 
 def evaluate(trajectory, t):
-    """Return the setpoints at some times as NumPy arrays."""
     return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 
 def check_curve(trajectory, curve, duration, scale=1.0):
-    """Compare position and yaw with a curve, and derivatives with its central differences."""
     np.testing.assert_allclose(trajectory.duration, duration, rtol=1e-12)
     t = np.linspace(0.01, 0.99, 500) * duration
     s = evaluate(trajectory, t)

@@ -19,7 +19,6 @@ on_device = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
 
 
 def evaluate(trajectory, t):
-    """Return the setpoints at some times as NumPy arrays."""
     return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 

@@ -85,7 +85,6 @@ def track(sim, plugin, seconds, steps_per_pose=5):
 
 
 def simulate_both(bodies, seconds, friction=0.6):
-    """Return positions and quaternions of the bodies, xyzw, by crazysim and by C MuJoCo."""
     sizes, masses, pos, vel = zip(*[body[:4] for body in bodies], strict=True)
     quat = np.array([body[4] if len(body) > 4 else (0, 0, 0, 1) for body in bodies])
     sim, plugin = build(len(bodies), list(sizes), masses, pos=np.array(pos), vel=np.array(vel), quat=quat,

@@ -133,7 +133,6 @@ def test_data_with_other_plugins_is_refused():
 
 
 def predict(sim, mppi, n_steps):
-    """Return the data that a rollout of the hovering plan predicts."""
     memory = mppi.init(sim.n_worlds, sim.n_drones)
     record = RolloutRecord(memory.plan, jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 1, len(x))), setpoint()),
                            jnp.zeros((2, 1, 1)))  # fmt: skip
@@ -141,7 +140,6 @@ def predict(sim, mppi, n_steps):
 
 
 def fly(sim, mppi, n_steps):
-    """Return the data after the same steps of the simulation."""
     sim.attitude_control(mppi.init(sim.n_worlds, sim.n_drones).plan[:, :, 0])
     sim.step(n_steps)
     return sim.data

@@ -53,7 +53,6 @@ def error_of(true, estimate):
 
 @pytest.fixture
 def estimate(x64):
-    """Return an estimate in motion, with a full covariance."""
     quat = jnp.array([0.3, -0.2, 0.4, 0.8])
     pos, vel, bias = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
     result = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, bias, 0.1 * bias)
@@ -166,7 +165,6 @@ def fly(aids, steps):
 
 @pytest.fixture(scope="module")
 def indoor_sim():
-    """Return a simulation that has flown with motion capture and GPS."""
     return fly([MotionCapture(noise=POS, angle_noise=ANGLE), GPS(noise=POS, vel_noise=0.02, delay=0.2)], 2000)
 
 
@@ -318,8 +316,6 @@ def test_a_sensor_of_ones_own_is_fused_by_the_derivatives_of_its_ideal(estimate)
 
 
 def drone_update(data, estimate, gyro, measured):
-    """Return the estimate of the first drone after a measured velocity."""
-
     def update(drone):
         imu, sensor = drone.plugins["imu"], drone.plugins["body_velocity"]
         samples = sensor.samples.replace(value=measured, taken_step=jnp.zeros(1, jnp.int32))
@@ -344,8 +340,6 @@ class OwnError(Link):
 
 
 class UnknownProbe(BodyVelocity):
-    """A probe with an error of its own."""
-
     name: str = "unknown_probe"
     chains: ClassVar = {"vel": [OwnError()]}
 
@@ -360,8 +354,6 @@ class Clicks(BodyVelocity):
 
 
 class RotorProbe(BodyVelocity):
-    """A probe of states that the filter does not estimate."""
-
     name: str = "rotor_probe"
 
     def ideal(self, data):

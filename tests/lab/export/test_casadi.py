@@ -25,13 +25,11 @@ assert all(integrator in INTEGRATORS for *_, integrator in OTHER_INTEGRATORS)
 
 
 def fields(data, names):
-    """Return the leaves of these names, in order."""
     leaves = dict(zip(Axes(data).names, jax.tree.leaves(data), strict=True))
     return [leaves[name] for name in names]
 
 
 def with_fields(data, changes):
-    """Return the data with other leaves, by name."""
     leaves, treedef = jax.tree.flatten(data)
     return treedef.unflatten([changes.get(name, x) for name, x in zip(Axes(data).names, leaves, strict=True)])
 

@@ -102,7 +102,6 @@ MAX_THRUST = 4 * float(AIRFRAME.value("rotors.thrust_max"))
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Return a function from a command level to a policy for hover, its actions, and the folder of its controller."""
     exports = {}
 
     def export(level):

@@ -27,7 +27,6 @@ def meta():
 
 @pytest.fixture(scope="module")
 def policy(meta):
-    """Return a policy with weights of a typical size, and inputs of very different mean and variance."""
     rng, n = np.random.default_rng(0), sum(meta["observations"].values())
     layers = init_mlp(jax.random.key(0), (n, 64, 32, 4), 1.0)
     layers = [(w, jnp.asarray(rng.normal(size=b.shape), jnp.float32)) for w, b in layers]
@@ -38,7 +37,6 @@ def policy(meta):
 
 @pytest.fixture(scope="module")
 def observations_and_actions(meta, policy):
-    """Return observations, some of them far outside of the statistics, and their actions in JAX."""
     rng = np.random.default_rng(1)
     n = sum(meta["observations"].values())
     x = rng.normal(size=(500, n)) * np.exp(rng.normal(scale=2.0, size=(500, 1)))
@@ -53,7 +51,6 @@ def observations_and_actions(meta, policy):
 
 
 def with_memory(policy, size):
-    """Return a policy with memory and the statistics of another policy."""
     network = gru_network(size)
     weights = init_weights(network, jax.random.key(2), len(policy.stats.mean), (16, 4), 1.0)
     body = weights.body.replace(bias=jax.random.normal(jax.random.key(3), weights.body.bias.shape))
@@ -77,7 +74,6 @@ def episodes(policy, observations_and_actions):
 
 
 def compile_header(path, folder, name="policy"):
-    """Return the function of a header, compiled by the C compiler."""
     source, library = folder / "use.c", folder / "use.so"
     source.write_text(
         f'#include "{path}"\nvoid fly(int n, const float *obs, float *action);\n'

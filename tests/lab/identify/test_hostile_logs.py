@@ -33,7 +33,6 @@ class HangError(BaseException):
 
 
 def create_table():
-    """Return the columns of a flight by name."""
     columns = create_mocap() | {
         "vx": np.ones(N),
         "vy": drift(T)[1],
@@ -52,8 +51,6 @@ def write_csv(path):
 
 
 def bag_writer(storage):
-    """Return the function that writes a bag of one file."""
-
     def write(path):
         if storage == "bag":
             return write_bag(path, storage=storage, seconds=1.0)
@@ -81,7 +78,6 @@ LOG_KINDS = {
 
 
 def draw_offset(rng, n):
-    """Return an offset, half of the time near one of the ends, where most formats have their structure."""
     margin = min(n, 1500)
     return rng.choice([rng.randrange(n), rng.randrange(n), rng.randrange(margin), n - 1 - rng.randrange(margin)])
 
@@ -110,7 +106,6 @@ def damage_bytes(rng, data):
 
 
 def damage_table(rng, text):
-    """Return a table with one cell, row or column that is wrong."""
     lines = text.splitlines()
     k = rng.choice([0, rng.randrange(len(lines))])
     cells = lines[k].split(",")
@@ -138,7 +133,6 @@ def damage_table(rng, text):
 
 
 def damage_archive(rng):
-    """Return the archive of a table with one array that is wrong."""
     columns, file = create_table(), io.BytesIO()
     key = rng.choice(list(columns))
     x = columns[key]
@@ -164,7 +158,6 @@ def mutate_file(rng, kind, k, data):
 
 @pytest.fixture(scope="module")
 def valid_files(tmp_path_factory):
-    """Return the content of a valid file of each kind."""
     pytest.importorskip("rosbags")
     folder, valid_files = tmp_path_factory.mktemp("seeds"), {}
     for kind, (name, write, columns, motion) in LOG_KINDS.items():
@@ -204,7 +197,6 @@ def read_refusal_message(path, columns, motion):
 
 @pytest.fixture
 def trace_allocations():
-    """Trace allocations."""
     tracemalloc.start()
     yield
     tracemalloc.stop()

@@ -20,7 +20,6 @@ N_LATE_STEPS = 3
 
 
 def draw_airframe(rng, folder, k):
-    """Return the file of an estimated airframe, a random airframe near it, and the true parameters by name."""
     mass = float(np.exp(rng.uniform(np.log(0.03), np.log(5))))
     propeller = 0.127 * (mass / 0.6) ** (1 / 3) * rng.uniform(0.85, 1.2)
     known = {"arm": propeller * rng.uniform(0.75, 1.2), "thrust_to_weight": rng.uniform(1.8, 5)}
@@ -117,7 +116,6 @@ def normalised_errors(folder, n, seconds, seed, *, at_samples, fits_both=False):
 
 
 def shares_within(errors):
-    """Return the shares of errors within one, two and three deviations."""
     return np.array([np.mean(np.abs(errors) <= k) for k in (1, 2, 3)])
 
 

@@ -14,7 +14,6 @@ TOLERANCE = 1e-3
 
 
 def fly_straight(begin, end, duration):
-    """Return a flight at constant speed, whose velocity jumps at both ends."""
     begin, end = np.asarray(begin, float), np.asarray(end, float)
     return Trajectory.of_pieces([duration], np.stack([begin, (end - begin) / duration], axis=-1)[None])
 

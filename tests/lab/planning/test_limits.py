@@ -11,7 +11,6 @@ from crazysim.trajectories import Limits, Trajectory, check, circle, line, splin
 
 
 def fly_straight(begin, end, duration):
-    """Return a flight at constant speed."""
     begin, end = np.asarray(begin, float), np.asarray(end, float)
     return Trajectory.of_pieces([duration], np.stack([begin, (end - begin) / duration], axis=-1)[None])
 

@@ -227,7 +227,6 @@ def test_the_cost_in_a_corridor_is_the_optimum_of_scipy(x64):
     result = pieces(minimum_snap(waypoints, durations, corridors=radius))
 
     def coefficients(x):
-        """Return both pieces for velocity, acceleration and jerk in x and y at the second waypoint."""
         solved = []
         for axis in range(2):
             ends = np.array([derivative_rows(t, 8)[k] for t in (0.0, 1.0) for k in range(4)])

@@ -13,12 +13,10 @@ HIDDEN, OUTPUT = RNG.normal(size=(5, N_INPUTS)), RNG.normal(size=(6, 5)) * np.re
 
 
 def drone(**residual):
-    """Return an airframe with the coefficients of a residual."""
     return {"base": "cf21B_500", "residual": {key: x.tolist() for key, x in residual.items()}}
 
 
 def set_flight_states(sim):
-    """Return the simulation with random states in flight."""
     rng, s = np.random.default_rng(0), sim.data.states
     quat = rng.normal(size=s.quat.shape)
     sim.data = sim.data.replace(

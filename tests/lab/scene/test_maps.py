@@ -17,7 +17,6 @@ TRIANGLES = [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
 
 
 def ply(points, faces=(), layout="ascii"):
-    """Return a .ply file with a colour behind each coordinate, as scanners write them."""
     order = ">" if layout == "binary_big_endian" else "<"
     lines = ["ply", f"format {layout} 1.0", "comment made by a test", f"element vertex {len(points)}"]
     lines += [f"property {kind} {name}" for kind, name in (("float", "x"), ("uchar", "red"), ("double", "y"))]
@@ -162,7 +161,6 @@ def test_triangles_have_the_voxels_that_they_meet(rng, monkeypatch):
 
 
 def room():
-    """Return corners and triangles of the four sides of a cube."""
     low = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
     sides = [[k, (k + 1) % 4, (k + 1) % 4 + 4, k + 4] for k in range(4)]
     faces = [[q[0], q[1], q[2]] for q in sides] + [[q[0], q[2], q[3]] for q in sides]

@@ -31,12 +31,10 @@ def sim():
 
 @pytest.fixture(scope="module")
 def draw_splats(sim):
-    """Return a function from data and Gaussians to images of all drones."""
     return jax.jit(sim.scene.splat_fn(**SIZE, background=(0.1, 0.2, 0.3)))
 
 
 def gaussians_of(columns):
-    """Return the Gaussians of the columns of a file."""
     columns = {name: np.float32(x) for name, x in columns.items()}
     rest = sum(name.startswith("f_rest") for name in columns) // 3
     colors = [[columns[f"f_dc_{c}"], *(columns[f"f_rest_{c * rest + k}"] for k in range(rest))] for c in range(3)]

@@ -11,7 +11,6 @@ RED_3_S = base64.b64encode(bytes([0x04, 255, 0, 0, 0x96, 0x01, 0x00])).decode()
 
 
 def pack_archive(files):
-    """Return a zip archive of JSON documents, or of bytes as they are."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
         for name, value in files.items():
@@ -149,7 +148,6 @@ SHOW_CREATORS = {
 
 
 def replace_value(files, name, path, value):
-    """Return the files with another value at a path of keys and indices."""
     files = copy.deepcopy(files)
     holder = files[name]
     for key in path[:-1]:

@@ -271,7 +271,6 @@ def test_damaged_archives_are_loaded_or_refused(name, changes, cut):
 
 
 def list_paths(value, path=()):
-    """Yield all paths of keys and indices in a JSON document."""
     yield path
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in items:

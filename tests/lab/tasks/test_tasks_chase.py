@@ -44,13 +44,11 @@ def step(env):
 
 @pytest.fixture(scope="module")
 def roof_motion(env):
-    """Return the function from data to position and velocity of the roof."""
     return jax.jit(vmap_worlds(env.task.target_motion))
 
 
 @pytest.fixture(scope="module")
 def state_after_step(start_state, step, roof_motion):
-    """Return the state after a step from all cases, over cars at their full speed."""
     data = start_state.data
     car = data.plugins["cars"]
     straight = {name: np.zeros_like(getattr(car, name)) for name in ("yaw", "yaw_rate", "steer", "command", "body_vel")}
@@ -68,7 +66,6 @@ def state_after_step(start_state, step, roof_motion):
 
 
 def names(mask):
-    """Return the names of the cases in whose worlds a mask of drones is True."""
     return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
 
 

@@ -28,7 +28,6 @@ def start_state(env):
 
 
 def move_drone(state, pos, vel, load=None):
-    """Return a state with drones and hooks at other positions, level, and with other fields of the loads."""
     data = state.data
     s = data.states
     level = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), s.quat.shape)

@@ -34,7 +34,6 @@ def step(env):
 
 
 def with_drones(state, **states):
-    """Return the state with other states of the drones."""
     return state.replace(data=state.data.replace(states=state.data.states.replace(**states)))
 
 
@@ -104,13 +103,10 @@ def test_an_episode_ends_where_the_drone_is_too_low_or_too_far_away(env, start_s
 @pytest.mark.long("flies whole episodes, step by step")
 def test_a_controller_with_privileged_observations_follows_the_car():
     class Informed(FollowCar):
-        """Observe the privileged observations, too."""
-
         def observe(self, data):
             return super().observe(data) | self.privileged(data)
 
     def fly(obs):
-        """Accelerate towards the point, along the axes of the world, with yaw zero."""
         acc = 4 * obs["difference_to_point_vel"] + 5 * obs["difference_to_point"]
         roll, pitch = -acc[..., 1:2] / 9.81, acc[..., :1] / 9.81
         return jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, 0.1 * acc[..., 2:]], axis=-1)

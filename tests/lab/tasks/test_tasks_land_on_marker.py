@@ -36,7 +36,6 @@ def env():
 
 @pytest.fixture(scope="module")
 def state_before(env):
-    """Return the state of all cases before a step."""
     state = jax.jit(env.reset)(jax.random.key(0))
     offset, vel, yaw = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
@@ -47,7 +46,6 @@ def state_before(env):
 
 @pytest.fixture(scope="module")
 def state_after(env, state_before):
-    """Return the state of all cases after a step."""
     return jax.jit(env.step)(state_before, state_before.action)
 
 

@@ -80,7 +80,6 @@ def in_all_worlds(cases):
 
 
 def place_drones(state, drone, load, vel, goal=GOAL):
-    """Return the state with level drones and loads at other positions, and an unturned gate."""
     data = state.data
     s, task, load_record = data.states, data.plugins["task"], data.plugins["load"]
     drone, load, vel, goal = (jnp.asarray(np.broadcast_to(np.float32(x), (len(s.pos), 3))[:, None])
@@ -94,7 +93,6 @@ def place_drones(state, drone, load, vel, goal=GOAL):
 
 @pytest.fixture(scope="module")
 def case_worlds_and_state(start_state, step):
-    """Return the world of each case, and the state after a step."""
     place, load_offset, vel = in_all_worlds(CASES.values())
     before = place_drones(start_state, GATE + place, GATE + place + load_offset, vel)
     return {name: k for k, name in enumerate(CASES)}, step(before, before.action)
@@ -181,13 +179,10 @@ def test_starts_are_clear_of_the_gates_and_links_are_taut():
 
 
 class Pilot(PyTree):
-    """Policy that flies through the gate along its axis, faster the nearer to the axis, and then to the goal."""
-
     gain: jax.Array
     """Factor of all actions. ()"""
 
     def __call__(self, obs):
-        """Return the actions for observations."""
         gate, axis, load = obs["difference_to_gate"], obs["gate_axis"], obs["load_pos"]
         gate = gate + jnp.array([0.0, 0.0, LENGTH / 2])
         ahead = jnp.sum(gate * axis, axis=-1, keepdims=True)

@@ -9,8 +9,6 @@ from crazysim.lab.validate import raptor
 
 
 class FakePolicy:
-    """Policy with the interface of RAPTOR that returns its count of steps and its observation."""
-
     def __init__(self):
         self.state, self.observed_actions = 0, []
         self.layers = [object(), self]

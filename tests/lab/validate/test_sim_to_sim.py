@@ -42,8 +42,6 @@ def test_a_pilot_flies_in_mujoco_as_in_crazysim(results):
 
 
 class Falling(Simulator):
-    """Drones whose motors are off."""
-
     def __init__(self, start):
         self.states = start
 

@@ -11,7 +11,6 @@ WHEELS = {"fl": (1, 1), "fr": (1, -1), "rl": (-1, 1), "rr": (-1, -1)}
 
 
 def create_mjcf(vehicle: VehicleModel, trailer: bool = False) -> str:
-    """Return MJCF of the car, and of its trailer."""
     number = vehicle.number
     radius = number("wheels.radius")
     spin = f'armature="{number("wheels.armature")}" damping="{number("wheels.damping")}"'
@@ -63,8 +62,6 @@ def _trailer(vehicle: VehicleModel) -> str:
 
 
 class ArticulatedCar:
-    """The car in MuJoCo, driven by torques, or by motor references and the torque law of the vehicle model."""
-
     def __init__(self, vehicle: VehicleModel, trailer: bool = False):
         self.vehicle = vehicle
         self.model = mujoco.MjModel.from_xml_string(create_mjcf(vehicle, trailer))

@@ -28,7 +28,6 @@ def build(n_worlds=2, n_drones=1, engine="interpret", cars_only=True, **settings
 
 
 def car_states(sim):
-    """Return the states of the cars by name."""
     record = sim.data.plugins["cars"]
     return {name: np.asarray(getattr(record, name)) for name in ("pos", "yaw", "body_vel", "yaw_rate", "steer")}
 

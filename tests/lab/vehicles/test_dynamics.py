@@ -30,8 +30,6 @@ def create_state(speed=0.0, side=0.0, yaw_rate=0.0, steer=0.0, yaw=0.0, joints=N
 
 
 def after_step(name, car, s, command, freq):
-    """Return the state of a vehicle one step later, by the classical Runge-Kutta method."""
-
     def advance(rate, dt):
         return jax.tree.map(lambda a, b: a + dt * b, s, rate)
 
@@ -61,7 +59,6 @@ def _end(name, car, start, command, n_steps):
 
 
 def end_of(name, car, start, command, duration):
-    """Return the state of a vehicle after some seconds of a constant command."""
     return jax.tree.map(np.asarray, _end(name, car, start, np.array(command), round(500 * duration)))
 
 
@@ -147,8 +144,6 @@ def test_a_sliding_vehicle_loses_energy(name):
 
 @functools.partial(jax.jit, static_argnums=0)
 def slopes_of(model, s, command, car):
-    """Return the gradients of the sum of all rates by state and command."""
-
     def total(s, command):
         return sum(jnp.sum(x) for x in jax.tree.leaves(MODELS[model](s, command, car)))
 

@@ -12,7 +12,6 @@ SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
 def sample(path, n=200, index=0):
-    """Return arc lengths and the points of a path there."""
     s = np.linspace(0.0, np.asarray(path.length)[index], n).astype(np.float32)
     return s, jax.tree.map(np.asarray, points_at(path, index, s))
 

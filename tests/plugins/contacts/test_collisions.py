@@ -26,13 +26,11 @@ def build(n_worlds=1, n_drones=1, height=3.0, **kwargs):
 
 
 def remove_gravity(sim):
-    """Return the simulation after its gravity was set to zero."""
     sim.data = with_params(sim.data, gravity_vec=0 * np.asarray(sim.data.params.gravity_vec))
     return sim
 
 
 def fix_drones(sim):
-    """Make the drones so heavy that loads do not move them, and balance their weight."""
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
 

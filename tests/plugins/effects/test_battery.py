@@ -25,7 +25,6 @@ def record(sim):
 
 
 def ocv(charge):
-    """Return the open-circuit voltage of a cell, V."""
     return -1.031 * np.exp(-35 * charge) + 3.685 + 0.2156 * charge - 0.1178 * charge**2 + 0.3201 * charge**3
 
 

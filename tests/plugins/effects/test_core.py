@@ -42,7 +42,6 @@ def add_effects(sim, settings=EFFECTS):
 
 @pytest.fixture(scope="module")
 def sim_with_effects():
-    """Return a simulation of hovering drones with all effects."""
     sim = make_hovering_sim()
     add_effects(sim)
     return sim
@@ -50,7 +49,6 @@ def sim_with_effects():
 
 @pytest.fixture(autouse=True)
 def restore(request):
-    """Restore the data of the shared simulation after each test."""
     if "sim_with_effects" not in request.fixturenames:
         yield
         return

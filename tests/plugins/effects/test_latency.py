@@ -66,7 +66,6 @@ def test_a_command_arrives_exactly_after_its_delay(control, dynamics):
 
 
 def initial_command(sim):
-    """Return the command that is staged before any was sent."""
     controls = sim.default_data.controls
     return np.asarray(
         controls.rotor_vel if sim.control == "rotor_vel" else getattr(controls, sim.control.value).staged_cmd
@@ -75,7 +74,6 @@ def initial_command(sim):
 
 @pytest.fixture(scope="module")
 def delayed_sim():
-    """Return a simulation whose commands arrive three steps late."""
     sim = build("attitude")
     sim.add(Latency(3, max_delay=5))
     return sim

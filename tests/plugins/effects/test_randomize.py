@@ -24,7 +24,6 @@ def build(n_worlds=3, n_drones=2, engine="interpret", **settings):
 
 @pytest.fixture(scope="module")
 def thousand_worlds():
-    """Return a simulation of a thousand worlds after one step, and its plugin."""
     sim, plugin = build(1000, 1, **RANGES)
     sim.rotor_vel_control(sim.data.states.rotor_vel)
     sim.step()

@@ -21,7 +21,6 @@ QUAD = {"control": "rotor_vel", "engine": "interpret"}
 
 
 def hover(n_worlds=1, drone="cf21B_500", **settings):
-    """Return a simulation of hovering drones, and its plugin of rotors in moving air."""
     sim = Sim(n_worlds, drone=drone, **QUAD)
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
     return sim, sim.add(RotorAerodynamics(**settings))
@@ -44,7 +43,6 @@ def quad():
 
 @pytest.fixture(scope="module")
 def compiled_wrench(quad):
-    """Return the wrench of that plugin as a compiled function of states."""
     sim, plugin = quad
     influence = jax.jit(plugin.stage(plugin.influence))
     return lambda **states: wrench_of(influence(with_states(sim.data, **states)).states)
@@ -63,7 +61,6 @@ def thrust(static, ang_vel, axial, across, blade, factor=1.0):
 
 
 def blade():
-    """Return the blade coefficient of a rotor of the airframe."""
     disc = inflow.disc_factor(R, RHO)
     return float(inflow.blade_coefficient(DRAG_Z / 4, WEIGHT / 4, HOVER, disc))
 

@@ -78,7 +78,6 @@ def compile_filter(firmware: Path) -> ctypes.CDLL:
 
 
 def float_array(x):
-    """Return numbers as a C array of floats."""
     return (ctypes.c_float * len(x))(*[float(a) for a in x])
 
 

@@ -50,7 +50,6 @@ c_float = ctypes.c_float
 
 
 def float_array(x):
-    """Return numbers as a C array of floats."""
     return (c_float * len(x))(*[float(a) for a in x])
 
 
@@ -98,7 +97,6 @@ def flight():
 
 
 def quaternion(rot):
-    """Return the quaternion of a rotation by less than pi, xyzw."""
     w = 0.5 * np.sqrt(max(1 + np.trace(rot), 1e-12))
     v = [rot[2, 1] - rot[1, 2], rot[0, 2] - rot[2, 0], rot[1, 0] - rot[0, 1]]
     return np.array([*(np.array(v) / (4 * w)), w])
@@ -116,7 +114,6 @@ def inertial_measurements(flight_states, is_flying, rng):
 
 
 def run(lib, kind, flight_states, inertial):
-    """Run the filter with one kind of measurements, and return the measurements of each loop and the outputs."""
     rng = np.random.default_rng(7)
     inputs, out = [], []
     lib.k_init(*[c_float(x) for x in (0.05, -0.05, 1.25, 0.0)])

@@ -25,8 +25,6 @@ def test_the_filter_agrees_with_the_compiled_firmware(kind):
 
 
 class Gusts(Plugin):
-    """White accelerations along x and y of the body, of the size that the filter assumes."""
-
     name: str = "gusts"
 
     def influence(self, data):

@@ -113,7 +113,6 @@ crazysim the angular velocity of the rod, which differ in the second order of th
 
 @pytest.fixture(scope="module")
 def flights():
-    """Return positions by MuJoCo and by crazysim, by case."""
     flights = {}
     with jax.enable_x64(True):
         for dof in (1, 2):

@@ -23,12 +23,10 @@ def build(n_worlds=3, n_drones=2, **settings):
 
 @pytest.fixture(scope="module")
 def half_forest():
-    """Return a simulation with a forest where half of the trees stand, and its plugin."""
     return build(difficulty=0.5)
 
 
 def standing_trees(sim, forest):
-    """Return positions and radii of the trees that stand, for each world."""
     pos = np.asarray(forest.poses(sim.data)[0])
     radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
     return [(p[p[:, 2] == 0], radii[p[:, 2] == 0]) for p in pos]

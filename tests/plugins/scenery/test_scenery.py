@@ -27,7 +27,6 @@ def build(plugin, n_worlds=3, n_drones=2):
 
 
 def data_at(sim, seconds):
-    """Return the data with its clock at a time after the reset."""
     core = sim.data.core
     return sim.data.replace(core=core.replace(steps=core.steps + round(seconds * sim.freq)))
 

@@ -12,7 +12,6 @@ SIZE = {"width": 9, "height": 6}
 
 
 def place_drones(sim, pos, quat=(0.0, 0, 0, 1)):
-    """Move drones to positions, with attitudes."""
     states = sim.data.states
     pos, quat = (
         jnp.broadcast_to(jnp.asarray(x, jnp.float32), (*states.pos.shape[:2], len(x[0]) if np.ndim(x) > 1 else len(x)))
@@ -23,7 +22,6 @@ def place_drones(sim, pos, quat=(0.0, 0, 0, 1)):
 
 @pytest.fixture(scope="module")
 def flight():
-    """Return a simulation, its slow, late and tilted camera with all outputs, and images and records of each step."""
     sim = Sim(2, 2, control="attitude", freq=200)
     sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
     outputs = ("depth", "distance", "normal", "segmentation")

@@ -188,7 +188,6 @@ def measurements_at_rest():
 
 
 def expected_deviation(kind, t):
-    """Return the Allan deviation of white noise of a one-sided density, a random walk, and a Gauss-Markov process."""
     if kind == 0:
         return NOISE / np.sqrt(2 * t)
     if kind == 1:  # sampled: 1/3 + 1/(6 m^2) in place of 1/3

@@ -12,8 +12,6 @@ from crazysim.plugins.sensors import Barometer, Camera, Sensor, White
 
 
 class Clock(Sensor):
-    """Measures the number of the step."""
-
     _: dataclasses.KW_ONLY
     name: str = "clock"
 
@@ -95,8 +93,6 @@ def test_a_sensor_without_channels_is_an_error_that_names_it():
 
 
 class Short(Sensor):
-    """A sensor whose truth has fewer numbers than its channel."""
-
     name: str = "short"
     channels: ClassVar = {"vel": 3}
     chains: ClassVar = {"vel": []}
@@ -106,8 +102,6 @@ class Short(Sensor):
 
 
 class Misspelt(Short):
-    """A sensor with errors of a channel that it lacks."""
-
     chains: ClassVar = {"velocity": []}
 
 

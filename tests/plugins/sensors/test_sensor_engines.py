@@ -38,7 +38,6 @@ def fields_of(kind):
 
 
 def build(n_worlds, names, **settings):
-    """Return a simulation of drones that fly and turn, with sensors."""
     sim = Sim(n_worlds, 2, control="rotor_vel", rng_key=9, **settings)
     speed = hover_rotor_state(sim.data) * np.array([1.02, 1.0, 0.99, 1.0])
     vel, ang_vel = np.float32([0.5, -0.3, 0.2]), np.float32([0.4, -0.5, 0.6])
@@ -61,7 +60,6 @@ def measurements(sim, data):
 
 @pytest.fixture(scope="module")
 def sim():
-    """Return a simulation with every sensor, whose data stay those of the start."""
     sim = build(3, SENSORS)
     for sensor in (Camera(2, 1), Lidar((0.0,), (0.0,))):
         sim.add(sensor)

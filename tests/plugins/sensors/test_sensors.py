@@ -259,8 +259,6 @@ def test_observations_of_other_plugins_use_measured_states():
 
 
 class HeightObserver(Plugin):
-    """Observe the height of the drone."""
-
     name: str = "height_observer"
 
     def observations(self, data):
