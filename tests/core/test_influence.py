@@ -69,18 +69,9 @@ REFUSED_INFLUENCES = {
     "steps": (with_fields(core={"steps": lambda x: x + 1}), "got other values of core.steps"),
     "own record": (with_record_fields(angle=lambda x: x + 1), r"got other values of plugins\['tilt'\].angle"),
     "higher command": (halve_staged_command, "got other values of controls.attitude.staged_cmd"),
-    "force of three drones": (
-        with_fields(states={"force": lambda x: jnp.zeros((3, 3))}),
-        r"to return states.force of shape \(3,\), got \(3, 3\)",
-    ),
-    "mass of each axis": (
-        with_fields(params={"mass": lambda x: x * jnp.ones(3)}),
-        r"to return params.mass of shape \(1,\), got \(3,\)",
-    ),
-    "flat curve": (
-        with_fields(params={"rpm2thrust": lambda x: x[0]}),
-        r"to return params.rpm2thrust of shape \(1, 3\), got \(3,\)",
-    ),
+    "force of three drones": (with_fields(states={"force": lambda x: jnp.zeros((3, 3))}), r"to return states.force of"),
+    "mass of each axis": (with_fields(params={"mass": lambda x: x * jnp.ones(3)}), r"to return params.mass of shape"),
+    "flat curve": (with_fields(params={"rpm2thrust": lambda x: x[0]}), r"to return params.rpm2thrust of shape \(1,"),
     "nothing": (lambda data: None, "to return SimData, got NoneType. Use 'return data'"),
     "structure": (lambda data: data.replace(plugins={}), "to keep the structure of SimData"),
 }

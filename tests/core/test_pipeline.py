@@ -63,26 +63,10 @@ def test_every_change_keeps_the_order_of_the_rest(pipeline, change, order):
     [
         (lambda p: append_fn(p, first), UnknownNameError, "stage named 'first' already exists"),
         (lambda p: prepend_fn(p, third, "second"), UnknownNameError, "stage named 'second' already exists"),
-        (
-            lambda p: insert_fn_before(p, "zeroth", third),
-            UnknownNameError,
-            "No stage named 'zeroth' exists in the pipeline. Use one of first, second",
-        ),
-        (
-            lambda p: insert_fn_after(p, "zeroth", third),
-            UnknownNameError,
-            "No stage named 'zeroth' exists in the pipeline. Use one of first, second",
-        ),
-        (
-            lambda p: replace_fn(p, third, "third"),
-            UnknownNameError,
-            "No stage named 'third' exists in the pipeline. Use one of first, second",
-        ),
-        (
-            lambda p: remove_fn(p, "third"),
-            UnknownNameError,
-            "No stage named 'third' exists in the pipeline. Use one of first, second",
-        ),
+        (lambda p: insert_fn_before(p, "zeroth", third), UnknownNameError, "Use one of first, second"),
+        (lambda p: insert_fn_after(p, "zeroth", third), UnknownNameError, "Use one of first, second"),
+        (lambda p: replace_fn(p, third, "third"), UnknownNameError, "Use one of first, second"),
+        (lambda p: remove_fn(p, "third"), UnknownNameError, "Use one of first, second"),
         (lambda p: append_fn(p, partial(third)), ValueError, "a name of a stage that is not a named function, got"),
         (lambda p: append_fn(p, lambda x: x), ValueError, "a name of a stage that is not a named function, got"),
         (lambda p: append_fn(p, 3), ValueError, "expected a function as a stage, got 3"),

@@ -300,23 +300,6 @@ def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_p
     assert capsys.readouterr().err == ""
 
 
-def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, monkeypatch, tmp_path, capsys):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
-    enable_for_command()
-    printed = capsys.readouterr().err
-    assert printed.count("\n") == 1
-    assert str(tmp_path / "kept") in printed
-    assert "1 GB" in printed
-    jax.config.update("jax_compilation_cache_dir", None)
-    enable_for_command()
-    kept = str(default_folder())
-    assert jax.config.jax_compilation_cache_dir == kept
-    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "other"))
-    enable_for_command()
-    assert jax.config.jax_compilation_cache_dir == kept
-    assert capsys.readouterr().err == ""
-
-
 def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path):
     autotuning = "xla_gpu_per_fusion_autotune_cache_dir"  # folder of XLA's measurements on GPUs
     for folder in ("crazysim", autotuning):

@@ -119,28 +119,6 @@ def make_remains(tmp_path):
     return make
 
 
-def test_remains_of_killed_processes_are_removed(tmp_path, make_remains):
-    here, other, gone = storage.process_name(), "0" * 8, NO_PROCESS
-    machine = here.split("-")[0]
-    old = 1.01 * storage.ABANDONMENT_AGE
-    remains = [
-        make_remains(f"key.{machine}-{gone}-140.part"),
-        make_remains(f"crazysim-{machine}-{gone}-abc"),
-        make_remains(f"key.{other}-{os.getpid()}-1.part", old),
-    ]
-    needed = [
-        make_remains(f"key.{here}-140.part", old),
-        make_remains(f"crazysim-{here}-abc", old),
-        make_remains(f"key.{other}-{gone}-1.part"),  # of another machine, which may still need it
-        make_remains("key.4711.140.part", old),
-        make_remains("crazysim-mine", old),
-    ]
-    for pattern in ("*.part", "crazysim-*"):
-        storage.remove_abandoned_files(tmp_path, pattern)
-    assert sorted(tmp_path.iterdir()) == sorted(needed)
-    assert not any(path.exists() for path in remains)
-
-
 def test_the_folders_are_swept_at_the_next_start(cache, make_remains):
     (cache / "crazysim").mkdir(mode=0o700)
     machine = storage.process_name().split("-")[0]

@@ -17,7 +17,6 @@ from crazysim.engine import Step, explain
 from crazysim.engine.backends import lanes, native
 from crazysim.engine.lowering import tracing
 from crazysim.engine.lowering.jaxprs import RULES
-from crazysim.engine.pytree import PyTree, leaf
 from crazysim.engine.stage import Stage, stage
 from crazysim.errors import EngineWarning
 
@@ -190,47 +189,12 @@ def is_running(pid):
         return False
 
 
-class Bytes(PyTree):
-    """Integers of 8 bits."""
-
-    counts: jax.Array = leaf("drone", 1)
-    labels: jax.Array = leaf("drone")
-
-
 @stage("drone")
 def count(data):
     """Add 100 to the counts, which overflow."""
     record = data.plugins["bytes"]
     counts = record.counts + record.counts.dtype.type(100)
     return data.replace(plugins={"bytes": record.replace(counts=counts)})
-
-
-@stage("drone")
-def label(data):
-    """Write a number without an operation."""
-    record = data.plugins["bytes"]
-    return data.replace(plugins={"bytes": record.replace(labels=jnp.asarray(7, record.labels.dtype))})
-
-
-@pytest.mark.parametrize(("writer", "dtype"), [(count, np.int8), (label, np.uint8)])
-def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, dtype, writer):
-    record = Bytes(jnp.full((3, 2, 2), 90, dtype), jnp.zeros((3, 2), dtype))
-    data = sim.data.replace(plugins={"bytes": record})
-    stages = {"sway": sway, writer.__name__: writer}
-    after = Step(stages, "lanes")(data, jnp.int32(2)).plugins["bytes"]
-    assert after.counts.dtype == after.labels.dtype == dtype
-    np.testing.assert_array_equal(
-        after.counts, np.full((3, 2, 2), (290 if writer is count else 90) % 256).astype(dtype)
-    )
-    np.testing.assert_array_equal(after.labels, 0 if writer is count else 7)
-    if native.compiler() is not None:
-        name = np.dtype(dtype).name
-        with pytest.raises(
-            ConfigError, match=rf"'fused' cannot run .* {name}.*\(stage '{writer.__name__}', jax.*Use 'lanes'"
-        ):
-            Step(stages, "fused").plan(data)
-        with pytest.warns(EngineWarning, match=f"stage '{writer.__name__}' has no kernel: .*{name}"):
-            assert Step(stages).plan(data).engine == "lanes"
 
 
 @needs_compiler

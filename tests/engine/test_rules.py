@@ -79,15 +79,9 @@ def write_first_number(data, x):
 
 
 REFUSED_STAGES = {
-    "eigh": (
-        lambda d: write_first_number(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]),
-        "primitive 'eigh' has no rule",
-    ),
+    "eigh": (lambda d: write_first_number(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]), "primitive 'eigh' has no"),
     "complex": (lambda d: write_first_number(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
-    "half": (
-        lambda d: write_first_number(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)),
-        "numbers of type bfloat16",
-    ),
+    "half": (lambda d: write_first_number(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)), "numbers of type"),
     "index": (lambda d: write_first_number(d, (jnp.arange(100.0) + d.states.pos[0])[d.core.steps % 100]), "100"),
     "cholesky": (lambda d: write_first_number(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "size 7"),
     "sort": (lambda d: write_first_number(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "65 elements"),

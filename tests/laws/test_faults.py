@@ -169,27 +169,6 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
     assert v < -3.5, "gravity gives 4.905 m/s; thrust of the slowing rotors and drag reduce it"
 
 
-@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy_rotor_drag"])
-def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(dynamics):
-    """Rotors that stand still cannot turn a drone, and start late. Compensation of drag does not tilt it."""
-    data, step, _ = build_program(dynamics, "state")
-    data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
-    after_fall = fly_without_force(step, data)
-    if dynamics in FITTED_DYNAMICS:
-        least = float(data.params.thrust_min[0])
-        commanded, z_v_r = after_fall.controls.attitude.cmd[..., 3], simulate_fall(data, 250, lambda r: least)
-    else:
-        p = jax.tree.map(lambda x: np.asarray(x, np.float64), data.controls.controller.params)
-        (k0, k1, k2), lead = p.allocation.rpm2thrust[0], p.lead[0]
-        idle = (np.sqrt(k1**2 - 4 * k2 * (k0 - p.allocation.thrust_min[0])) - k1) / (2 * k2)
-        least, commanded = idle, after_fall.controls.rotor_vel
-        lowest = float(np.min(data.params.rotor_vel_min))  # of the dynamics, for rotors that are on
-        z_v_r = simulate_fall(data, 250, lambda r: np.maximum(r + lead * (idle - r), lowest))
-    np.testing.assert_allclose(commanded, least, rtol=1e-3)  # the last per mille of the lag
-    assert_falls(after_fall.states, *z_v_r)
-    assert z_v_r[1] < -2.5, "four fifths of gravity give 3.9 m/s; thrust of the slowing rotors and drag reduce it"
-
-
 def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():
     """The speed from rest is the exact solution with linear drag: v = -g tau (1 - exp(-t / tau))."""
     data, step, _ = build_program("first_principles", "attitude")

@@ -113,15 +113,6 @@ def three_by_three():
     return sim
 
 
-def test_a_mass_belongs_to_its_world_and_drone(three_by_three):
-    """Law 2, with equal lengths of different axes: three worlds, three drones, three components, nine masses."""
-    mass = 0.01 * np.arange(1, 10).reshape(3, 3, 1)
-    data = three_by_three.step_fn(with_params(three_by_three.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
-    expected = np.array([0.03, -0.02, 0.01]) / mass / three_by_three.freq
-    # float32: force, mass, quotient, product and sum each round to 6e-8
-    np.testing.assert_allclose(data.states.vel, expected, rtol=5e-7)
-
-
 @pytest.mark.parametrize("shape", [(3,), (3, 1, 1), (3, 3), (2, 3, 1), ()])
 def test_a_mass_of_a_world_without_an_axis_of_drones_is_refused(three_by_three, shape):
     """Law 2: a parameter is shared or per drone; the user must broadcast a parameter of a world to its drones."""

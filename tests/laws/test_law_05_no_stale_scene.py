@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from crazysim import ConfigError, SlungLoad
+from crazysim import ConfigError
 from crazysim.core import functional as F
 from crazysim.scene import mjx_scene
 from crazysim.scene.sync import poses_of, sync_poses
@@ -23,15 +23,6 @@ from crazysim.sim.sim import sync_sim2mjx
 FREE_HEIGHT = 1.0
 """Height, m, at which a drone touches nothing."""
 SMALL_IMAGE = {"mode": "rgb_array", "width": 32, "height": 24}
-
-
-class Unreadable:
-    """A flag that must not be read."""
-
-    def __bool__(self):
-        raise AssertionError("the device's flag was read")
-
-    __array__ = __jax_array__ = __bool__
 
 
 @pytest.fixture(scope="module")
@@ -151,20 +142,6 @@ def test_the_next_query_after_a_change_syncs_once(syncs, two_world_sim, change):
         assert len(syncs) == 1
 
 
-def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two_world_sim):
-    """Any flag is replaced by a cleared one; a flag that is known to be clear stays, so edits need no transfer."""
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    two_world_sim.step()
-    compiled = two_world_sim.step_fn._cache_size()
-    for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
-        two_world_sim.data = two_world_sim.data.replace(core=two_world_sim.data.core.replace(mjx_synced=flag))
-        two_world_sim.step()
-    assert two_world_sim.step_fn._cache_size() == compiled
-    clear = two_world_sim.data.core.mjx_synced
-    two_world_sim.data = with_heights(two_world_sim.data, FREE_HEIGHT, FREE_HEIGHT)
-    assert two_world_sim.data.core.mjx_synced is clear
-
-
 def test_a_cleared_flag_is_an_array_of_its_own(two_world_sim):
     """A user who donates data read from ``sim.data`` must not invalidate other data, such as the default data."""
     sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
@@ -193,21 +170,6 @@ def test_pictures_show_the_world_as_it_is_and_do_not_use_mjx(one_world_sim, sync
     assert not syncs
 
 
-def test_queries_read_no_flag_from_the_device(two_world_sim, syncs):
-    """The host knows whether a sync is due, so the flag on the device is never read."""
-
-    sync_scene(two_world_sim, FREE_HEIGHT, FREE_HEIGHT)
-    valid_data = two_world_sim._stepper.data
-    try:
-        two_world_sim._stepper.data = valid_data.replace(core=valid_data.core.replace(mjx_synced=Unreadable()))
-        syncs.clear()
-        two_world_sim.contacts()
-        two_world_sim.contacts("drone:0")
-        assert not syncs
-    finally:
-        two_world_sim._stepper.data = valid_data
-
-
 # Whose poses the scene has --------------------------------------------------------------------------------------
 
 
@@ -219,28 +181,6 @@ def test_a_step_that_moves_nothing_leaves_the_scene_fresh(syncs):
     sim.step()
     sim.contacts()
     assert len(syncs) == 1
-
-
-def test_commands_between_queries_read_poses_once_on_the_host(syncs):
-    """A staged command keeps the arrays that were read from the memory of kernels, which tell that nothing moved."""
-    sim = Sim(n_worlds=2)
-    for _ in range(2):
-        sim.attitude_control(np.zeros((2, 1, 4)))
-        sim.step(5)
-        sim.contacts()
-    syncs.clear()
-    sim.attitude_control(np.zeros((2, 1, 4)))
-    sim.contacts()
-    assert not syncs
-
-
-def test_a_scene_with_a_load_is_synced_once_for_two_queries(syncs):
-    sim = Sim(n_worlds=2, plugins=[SlungLoad(0.01, 0.5)])
-    for _ in range(2):
-        sim.step(5)
-        sim.contacts()
-        sim.contacts()
-    assert len(syncs) == 2
 
 
 def test_numpy_arrays_are_copied_at_every_sync(two_world_sim, syncs):
@@ -291,25 +231,6 @@ def test_a_pure_step_clears_the_flag(two_world_sim):
 
 
 # What is allocated ----------------------------------------------------------------------------------------------
-
-
-def test_no_scene_state_of_worlds_is_allocated_before_it_is_needed():
-    n_worlds = 977  # a number that no other test uses, so arrays with this number of rows belong to this simulation
-    sim = Sim(n_worlds=n_worlds)
-
-    def scene_bytes():
-        own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
-        return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
-
-    assert not sim.scene.is_allocated
-    assert scene_bytes() == 0
-    sim.step(2)
-    sim.reset()
-    sim.build_mjx()
-    assert not sim.scene.is_allocated
-    assert scene_bytes() == 0
-    assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
-    assert scene_bytes() > 1000 * n_worlds
 
 
 def test_data_have_added_objects_before_the_scene_is_compiled(monkeypatch, syncs):
@@ -372,16 +293,6 @@ def test_a_spec_that_lost_an_object_with_poses_is_refused_and_keeps_its_name():
     with pytest.raises(ConfigError, match="expected a new name, got 'ball:0'"):
         sim.scene.add("sphere", "ball", pos=[-1, 0, 0])
     np.testing.assert_array_equal(ball.pose(sim.data)[0], [[[1, 0, 0]]])
-
-
-def test_drawing_one_world_allocates_nothing_for_the_others(opengl, syncs):
-    """A picture needs one world's poses: no MJX, no scene state, no sync of all worlds."""
-    sim = Sim(n_worlds=2)
-    sim.step()
-    assert sim.render(**SMALL_IMAGE, world=1).shape == (24, 32, 3)
-    assert not sim.scene.is_allocated
-    assert sim.scene._mjx._model is None
-    assert not syncs
 
 
 # Any order ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 
 from crazysim.engine.sharding import world_mesh
 from crazysim.sim import Sim
-from crazysim.sim.sim import sync_sim2mjx, use_box_collision
+from crazysim.sim.sim import use_box_collision
 
 N_WORLDS = 64
 RADIUS, OFFSET = 0.086, np.array([0.0, 0.0, 0.02])  # collision sphere of cf21B_500, in its body frame
@@ -165,33 +165,6 @@ def test_contacts_of_a_body_are_its_own_slots(scattered_scene, body):
     belongs_to_body = (bodies == sim.mj_model.body(body).id).any(0)
     assert 0 < belongs_to_body.sum() < belongs_to_body.size
     np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & belongs_to_body)
-
-
-def test_a_closed_over_scene_gives_the_same_contacts(scattered_scene):
-    """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
-    sim = scattered_scene[0]
-    expected = np.asarray(sim.contacts())
-    _mjx_data, mjx_model = sim.mjx_data, sim.mjx_model
-    traces = []
-
-    @jax.jit
-    def check_contacts(sim_data, obstacle_mocap_pos):
-        traces.append(1)
-        mjx_data = _mjx_data.replace(mocap_pos=obstacle_mocap_pos)
-        _, mjx_data = sync_sim2mjx(sim_data, mjx_data, mjx_model)
-        return mjx_data._impl.contact.dist < 0
-
-    mocap_pos = np.array(sim.mjx_data.mocap_pos)
-    np.testing.assert_array_equal(check_contacts(sim.data, mocap_pos), expected)
-    far_mocap_pos = mocap_pos.copy()
-    far_mocap_pos[:, sim.mj_model.body("pole").mocapid.item()] = 9.0
-    far_contacts = check_contacts(sim.data, far_mocap_pos)
-    contact = jax.device_get(sim.mjx_data._impl.contact)
-    belongs_to_pole = (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
-    assert expected[belongs_to_pole].any()
-    np.testing.assert_array_equal(far_contacts, expected & ~belongs_to_pole)
-    assert len(traces) == 1
-    assert sim.mjx_data is _mjx_data, "the check is pure"
 
 
 def test_worlds_on_two_devices_have_the_same_contacts(scattered_scene):

@@ -8,7 +8,7 @@ import pytest
 from crazysim import RangeFinder, Sim, Wind
 from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
-from crazysim.lab.control.mppi import MPPI, RolloutRecord, setpoint_after
+from crazysim.lab.control.mppi import MPPI, RolloutRecord
 from crazysim.trajectories import figure_eight
 
 
@@ -89,15 +89,6 @@ def test_a_sample_that_is_not_finite_has_no_weight(sim):
     assert np.isfinite(partly_nan).all()
     assert np.any(partly_nan != all_nan)
     np.testing.assert_allclose(all_nan, [[0, 0, 0, 0.0434 * 9.81]], rtol=1e-5)
-
-
-def test_the_setpoint_moves_along_its_taylor_polynomial():
-    ones = jnp.ones(3)
-    sp = Setpoint(ones, 2 * ones, 3 * ones, 4 * ones, 5 * ones, *(jnp.full(1, x) for x in (0.1, 0.2, 0.3)))
-    after = setpoint_after(sp, 0.5)
-    np.testing.assert_allclose(after.pos, 1 + 2 / 2 + 3 / 8 + 4 / 48 + 5 / 384, rtol=1e-6)
-    np.testing.assert_allclose(after.vel, 2 + 3 / 2 + 4 / 8 + 5 / 48, rtol=1e-6)
-    np.testing.assert_allclose(after.yaw, 0.1 + 0.2 / 2 + 0.3 / 8, rtol=1e-6)
 
 
 WRONG_SETTINGS = {

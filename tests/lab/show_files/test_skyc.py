@@ -67,14 +67,6 @@ def test_the_lab_show_is_read():
     np.testing.assert_array_equal(show.lights.colors([0.0, 2.9, 100.0]), np.broadcast_to([1.0, 0.0, 0.0], (3, 2, 3)))
 
 
-def test_poly4d_show():
-    show = parse_show(skyc_files.pack_archive(skyc_files.create_lab_poly4d_show()))
-    assert show.encodings == ("POLY4D", "POLY4D")
-    change = show.parameters[1][0]
-    assert (change.time, change.name, change.value) == (0.5, "stabilizer.controller", 6.0)
-    np.testing.assert_array_equal(show.lights.colors([0.5, 1.0, 9.0])[:, 0], [[0, 0, 1], [1, 1, 0], [1, 1, 0]])
-
-
 def test_studio_show_rests_until_take_off_and_turns_by_yaw_control():
     show = parse_show(skyc_files.pack_archive(skyc_files.create_studio_show()))
     assert show.names == ("drone_0",)

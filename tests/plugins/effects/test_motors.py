@@ -83,3 +83,13 @@ def test_rotors_fail_at_random_at_their_rate():
     assert set(np.unique(effectiveness(sim))) == {0.0, 1.0}
     pairs = (effectiveness(sim)[:, 0, 1] == 1) & (effectiveness(sim)[:, 0, 3] == 1)
     assert abs(pairs.mean() - np.exp(-1.0)) < 4 * np.sqrt(0.25 / n), "rotors fail independently"
+
+
+def test_fail_stops_the_rotors_of_its_mask(weak_sim):
+    before = weak_sim.data
+    mask = np.zeros((3, 2, 4), bool)
+    mask[2, 1, 3] = True
+    weak_sim.data = weak_sim.plugins["motors"].fail(weak_sim.data, mask)
+    changed, weak_sim.data = effectiveness(weak_sim), before
+    np.testing.assert_array_equal(changed != effectiveness(weak_sim), mask)
+    assert changed[2, 1, 3] == 0

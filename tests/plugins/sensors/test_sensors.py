@@ -179,15 +179,6 @@ def test_telemetry_and_battery():
     np.testing.assert_allclose(voltage.std(), np.sqrt(0.02**2 + 0.01**2 / 12), rtol=std_tolerance(N))
 
 
-def test_a_multi_ranger_measures_the_distances_of_the_range_finder():
-    sim = build(RangeFinder(max_range=2.0), sensors.MultiRanger(0.05, freq=None), n_worlds=N)
-    sim.step()
-    distance = read(sim, "multi_ranger.distance")[:, 0]
-    np.testing.assert_array_equal(distance[:, :5], 2.0)
-    np.testing.assert_allclose(distance[:, 5].mean(), 1.0, atol=4 * 0.05 / np.sqrt(N) + 1e-3)
-    np.testing.assert_allclose(distance[:, 5].std(), 0.05, rtol=std_tolerance(N))
-
-
 def test_ranges_and_their_detours_by_hand():
     anchors = [(3.0, 0, 1.0), (0, 4.0, 1.0), (0, 0, 6.0)]
     sim = build(
