@@ -49,6 +49,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.control.load_lqr": "LoadLQR load_lqr_control",
         "crazysim.lab.control.lqr": "LQR lqr_control",
         "crazysim.lab.control.tracking_lqr": "TrackingLQR tracking_lqr_control",
+        "crazysim.sim.crazyflow": "load_fn_params load_params",
     },
     "crazysim.engine": {
         "crazysim.engine.plan": "ENGINES",
@@ -136,6 +137,7 @@ NAMES: dict[str, dict[str, str]] = {
         "unpack_compressed unpack_poly4d",
     },
     # Modules of Crazyflow.
+    "crazysim.control.parameters": {"crazysim.sim.crazyflow": "load_fn_params load_params"},
     "crazysim.dynamics.utils": {},
     "crazysim.dynamics.utils.data_utils": {
         "crazysim.lab.identify.attitude_logs": "derivatives_svf preprocessing state_variable_filter",

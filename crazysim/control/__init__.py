@@ -10,7 +10,6 @@ from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude_controller import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.levels import COMMAND_FIELDS, Control, command_size
 from crazysim.control.mellinger import Mellinger
-from crazysim.control.parameters import load_fn_params, load_params
 from crazysim.control.pid import PID
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from crazysim.lab.control.load_lqr import LoadLQR, load_lqr_control
     from crazysim.lab.control.lqr import LQR, lqr_control
     from crazysim.lab.control.tracking_lqr import TrackingLQR, tracking_lqr_control
+    from crazysim.sim.crazyflow import load_fn_params, load_params
 
 __all__ = [
     "COMMAND_FIELDS",

@@ -14,7 +14,7 @@ from crazysim.control.bandwidth import bandwidth, fastest_rotor_rate, momentum_p
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, bandwidth_gains
 from crazysim.control.levels import Control
-from crazysim.control.low_pass import butterworth
+from crazysim.control.pid_loop import butterworth
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control.low_pass import butterworth
 from crazysim.drones import Airframe
 from crazysim.engine.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import clip
@@ -168,3 +168,18 @@ def _wrap_angle(x: Array, is_angle: Sequence[bool]) -> Array:
         return x
     correction = jnp.where(x > 180, 360.0, jnp.where(x < -180, -360.0, 0.0))
     return jnp.where(jnp.asarray(is_angle), x - correction, x)
+
+
+def butterworth(cutoff: float, freq: float) -> list[float]:
+    """Return the coefficients b0, a1, a2 of a low-pass Butterworth filter of order 2; ``b1 = 2 b0`` and ``b2 = b0``.
+
+    The frequency is prewarped for the bilinear transform, so that the gain at the cutoff is 1/sqrt(2), as in
+    ``lpf2pSetCutoffFreq`` in filter.c of bitcraze/crazyflie-firmware.
+
+    Args:
+        cutoff: Cutoff frequency, Hz.
+        freq: Sampling rate, Hz.
+    """
+    k = math.tan(math.pi * cutoff / freq)
+    scale = 1 / (1 + math.sqrt(2) * k + k * k)
+    return [k * k * scale, 2 * (k * k - 1) * scale, (1 - math.sqrt(2) * k + k * k) * scale]

@@ -6,16 +6,18 @@ from contextlib import nullcontext
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
-from crazysim.eager import fetch_rows
+from crazysim.eager import fetch_rows, jit_eager_calls
 from crazysim.engine.cache import announce_if_slow
 from crazysim.engine.sharding import put_on_device, shard_scene
-from crazysim.scene import build, contacts, mjx
+from crazysim.errors import UnknownNameError
+from crazysim.scene import build, mjx
 from crazysim.scene.sync import Poses, sync_poses
 
 
@@ -116,7 +118,7 @@ class MjxScene:
             (n_worlds, n_slots), bool
         """
         data = self.sync(poses)
-        return contacts.contact_flags(data) if body is None else contacts.body_contact_flags(data, self._mj_model, body)
+        return contact_flags(data) if body is None else body_contact_flags(data, self._mj_model, body)
 
     def shard(self, mesh: Mesh) -> None:
         """Distribute the worlds over devices."""
@@ -126,3 +128,32 @@ class MjxScene:
 
     def _to_device(self, data: mjx.Data) -> mjx.Data:
         return put_on_device(data, self._device) if self._mesh is None else shard_scene(data, self._mesh)
+
+
+# Contact slots: the rows of MJX's contact arrays. Only these functions read the private arrays.
+def contact_flags(mjx_data: mjx.Data) -> Array:
+    """Return True for every contact slot whose two geoms touch. (n_worlds, n_slots)"""
+    return mjx_data._impl.contact.dist < 0
+
+
+def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
+    """Return True for every contact slot in which a geom of a body touches another geom. (n_worlds, n_slots)"""
+    belongs_to_body = mj_model.geom_bodyid == body_id(mj_model, body)
+    contact = mjx_data._impl.contact
+    return _slot_flags(contact.dist, contact.geom1, contact.geom2, belongs_to_body)
+
+
+@jit_eager_calls()
+def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array) -> Array:
+    belongs_to_body = jnp.asarray(belongs_to_body)
+    return (dist < 0) & ((geom1 >= 0) & belongs_to_body[geom1] | (geom2 >= 0) & belongs_to_body[geom2])
+
+
+def body_id(mj_model: mujoco.MjModel, body: str) -> int:
+    """Return the id of a body."""
+    index = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
+    if index < 0:
+        names = [name for name in (mj_model.body(i).name for i in range(mj_model.nbody)) if not name.startswith("_")]
+        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise UnknownNameError(f"expected a body of the scene, {listed}, got {body!r}")
+    return index

@@ -39,8 +39,8 @@ from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contact_report import ContactReport, ObjectSelection
-from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
+from crazysim.scene.mjx_scene import body_id
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.ray_casting import RayKernels

@@ -13,7 +13,7 @@ from flights import fly, hover, make_sim, path_setpoint, start_on_path
 from crazysim import Sim, load_airframe
 from crazysim.control.geometric import Geometric, geometric_control
 from crazysim.control.indi import INDI, INDIMemory, apply_filter, indi_control
-from crazysim.control.low_pass import butterworth
+from crazysim.control.pid_loop import butterworth
 
 
 def test_the_filter_agrees_with_scipy():

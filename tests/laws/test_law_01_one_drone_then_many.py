@@ -174,15 +174,14 @@ def test_drones_in_a_batch_fly_like_single_drones(name, rng):
 def test_the_cases_cover_dynamics_and_control():
     """No module of physics or control that computes arrays is missing.
 
-    ``parameters`` only loads arrays. In ``firmware`` a library computes, which
-    ``test_c_firmware`` compares. Modules that controllers import count as covered by them.
+    ``parameters`` only loads arrays. Modules that controllers import count as covered by them.
     """
     covered = {m.__name__ for m in MODULES}
     for path in CONTROLLERS.values():
         module = importlib.import_module(path.partition(":")[0])
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
     names = ("__init__", "levels", "models", "parameters")
-    names += ("protocol", "controllers", "setpoint", "switch", "firmware")
+    names += ("protocol", "controllers", "setpoint", "switch")
     for path in source_files():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
         assert name in covered or path.stem in names, name

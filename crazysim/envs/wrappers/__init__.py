@@ -2,8 +2,7 @@
 
 from crazysim.envs.reset_policy import AutoresetMode, ResetPolicy
 from crazysim.envs.wrappers.action import ActionDelay
-from crazysim.envs.wrappers.autoreset import AutoReset
-from crazysim.envs.wrappers.base import Wrapper
+from crazysim.envs.wrappers.base import AutoReset, Wrapper
 from crazysim.envs.wrappers.images import CameraImages
 from crazysim.envs.wrappers.observation import FrameStack, Normalize, ObservationNoise, Observe, PrivilegedObservation
 from crazysim.envs.wrappers.randomize import RandomizeWith

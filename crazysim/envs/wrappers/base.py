@@ -1,12 +1,14 @@
-"""Base class of wrappers."""
+"""Base class of wrappers, and the wrapper for automatic resets."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from crazysim.arguments import check_arguments
+from crazysim.core.settings import enum_member
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.hooks import Hooks
+from crazysim.envs.reset_policy import POLICIES, AutoresetMode, ResetPolicy
 from crazysim.errors import ConfigError, require
 
 
@@ -42,3 +44,15 @@ class Wrapper(Hooks, Env):
     @property
     def wrappers(self) -> tuple[Hooks, ...]:
         return (*self.env.wrappers, self)
+
+
+class AutoReset(Wrapper):
+    """Begin a new episode within a step where an episode is over. It must be the outermost wrapper."""
+
+    def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
+        super().__init__(env)
+        self.mode = enum_member(AutoresetMode, "mode", mode)
+
+    @property
+    def reset_policy(self) -> ResetPolicy | None:
+        return POLICIES[self.mode]

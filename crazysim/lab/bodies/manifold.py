@@ -13,7 +13,7 @@ from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
-from crazysim.geometry.small_matrices import matmul, matvec
+from crazysim.lab.bodies.small_matrices import matmul, matvec
 
 N_BOX_POINTS = 13
 """Number of contact points between two boxes."""

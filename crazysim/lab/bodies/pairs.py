@@ -12,8 +12,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.geometry import Shape, distance, point_distance
-from crazysim.geometry.small_matrices import matvec
 from crazysim.lab.bodies.manifold import Manifold, ball_box_contacts, ball_contacts, box_contacts
+from crazysim.lab.bodies.small_matrices import matvec
 from crazysim.lab.bodies.solver import Contacts
 from crazysim.scene.collision import CollisionGeom
 

@@ -18,7 +18,6 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import ConfigError
-from crazysim.geometry.small_matrices import matmul, matvec
 from crazysim.lab.bodies.manifold import N_BOX_POINTS
 from crazysim.lab.bodies.pairs import (
     CORNERS,
@@ -29,6 +28,7 @@ from crazysim.lab.bodies.pairs import (
     contacts_on_surface,
     join_contacts,
 )
+from crazysim.lab.bodies.small_matrices import matmul, matvec
 from crazysim.lab.bodies.solver import Bodies, Impulses, SolvedBodies, solve_contacts
 from crazysim.plugins.contacts.contact_points import Carrier, find_carriers
 from crazysim.plugins.effects.ground import HeightField

@@ -17,7 +17,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.engine.jaxcompat import fori_loop
-from crazysim.geometry.small_matrices import matmul, matvec
+from crazysim.lab.bodies.small_matrices import matmul, matvec
 from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, MAX_PUSH_SPEED
 
 MAX_ACTING_GAP = 1e-3

@@ -20,7 +20,8 @@ from crazysim.eager import jit_eager_calls
 from crazysim.engine.jaxcompat import fori_loop
 from crazysim.engine.pytree import device_array
 from crazysim.errors import ConfigError
-from crazysim.geometry.small_matrices import matvec, solve_symmetric
+from crazysim.lab.bodies.small_matrices import matvec
+from crazysim.plugins.contacts.impulse import solve_symmetric
 from crazysim.plugins.payloads.colliders import LoadBody, rest_height
 from crazysim.plugins.payloads.link import TAUT_BAND, UnitPull, acceleration_at, correction_rate, link_geometry
 from crazysim.plugins.payloads.point_load import (

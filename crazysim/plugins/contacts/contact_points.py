@@ -6,7 +6,7 @@ They are the corners of the box, and the points of its upper and lower plate tha
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -23,9 +23,11 @@ from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.plugins.effects.ground import HeightField
 from crazysim.plugins.payloads.colliders import LoadBody
-from crazysim.scene.collision import CollisionGeom
+from crazysim.scene.collision import CollisionGeom, DroneGeoms
 from crazysim.scene.contact_report import ObjectSelection, select_bodies
 
+DroneBoxes = Sequence[tuple[DroneGeoms, np.ndarray]]
+"""For each airframe: its drones, with the centre and half extents of their collision box, body frame, m. (6,)"""
 FLAT_KINDS = ("plane", "box", "cylinder")
 """Kinds of geoms with flat faces, which the corners of a drone's box touch."""
 PLATE_HEIGHT_FRACTION = 0.05
@@ -279,3 +281,27 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
         )
 
     return to_geom, to_world, None if vel is None else velocity_at
+
+
+def collision_boxes(sim: Simulation) -> DroneBoxes:
+    """Return the collision box of each airframe in a simulation, with the drones that have it."""
+    drone_groups = [DroneGeoms((), drones) for drones in sim.scene.drone_groups]
+    first_drones = [0 if group.drones is None else group.drones[0] for group in drone_groups]
+    boxes = [np.asarray(sim.airframes[k].value("shape.collision_box"), np.float64) for k in first_drones]
+    return list(zip(drone_groups, boxes, strict=True))
+
+
+def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
+    """Return for each drone the result that belongs to its airframe.
+
+    Args:
+        results: For each airframe: its drones, with a result that was computed as if all drones had this airframe. A
+            result is a tree of arrays, (k,) for one drone, else (..., n_drones, k).
+        drone_id: Index of the drone, or indices of all drones. () or (n_drones,)
+    """
+    (_, result), *others = results
+    for group, other in others:
+        is_in_group: Any = group.drone_mask(drone_id)
+        mask = is_in_group[..., None] if is_in_group.ndim else is_in_group
+        result = jax.tree.map(lambda x, y, mask=mask: x if y is x else jnp.where(mask, y, x), result, other)
+    return result

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
 from crazysim.engine.jaxcompat import fori_loop
-from crazysim.geometry.small_matrices import solve_symmetric
 from crazysim.plugins.contacts.contact_points import ContactPoints
 
 BOUNCE_SPEED = 0.1
@@ -138,3 +138,26 @@ def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array
     angular = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
     upper = jnp.concatenate([translation, -cross], axis=-1)
     return jnp.concatenate([upper, jnp.concatenate([cross, angular], axis=-1)], axis=-2)
+
+
+def solve_symmetric(matrix: Array, b: Array) -> Array:
+    """Solve ``matrix x = b`` for a symmetric positive definite matrix, unrolled. (..., n)
+
+    The matrix is first scaled to a unit diagonal, because mass and moments of inertia differ by four orders of
+    magnitude.
+    """
+    n = b.shape[-1]
+    scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
+    a = [[matrix[..., i, j] * scale[i] * scale[j] for j in range(i + 1)] for i in range(n)]
+    y = [b[..., k] * scale[k] for k in range(n)]
+    lower: list[list[Array]] = []
+    for i in range(n):
+        lower.append([])
+        for j in range(i):
+            lower[i].append((a[i][j] - sum(lower[i][k] * lower[j][k] for k in range(j))) / lower[j][j])
+        lower[i].append(jnp.sqrt(a[i][i] - sum(lower[i][k] ** 2 for k in range(i))))
+    for i in range(n):
+        y[i] = (y[i] - sum(lower[i][k] * y[k] for k in range(i))) / lower[i][i]
+    for i in reversed(range(n)):
+        y[i] = (y[i] - sum(lower[k][i] * y[k] for k in range(i + 1, n))) / lower[i][i]
+    return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)

@@ -15,8 +15,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.geometry import Shape, distance
-from crazysim.plugins.contacts.contact_points import Surface, load_points
-from crazysim.plugins.contacts.drone_boxes import DroneBoxes, select_airframe
+from crazysim.plugins.contacts.contact_points import DroneBoxes, Surface, load_points, select_airframe
 from crazysim.plugins.contacts.impulse import (
     BOUNCE_SPEED,
     MAX_PUSH_SPEED,

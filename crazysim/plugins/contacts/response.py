@@ -19,8 +19,15 @@ from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Param, Plugin, Simulation, StagePlacement, param, state
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.engine.stage import Stage
-from crazysim.plugins.contacts.contact_points import Surface, contact_points, find_surfaces, is_ground
-from crazysim.plugins.contacts.drone_boxes import DroneBoxes, collision_boxes, select_airframe
+from crazysim.plugins.contacts.contact_points import (
+    DroneBoxes,
+    Surface,
+    collision_boxes,
+    contact_points,
+    find_surfaces,
+    is_ground,
+    select_airframe,
+)
 from crazysim.plugins.contacts.impulse import Material, inertia_matrix, velocity_after_contact
 from crazysim.plugins.contacts.load_contacts import (
     load_names,
