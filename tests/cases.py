@@ -254,12 +254,7 @@ def shared_sim(**settings):
 
 
 def count_documented_arrays(record, **sizes):
-    """Check that the docstring of every array of a record ends with its shape, and return the number of arrays.
-
-    Args:
-        record: Record; its parts are checked too.
-        sizes: Sizes of the names in these shapes.
-    """
+    """Check that the docstring of every array of a record ends with its shape, and return the number of arrays."""
     shapes, n_arrays = _documented_shapes(type(record)), 0
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)

@@ -169,16 +169,7 @@ def compile_distance_and_slopes(a, b):
 
 
 def check_pair(a, b, rng, n, separated_tolerance=1e-5, shallow_tolerance=1e-6, deep_tolerance=1e-6):
-    """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs.
-
-    Args:
-        a, b: Two shapes.
-        rng: Random generator of the poses of ``a``.
-        n: Number of poses.
-        separated_tolerance: Tolerance of the distances of separated shapes, m.
-        shallow_tolerance: Tolerance of depths below 0.05 m, m.
-        deep_tolerance: Tolerance of other depths, m.
-    """
+    """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs."""
     pos, quat = poses(rng, n)
     rot, evaluate = rotations(quat), compile_distance_and_slopes(a, b)
     (actual, by_pos, _), expected = evaluate(pos, rot), distances(a, b, pos, quat)

@@ -35,15 +35,7 @@ def make_splat(pos, deviation, opacity, color):
 
 
 def spot_alpha(offset, deviation, opacity, focal, n):
-    """Return the alpha of ``make_splat`` in a square image of n x n pixels: its linear projection, plus 0.3 pixels^2.
-
-    Args:
-        offset: Position relative to a camera that looks along x, with y to its left and z up, m. (3,)
-        deviation: Standard deviation, m.
-        opacity: Opacity.
-        focal: Focal length, pixels.
-        n: Pixels.
-    """
+    """Return the alpha of ``make_splat``: its linear projection, plus 0.3 pixels^2."""
     ahead, left, up = offset
     u, v = -left / ahead, -up / ahead
     sides = focal * deviation / ahead * np.array([[1, 0, -u], [0, 1, -v]])

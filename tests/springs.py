@@ -95,15 +95,7 @@ KINDS = (Springs, Crowd, Tied, Tying)
 
 
 def build_springs(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
-    """Return a simulation of drones at different positions in the air, with populations of masses.
-
-    Args:
-        kinds: Class of the population, which is added as "springs", or several, each added under the name of its class.
-        n_worlds: Number of worlds.
-        n_drones: Number of drones in each world.
-        n_members: Number of members of each population in each world.
-        **settings: Other settings of the simulation.
-    """
+    """Return a simulation of drones at different positions in the air, with populations of masses."""
     sim = cs.Sim(n_worlds, n_drones, control="rotor_vel", **settings)
     for kind in (kinds,) if isinstance(kinds, type) else kinds:
         name = "springs" if kind is kinds else kind.__name__.lower()

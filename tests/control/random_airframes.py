@@ -117,17 +117,7 @@ def random_directions(rng, *shape):
 
 
 def throw_drones(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
-    """Start all drones in flight, with random directions of all motions.
-
-    Args:
-        sim: Simulation.
-        seed: Seed of the directions, distances and yaws.
-        tilt: Angle between the z axes of drone and world, rad.
-        rate: Body rate, rad/s.
-        speed: Speed, m/s.
-        away: Maximum distance from the origin, m.
-        heading: Maximum yaw, rad.
-    """
+    """Start all drones in flight, with random directions of all motions."""
     rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
     axes = random_directions(rng, *shape) * [1, 1, 0]
     axes *= tilt / np.linalg.norm(axes, axis=-1, keepdims=True)

@@ -7,13 +7,7 @@ from crazysim.engine.ir.program import Leaf, Program, Segment
 
 
 def make_program(block, inputs, n_lanes):
-    """Return a program of one block, and its leaves: one for each input, shared if it is a scalar, and each output.
-
-    Args:
-        block: The block.
-        inputs: Its inputs, (n_lanes,) or ().
-        n_lanes: Number of worlds, each with one drone.
-    """
+    """Return a program of one block, and its leaves: one for each input, shared if it is a scalar, and each output."""
     leaves, arrays = [], []
     for k, x in enumerate(map(np.asarray, inputs)):
         scope, shape = ("drone", (n_lanes, 1)) if x.ndim else ("shared", (1,))

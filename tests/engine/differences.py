@@ -59,13 +59,6 @@ def first_difference(
 
     Both engines run each stage on the data that the first engine computed so far, so a difference is due to that stage
     alone. To find the operation, an engine that compiles programs then runs the stage again and returns every value.
-
-    Args:
-        pipeline: Stages of a step.
-        data: Data to begin from.
-        engines: Two of ``ENGINES``.
-        tolerance: Largest difference that is ignored, relative to the largest component of a vector. NaN is equal to
-            NaN.
     """
     axes = Axes(data)
     for name, stage in pipeline.items():
@@ -113,14 +106,7 @@ def _find_operation(stage: Any, name: str, data: Any, engines: Sequence[str], to
 
 
 def first_operation(program: Program, leaves: list[Any], build: Build, tolerance: float = TOLERANCE) -> str | None:
-    """Return the listing of the first operation whose result differs from the interpreter's, or None.
-
-    Args:
-        program: A program of one segment.
-        leaves: Its leaves, for all worlds.
-        build: Function ``build`` of a backend.
-        tolerance: As in ``first_difference``.
-    """
+    """Return the listing of the first operation whose result differs from the interpreter's, or None."""
     exposed_program, operations = expose_values(program)
     n_worlds = lanes.batch_counts(program, leaves)[0]
     zero_leaves = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed_program.leaves[len(leaves) :]]

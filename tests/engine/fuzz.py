@@ -195,13 +195,7 @@ class Fuzzer:
     """Runner of programs on all engines, which counts the outcomes."""
 
     def __init__(self, seed: int, engines: Sequence[str] = COMPARED_ENGINES, device: str = "cpu"):
-        """Draw the inputs of all programs.
-
-        Args:
-            seed: Seed of inputs and programs.
-            engines: Engines that are compared with ``plain``; those that cannot run on the device are left out.
-            device: Platform that runs the programs, ``"cpu"`` or ``"gpu"``.
-        """
+        """Draw the inputs of all programs."""
         self.platform = device
         self.engines = tuple(e for e in engines if e != "fused" or fused.unavailable_reason(device) is None)
         self.rng = np.random.default_rng(seed)

@@ -506,13 +506,7 @@ def random_numbers(d: Draw) -> str:
 
 
 def draw_program(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
-    """Return a random program.
-
-    Args:
-        rng: Source of random choices.
-        input_shapes: Shapes and types of the inputs that it may use, by name.
-        n_lines: Number of lines.
-    """
+    """Return a random program."""
     inputs = tuple(input_shapes)
     avals = list(input_shapes.values())
     lines: list[str] = []

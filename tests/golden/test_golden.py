@@ -55,11 +55,7 @@ def crazyflow_rk4(data, deriv_fn):
 
 
 def fly(stem, variant, with_crazyflow_rk4=True):
-    """Fly every airframe and start of a recording in its own world.
-
-    Returns:
-        The samples, the recorded samples, and the recorded errors of Crazyflow in float32.
-    """
+    """Fly every airframe and start of a recording in its own world."""
     dynamics, control = stem.split("-")
     integrator = variant.removesuffix("-slow")
     recorded = load_recordings(stem)[variant]

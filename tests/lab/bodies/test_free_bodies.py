@@ -36,17 +36,7 @@ def keep_stages(sim, prefix="bodies"):
 def mujoco_track(
     bodies, seconds, friction=0.6, steps_per_pose=5, timestep=0.0005, contact='solref="0.004 1"', carrier=""
 ):
-    """Return positions and quaternions, xyzw, of free bodies in C MuJoCo, once in ``steps_per_pose`` steps of crazysim.
-
-    Args:
-        bodies: Size (radius or full lengths), mass, position and velocity of each, and its quaternion, xyzw, if tilted.
-        seconds: Duration, s.
-        friction: Coulomb's coefficient.
-        steps_per_pose: Steps of crazysim between two poses.
-        timestep: Step of MuJoCo, s.
-        contact: Attributes of all geoms.
-        carrier: MJCF of one more body, with one degree of freedom, that starts at 1 m/s.
-    """
+    """Return positions and quaternions, xyzw, of free bodies in C MuJoCo."""
     bodies_xml = ""
     for size, mass, pos, _, *quat in bodies:
         kind = "sphere" if np.ndim(size) == 0 else "box"

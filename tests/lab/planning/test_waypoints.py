@@ -41,12 +41,6 @@ def coefficients_by_kkt(waypoints, durations, order, velocity):
     """Return the coefficients of the optimal polynomials. (n_pieces, 3, 2 order)
 
     Waypoints and continuity are equality constraints, and the KKT system is solved.
-
-    Args:
-        waypoints: (n_pieces + 1, 3)
-        durations: (n_pieces,)
-        order: Order of the derivative whose squared integral is minimised.
-        velocity: Velocity at the second waypoint; NaN where free. (3,)
     """
     size, n = 2 * order, len(durations)
     cost = np.zeros((n * size, n * size))

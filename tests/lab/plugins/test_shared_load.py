@@ -56,11 +56,7 @@ def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
 
 
 def throw_apart(integrator, freq, n_worlds=32):
-    """Throw one to four drones apart for 1 s, on cables of 1 m without gravity, in all directions.
-
-    Returns:
-        Largest length of a cable, m, and largest relative error of angular momentum, of each world.
-    """
+    """Throw one to four drones apart for 1 s, on cables of 1 m without gravity, in all directions."""
     sim = Sim(n_worlds, 4, **SETTINGS, integrator=integrator, freq=freq)
     sim.data = with_params(with_states(sim.data, pos=CORNERS), gravity_vec=np.zeros(3))
     load = sim.add(SharedLoad(mass=0.3, length=1.0, in_scene=False))

@@ -47,13 +47,7 @@ def air_velocity(sim, data):
 
 
 def jet_speed(below, radius, thrust=0.0434 * 9.81):
-    """Return the speed of the jet of a Crazyflie 2.1 Brushless, d = sqrt(8) 27.5 mm = 77.8 mm, at sea level, m/s.
-
-    Args:
-        below: Distance below the drone, m.
-        radius: Distance from the axis of the jet, m.
-        thrust: Thrust of the drone, N.
-    """
+    """Return the speed of the jet of a Crazyflie 2.1 Brushless, d = sqrt(8) 27.5 mm = 77.8 mm, at sea level, m/s."""
     d = 0.07778
     start = np.sqrt(4 * thrust / (np.pi * 1.225)) / d
     return start / (1 + below / (5.8 * d)) / (1 + 0.41421 * (radius / (0.094 * (below + 5.8 * d))) ** 2) ** 2

@@ -66,13 +66,7 @@ def simulate_in_mujoco(dof, attach, damping, angles, ang_vel, control_law):
 
 
 def simulate_in_crazysim(dof, cases, starts):
-    """Return positions of drone and tip after every tenth step, m, with each case in its own world.
-
-    Args:
-        dof: Degrees of freedom of the joint.
-        cases: Entries of ``CASES``.
-        starts: Position and velocity of the tip of each case.
-    """
+    """Return positions of drone and tip after every tenth step, m, with each case in its own world."""
     n, control_laws = len(cases), [case[-1] for case in cases]
     attach, damping, ang_vel = (np.array([case[k] for case in cases])[:, None] for k in (1, 2, 4))
     sim = Sim(n, drone="bumblebee", control="rotor_vel", integrator="rk4", freq=FREQ, engine="fused", strict=True)
