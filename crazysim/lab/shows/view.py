@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.arguments import check_flag
-from crazysim.drones.body import LED_MATERIALS
+from crazysim.lab.live.leds import Leds
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
 from crazysim.lab.show_files.show import Show
@@ -19,7 +19,7 @@ from crazysim.lab.shows.flight import ShowFlight, start_simulation
 from crazysim.lab.shows.show_report import collisions
 from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.sim.sim import Sim
-from crazysim.sim.visualize import change_material, draw_label, draw_points
+from crazysim.sim.visualize import draw_label, draw_points
 
 GLOW_RADIUS_SHARE = 0.006
 """Radius of the glow around a light, as a fraction of the size of the show."""
@@ -87,12 +87,12 @@ def create_view(flight: ShowFlight, **settings: Any) -> View:
     camera = camera_around(flight.planned)
     size = camera["distance"] / CAMERA_DISTANCE
     marks = collisions(flight)
-    led_materials = _led_materials(flight.sim)
+    leds = Leds(flight.sim.mj_model)
 
     def draw(sim: Sim, world: int) -> None:
         now = float(sim.time[world, 0])
         k = int(np.argmin(np.abs(flight.times - now)))
-        color_leds(sim, led_materials, flight.colors[k])
+        leds.set_colors(flight.colors[k])
         glow = np.concatenate([flight.colors[k], np.full((flight.show.n_drones, 1), 0.6)], axis=1)
         pos = np.asarray(sim.data.states.pos[world], float)
         sim.overlays.points(pos, glow, max(GLOW_RADIUS_SHARE * size, MIN_GLOW_RADIUS), emission=1.0)
@@ -114,19 +114,6 @@ def camera_around(points: NDArray) -> dict[str, Any]:
     return {"lookat": (low + high) / 2, "distance": CAMERA_DISTANCE * size, "azimuth": 110, "elevation": -18}
 
 
-def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
-    """Set the LEDs of all drones of a simulation.
-
-    Args:
-        sim: Simulation.
-        materials: Names of the LEDs' materials, such as ``led_top``.
-        colors: Colours, 0 to 1. (n_drones, 3)
-    """
-    rgba = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
-    for material in materials:
-        change_material(sim, material, np.arange(len(colors)), rgba=rgba, emission=colors.max(1))
-
-
 def darken(sim: Sim) -> None:
     """Dim the lights and the sky of a simulation's scene for a night; call it before the first image."""
     model = sim.mj_model
@@ -139,12 +126,6 @@ def darken(sim: Sim) -> None:
         n = model.tex_height[k] * model.tex_width[k] * model.tex_nchannel[k]
         sky = model.tex_data[model.tex_adr[k] : model.tex_adr[k] + n].reshape(-1, model.tex_nchannel[k])
         np.minimum(sky[:, :3], NIGHT_SKY, out=sky[:, :3], casting="unsafe")
-
-
-def _led_materials(sim: Sim) -> tuple[str, ...]:
-    return tuple(
-        x for x in LED_MATERIALS if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0
-    )
 
 
 def _to_ascii(text: str) -> str:

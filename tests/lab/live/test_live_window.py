@@ -12,9 +12,9 @@ from screens import screen_pixels, virtual_screen
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Live, Window
+from crazysim.lab.live.leds import Leds
 from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
-from crazysim.lab.live.window_program import Leds
 from crazysim.plugins.vehicles import Cars
 from crazysim.scene.scene_window import camera_ray
 from crazysim.scene.visual_geoms import visual_geoms
