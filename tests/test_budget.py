@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3234,
     "geometry": 940,
-    "lab": 15599,
+    "lab": 15597,
     "media": 1070,
     "plugins": 4874,
     "scene": 2571,
