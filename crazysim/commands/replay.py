@@ -23,11 +23,14 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> None:
     """Serve the page of a flight, or write it."""
     from crazysim.media.flight import Flight
-    from crazysim.media.web import export, serve
+    from crazysim.media.web import page, serve_page
+    from crazysim.storage import check_writable, write_file
 
-    flight = Flight.load(options.flight)
+    if options.export is not None:
+        check_writable(options.export, (".html",))
+    html = page(Flight.load(options.flight), options.world)
     if options.export is None:
-        serve(flight, options.world, options.port, options.host)
+        serve_page(html, options.port, options.host)
     else:
-        export(flight, options.export, options.world)
+        write_file(options.export, html)
         print(f"wrote {options.export}")

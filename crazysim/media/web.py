@@ -6,7 +6,6 @@ import contextlib
 import http.server
 import io
 import socket
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from crazysim.media.browser_scene import BrowserScene, rgb
 from crazysim.media.flight import Flight
 from crazysim.media.picture import Picture, light_spheres, setpoint_spheres
 from crazysim.media.trail import choose_drone_colors
-from crazysim.storage import check_writable, write_file
 
 FPS = 30
 """Samples per second of a page."""
@@ -53,18 +51,6 @@ def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = No
             return _record_scene(server, flight, k, lights).as_html()
         finally:
             server.stop()
-
-
-@check_arguments
-def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
-    """Write ``page`` to a file.
-
-    Raises:
-        ConfigError: If the world was not recorded, the folder does not exist, or the name has another suffix.
-        ImportError: If viser is not installed.
-    """
-    check_writable(path, (".html",))
-    write_file(path, page(flight, world))
 
 
 def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
@@ -111,16 +97,6 @@ def initial_camera_pose(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
     middle, extent = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
     return middle + extent * np.array([0.0, -1.1, 0.7]), middle
-
-
-def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str = "127.0.0.1") -> None:
-    """Serve a flight at a port until interrupted.
-
-    Raises:
-        ImportError: If viser is not installed.
-        RenderError: If the server cannot listen at the address.
-    """
-    serve_page(page(flight, world), port, host)
 
 
 def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:

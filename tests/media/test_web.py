@@ -19,6 +19,7 @@ from waiting import wait_for
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError, RenderError
 from crazysim.media import Recorder, web
+from crazysim.media.browser_scene import BrowserScene
 from crazysim.media.web import FOV, initial_camera_pose, page
 from crazysim.sim import Sim
 
@@ -162,6 +163,19 @@ def test_without_viser_the_extra_is_named(flight, monkeypatch):
 def test_wrong_flights_and_lights_are_named(flight, wrong):
     with pytest.raises(ConfigError, match=f"{next(iter(wrong))}"):
         page(**{"flight": flight} | wrong)
+
+
+def test_poses_that_are_not_finite_or_have_not_changed_are_not_sent():
+    scene, sent = BrowserScene.__new__(BrowserScene), []
+    scene._sent_values = {}
+
+    class Handle:
+        name = "/a"
+        values = property(None, lambda _, values: sent.append(values))
+
+    for values in ([[1.0, 2.0]], [[1.0, 2.0]], [[np.nan, np.nan]], [[3.0, np.inf]]):
+        scene._send(Handle(), "values", np.array(values))
+    np.testing.assert_array_equal(sent, [[[1.0, 2.0]], [[3.0, 2.0]]])
 
 
 class StubServer:
