@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 821,
+    "commands": 824,
     "control": 1393,
     "core": 1577,
     "crazysim": 839,
@@ -20,7 +20,7 @@ BUDGET = {
     "envs": 3234,
     "geometry": 940,
     "lab": 15597,
-    "media": 1070,
+    "media": 1063,
     "plugins": 4874,
     "scene": 2571,
     "sim": 914,
