@@ -13,13 +13,13 @@ PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile --junitxml=out/tests/$@$
 tests_of = $(patsubst %,tests/$(1)/test_%.py,$(2))
 TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(patsubst %,tests/test_%.py,eager machine package rotation startup storage utils) \
-  $(call tests_of,control,allocation attitude flatness setpoint state) \
+  $(call tests_of,control,allocation attitude flatness setpoint state wrong_controllers) \
   $(call tests_of,docs,first_pages imports site) \
   $(call tests_of,engine,gradient_kernels interpret jaxcompat passes plan pytree record rules) \
   $(call tests_of,engine,simplify step symbolic) \
   $(call tests_of,envs,actions brax contract pettingzoo task vector wrappers) \
   $(call tests_of,geometry,heightfield rays shapes) tests/lab/bodies/test_manifold.py \
-  $(call tests_of,scene,build contact_report contacts sync) \
+  $(call tests_of,scene,build contact_report contacts sync wrong_scenes) \
   tests/trajectories/test_formation.py
 # What a new JAX can break: derivatives, tracing, lowering, devices and the cache of programs.
 NEEDS_JAX = $(call tests_of,engine,cache ffi_handlers fuzz gradient_kernels host_call index_map indexing interpret) \

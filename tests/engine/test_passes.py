@@ -230,3 +230,21 @@ def test_zeros_of_shared_parameters_are_no_inputs():
     assert sum(s.n_operations for s in known.segments) < sum(
         s.n_operations for s in lower_stages(stages, sim.data).segments
     )
+
+
+def test_phases_and_scopes_are_not_joined():
+    stages = [
+        segment("a", [X], [Y], apply_fn("exp"), phase="before"),
+        segment("b", [Y], [Z], apply_fn("neg")),
+        segment("c", [Z], [X], apply_fn("exp"), scope="world"),
+        segment("d", [X], [Y], apply_fn("exp")),
+    ]
+    assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
+
+
+def test_stages_of_other_ticks_are_not_joined():
+    first = guarded_segment("first", [], Y, lambda b: np.float32(1))
+    between = segment("between", [Y], [X], apply_fn("neg"))
+    second = guarded_segment("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
+    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (first, between, second))))
+    assert [op.name for op in joined.segments[0].block.operations].count("when") == 2

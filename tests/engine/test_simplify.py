@@ -89,3 +89,11 @@ def test_integers_fold_as_xla_computes_them(name, args, expected):
 )
 def test_conversions_fold_as_xla_computes_them(x, dtype, expected):
     assert simplify("convert_element_type", (F(x),), np.dtype(dtype), ()) == expected
+
+
+def test_angles_of_zero_are_exact():
+    expected = {"sin": 0.0, "cos": 1.0}
+    assert {name: simplify(name, (F(0),), np.dtype(F), ()) for name in expected} == expected
+    assert simplify("atan2", (F(0), F(2)), np.dtype(F), ()) == 0
+    assert simplify("atan2", (F(0), F(-2)), np.dtype(F), ()) is None
+    assert simplify("sin", (F(1),), np.dtype(F), ()) is None
