@@ -16,13 +16,11 @@ from crazysim.errors import require
 from crazysim.lab.live.browser_panel import BrowserPanel
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import PictureSource
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.access import LOOPBACK_ADDRESSES, Access, start_guarded_server
 from crazysim.media.browser_scene import BrowserScene
 from crazysim.media.web import FOV, import_viser, require_free_port
 from crazysim.media.worlds import world_indices
-from crazysim.scene.visual_geoms import visual_geoms
 
 MAX_WORLDS = 64
 """Largest number of worlds that are shown if ``worlds`` is None."""
@@ -91,12 +89,8 @@ class Browser(Viewer[Live]):
         if access.host not in LOOPBACK_ADDRESSES:
             log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
                         "watch and command the simulation", access.host, access.port)  # fmt: skip
-        sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), int(worlds[0]))
-        shapes = visual_geoms(sim.mj_model, sim.mj_data)
-        bodies = SceneBodies(sim, shapes)
-        self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind, self._trail)
-        self._picture = self._source.take_picture(live)
+        self._source = source = PictureSource(sim, worlds.tolist(), self._contacts, self._wind, self._trail)
+        self._picture = source.take_picture(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self._server = start_guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
@@ -104,7 +98,7 @@ class Browser(Viewer[Live]):
         drone_pos = np.asarray(sim.data.states.pos, float)[worlds]
         extent = float(np.nanmax(np.ptp(drone_pos, axis=1)[..., :2])) + 2 * WORLD_MARGIN
         spacing = extent if self._spacing is None else self._spacing
-        self._scene = BrowserScene(self._server, shapes, self._picture, spacing)
+        self._scene = BrowserScene(self._server, source.shapes, self._picture, spacing)
         camera = self._server.initial_camera
         size = max(np.ptp(self._scene.offsets[:, :2], axis=0).max() + extent, 2.0)
         camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
@@ -123,7 +117,7 @@ class Browser(Viewer[Live]):
         @scene.on_click()
         def _(event: Any) -> None:
             origins = event.ray_origin - self._scene.origin - self._scene.offsets
-            live.click_along(bodies, self._picture, origins, np.asarray(event.ray_direction, float))
+            live.click_along(source.bodies, self._picture, origins, np.asarray(event.ray_direction, float))
 
     def update(self, live: Live) -> None:
         if not self._server.get_clients():

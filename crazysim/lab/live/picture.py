@@ -19,6 +19,7 @@ from crazysim.media.picture import Focus, Picture, Spheres, light_spheres, setpo
 from crazysim.media.trail import choose_drone_colors
 from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
+from crazysim.scene.visual_geoms import VisualGeom, visual_geoms
 from crazysim.sim.sim import Sim
 
 WIND_SCALE = 0.1
@@ -34,17 +35,25 @@ CONTACT_COLOR, FOLLOWED_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25)
 class PictureSource:
     """Source of the pictures of one viewer."""
 
+    shapes: list[VisualGeom]
+    """Visible geoms of the scene."""
+    bodies: SceneBodies
+    """Bodies that can be picked and followed."""
+
     def __init__(
         self,
         sim: Sim,
-        bodies: SceneBodies,
         worlds: Sequence[int],
         contacts: bool = False,
         wind: bool = True,
         trail: float = 0.0,
         setpoints: bool = True,
     ):
-        self._sim, self._bodies, self._worlds = sim, bodies, np.asarray(worlds)
+        self._sim, self._worlds = sim, np.asarray(worlds)
+        sim.scene.compile_if_edited()
+        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
+        self.shapes = visual_geoms(sim.mj_model, sim.mj_data)
+        self.bodies = SceneBodies(sim, self.shapes)
         self._contacts, self._wind, self._setpoints = contacts, wind, setpoints
         self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air_velocity)))
         self._colors = choose_drone_colors(sim.n_drones, None)
@@ -102,14 +111,14 @@ class PictureSource:
         if live.followed is None:
             return None
         world, kind, index = live.followed
-        body = next((body for body in self._bodies.items if (body.kind, body.index) == (kind, index)), None)
+        body = next((body for body in self.bodies.items if (body.kind, body.index) == (kind, index)), None)
         if body is None or world not in self._worlds:
             return None
         k = self._worlds.tolist().index(world)
-        return Focus(k, pos[k, body.mocap], self._bodies.mark_radius(body.mocap), body.name)
+        return Focus(k, pos[k, body.mocap], self.bodies.mark_radius(body.mocap), body.name)
 
     def _extend_trail(self, time: float, pos: NDArray) -> NDArray:
-        pos, path = pos[:, self._bodies.trail_mocap_ids], self._trail
+        pos, path = pos[:, self.bodies.trail_mocap_ids], self._trail
         if not path.maxlen:
             return pos[None]
         if time < self._trail_time:  # the first picture, or a jump back in time

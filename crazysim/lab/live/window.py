@@ -26,13 +26,11 @@ from crazysim.core.settings import check_image_size
 from crazysim.errors import ConfigError, RenderError, require
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import PictureSource, list_quantities
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.picture import Picture
 from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import require_screen
-from crazysim.scene.visual_geoms import visual_geoms
 
 OPEN_TIMEOUT = 60.0
 """Longest time to wait for the window to open, s."""
@@ -95,10 +93,7 @@ class Window(Viewer[Live]):
         camera_id(sim.mj_model, self.camera)
         if self.plot and self.plot not in (names := [*live.quantities, *list_quantities(sim)]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(names)}, got {self.plot!r}")
-        sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
-        self._bodies = bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
-        self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind, self.trail, self.setpoints)
+        self._source = PictureSource(sim, worlds, self.contacts, self.wind, self.trail, self.setpoints)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self._process = process = subprocess.Popen(
             [sys.executable, "-m", "crazysim.lab.live.window_program"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -158,7 +153,7 @@ class Window(Viewer[Live]):
                 k, origin, direction = values
                 origins = np.full((len(self.worlds), 3), np.nan)
                 origins[k] = origin
-                live.click_along(self._bodies, self._shown_picture, origins, np.array(direction))
+                live.click_along(self._source.bodies, self._shown_picture, origins, np.array(direction))
         process.stdout.close()
         process.wait()
         live.keyboard.release_all()

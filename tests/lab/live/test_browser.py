@@ -16,7 +16,6 @@ from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Browser, Live, Pilot
 from crazysim.lab.live.picture import PictureSource, list_quantities, read_quantity
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.browser_scene import grid_offsets
 from crazysim.media.web import FOV
 from crazysim.plugins.vehicles import Cars
@@ -326,9 +325,7 @@ def test_a_picture_contains_all_that_viewers_draw():
     live.select(1, 0)
     live.quantities["double"] = lambda live: 2.0
     live.lights[1] = [[2.0, 0.5, 0.0], [0.0, 0.0, 0.0]]
-    sim.scene.compile_if_edited()
-    bodies = SceneBodies(sim)
-    source = PictureSource(sim, bodies, [1, 2], contacts=True, trail=0.1)
+    source = PictureSource(sim, [1, 2], contacts=True, trail=0.1)
     picture = source.take_picture(live, "states.pos")
     drone_pos = picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)]
     np.testing.assert_allclose(drone_pos[0, 0], [0.3, 0.2, 1.0], atol=1e-6)

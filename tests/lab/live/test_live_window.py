@@ -14,10 +14,8 @@ from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Live, Window
 from crazysim.lab.live.leds import Leds
 from crazysim.lab.live.picture import PictureSource
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.plugins.vehicles import Cars
 from crazysim.scene.scene_window import camera_ray
-from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.sim import Sim
 
 
@@ -160,16 +158,14 @@ def test_a_click_follows_the_body_below_it():
     """A click on a wheel follows its car; other worlds are not below the cursor."""
     sim = Sim(n_worlds=2, n_drones=2, control="state")
     sim.add(Cars(2))
-    sim.scene.compile_if_edited()
-    sim.sync(0)
     live, clicked = Live(sim), []
     live.on_click = lambda live, world, point: clicked.append((world, *point))
-    bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
-    picture = PictureSource(sim, bodies, [0, 1]).take_picture(live)
+    source = PictureSource(sim, [0, 1])
+    picture = source.take_picture(live)
     wheel = picture.pos[1, sim.mj_model.body("cars_wheel:7").mocapid.item()]
     for target, direction in ((wheel, [0, 0, -1.0]), ([7.0, 8.0, 0.0], [0.1, 0, -1.0]), (wheel, [0, 0, 1.0])):
         origins = np.stack([np.full(3, np.nan), np.asarray(target) - 2 * np.array(direction)])
-        live.click_along(bodies, picture, origins, np.array(direction))
+        live.click_along(source.bodies, picture, origins, np.array(direction))
     live._run_posted()
     assert live.followed == (1, "cars", 1)
     np.testing.assert_allclose(clicked, [(1, 7.0, 8.0, 0.0)])

@@ -15,7 +15,6 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live import Live, PolicyPilot
 from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.policy_pilot import ARRIVAL_DISTANCE, parse_point, read_points
-from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media import Flight
 
 POINTS = [[0.5, 0.0, 1.0], [0.5, 0.5, 1.4]]
@@ -72,7 +71,7 @@ def test_typed_lines_set_the_goal_and_wrong_ones_change_nothing(live_and_pilot, 
     assert len(refused) == 5
     assert "expected x y z, m, got 'home'" in refused[0]
     assert "within the arena of 'hover', x and y from -3 to 3 m, z from 0.02 to 3 m, got 4 0 1" in refused[2]
-    source = PictureSource(live.sim, SceneBodies(live.sim), [0, 1])
+    source = PictureSource(live.sim, [0, 1])
     np.testing.assert_array_equal(source.take_picture(live).spheres["setpoints"].pos, pilot.goals)
     live.selected = None
     pilot.listen(live, ["0 0 1"]).join()

@@ -78,7 +78,7 @@ def test_the_followed_body(sim):
 
 def test_trails_follow_bodies_and_restart_after_a_reset(sim, bodies):
     live, ball = Live(sim), bodies.find("ball", 0)
-    source, k = PictureSource(sim, bodies, [1], trail=0.2), bodies.trail_mocap_ids.tolist().index(ball.mocap)
+    source, k = PictureSource(sim, [1], trail=0.2), bodies.trail_mocap_ids.tolist().index(ball.mocap)
 
     def take_trail(step, x):
         live.step, objects = step, sim.data.objects
