@@ -21,7 +21,7 @@ from crazysim.errors import ConfigError, require
 from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
 from crazysim.lab.live.pace import LiveReport, Pace, Speed, protect_loop
-from crazysim.lab.live.process import Event, OnError, Process, RateLimit, steps_per_call
+from crazysim.lab.live.process import OnError, Process, RateLimit, steps_per_call
 from crazysim.lab.live.staging import StagedCommands, compile_step
 from crazysim.lab.live.viewer import Viewer
 from crazysim.lab.live.viewers import Viewers
@@ -84,7 +84,7 @@ class Live(Interaction, Closeable):
         self._history = History(positive_integer("n_snapshots", n_snapshots))
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
         self._processes: list[Process] = []
-        self._events: dict[int, list[Event]] = defaultdict(list)
+        self._events: dict[int, list[tuple[str, Callable[[], object]]]] = defaultdict(list)
         self._viewers = Viewers[Live](fps, self.stop)
         self._recorder: Recorder | None = None
         self._recording_path, self._recording_period, self._recording_start = Path("flight.journal"), 1, 0
@@ -188,7 +188,7 @@ class Live(Interaction, Closeable):
         """Call a function with the loop when the simulation reaches a time, s, and again after every reset."""
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
         require(step >= self.step, f"expected a time of {self.time:g} s or later, got {time!r}")
-        self._events[step].append(Event(step, partial(callback, self), name or getattr(callback, "__name__", "event")))
+        self._events[step].append((name or getattr(callback, "__name__", "event"), partial(callback, self)))
 
     def show(self, viewer: V) -> V:
         """Show the simulation in a viewer, and return the viewer; ``run`` ends when all viewers have been closed.
@@ -326,9 +326,9 @@ class Live(Interaction, Closeable):
             for process in self._processes:
                 if self.step % process.period == 0:
                     process.run(self.time)
-            for event in self._events.get(self.step, ()):
-                log.info("%s at %.2f s", event.name, self.time)
-                event.callback()
+            for name, callback in self._events.get(self.step, ()):
+                log.info("%s at %.2f s", name, self.time)
+                callback()
             self._commands.stage()
             self.sim.step(self.n_substeps)
         finally:

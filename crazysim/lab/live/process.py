@@ -1,4 +1,4 @@
-"""Processes and timed events of a live simulation: functions that its loop calls between steps."""
+"""Processes of a live simulation: functions that its loop calls between steps."""
 
 from __future__ import annotations
 
@@ -71,18 +71,6 @@ class Process:
         duration = time.perf_counter() - start_time
         if duration > self.longest_call:
             self.longest_call, self.longest_call_time = duration, now
-
-
-@dataclass(frozen=True)
-class Event:
-    """A function that is called when the simulation reaches a time."""
-
-    step: int
-    """Control step before which it is called."""
-    callback: Callable[[], object]
-    """The function."""
-    name: str
-    """Name in messages."""
 
 
 def steps_per_call(freq: float | None, control_freq: int, name: str) -> int:
