@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3234,
     "geometry": 940,
-    "lab": 15597,
+    "lab": 15589,
     "media": 1063,
     "plugins": 4874,
     "scene": 2571,
