@@ -91,11 +91,6 @@ class ModelRenderer:
         renderer.disable_depth_rendering()
         return depth if color is None else (color, depth)
 
-    @property
-    def has_window(self) -> bool:
-        """True while a window is open."""
-        return any(window.is_open for window in self._windows)
-
     def close(self) -> None:
         """Close the window and free the contexts."""
         _close_all(self._renderers, self._windows)

@@ -147,13 +147,6 @@ def controller_constants(controller: Any, drone: AirframeSource) -> tuple:
     )
 
 
-def traceable_pwm(
-    controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250"
-) -> Array:
-    """Return the result of ``compiled_pwm``, by a function that JAX can trace."""
-    return _flight_pwm(controller, mode, controller_constants(controller, drone), states, commands)
-
-
 def _flight_pwm(controller: Any, mode: str, constants: tuple, states: Any, commands: Any) -> Array:
     params, initial_memory, newton_per_pwm, thrust_curve = constants
     initial_memory = jax.tree.map(jnp.asarray, initial_memory)
