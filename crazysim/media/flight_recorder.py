@@ -72,9 +72,7 @@ class Recorder:
         return self._n_samples
 
     def add(self, time: float | None = None) -> None:
-        """Record the present poses.
-
-        In memory, a second sample at the same time replaces the first; in a file, it is left out.
+        """Record the present poses; a second sample at the same time is left out.
 
         Args:
             time: Time since the start of the recording, s; None for the time of the first recorded
@@ -86,11 +84,8 @@ class Recorder:
         sim, worlds = self._sim, self._worlds
         if time is None:
             time = self._clock.elapsed_at(float(sim.time[self._worlds[0], 0]))
-        if self._n_samples and self._last_time == time:
-            if self._journal is not None:
-                return
-            self._samples.pop()
-            self._n_samples -= 1
+        if self._last_time == time:
+            return
         states, state = sim.data.states, sim.data.controls.state
         sample = np.zeros((), self._dtype)
         sample["time"] = time

@@ -74,9 +74,9 @@ def test_a_recorder_with_a_path_writes_the_same_flight(tmp_path):
     command[..., 2], command[..., 12] = [[1, 2], [3, 4]], 1
     sim.state_control(command)
     for _ in range(4):
-        memory.add()
-        file.add()
-        file.add()  # at the same time
+        for recorder in (memory, file):
+            recorder.add()
+            recorder.add()  # at the same time
         sim.step(10)
     assert len(memory) == len(file) == 4
     file.close()
