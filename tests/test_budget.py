@@ -20,7 +20,7 @@ BUDGET = {
     "envs": 3234,
     "geometry": 940,
     "lab": 15587,
-    "media": 1063,
+    "media": 1060,
     "plugins": 4874,
     "scene": 2569,
     "sim": 914,
