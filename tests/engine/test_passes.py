@@ -105,12 +105,12 @@ def apply_fn(name):
     return lambda b, *args: [b.add(name, args, np.float32)]
 
 
-def guarded_segment(name, reads, write, fn):
+def guarded_segment(name, reads, write, fn, limit=0):
     b = Builder(stage=name)
     x, old, *rest = [b.input(np.float32) for _ in [X, write, *reads]]
     inner = Builder(b)
     block = inner.finish([fn(inner, *rest)])
-    mask = b.add("gt", (x, np.float32(0)), bool)
+    mask = b.add("gt", (x, np.float32(limit)), bool)
     new = b.add_many("when", (mask, old), (np.float32,), (), (block,))
     return Segment("drone", (name,), "each", b.finish(new), (X, write, *reads), (write,))
 
@@ -243,6 +243,16 @@ def test_phases_and_scopes_are_not_joined():
 
 
 def test_stages_of_other_ticks_are_not_joined():
+    """The third has the ticks of the first, which the second separates from it."""
+    first, second, third = (
+        guarded_segment(f"stage{i}", [SHARED], write, lambda b, x: b.add("sin", (x,), F32), limit)
+        for i, (write, limit) in enumerate([(Y, 0), (Z, 1), (Y, 0)])
+    )
+    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (first, second, third))))
+    assert [op.name for op in joined.segments[0].block.operations].count("when") == 3
+
+
+def test_a_changed_clock_gives_other_ticks():
     first = guarded_segment("first", [], Y, lambda b: np.float32(1))
     between = segment("between", [Y], [X], apply_fn("neg"))
     second = guarded_segment("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
