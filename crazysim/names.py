@@ -117,6 +117,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.evaluation": "evaluate",
         "crazysim.train.networks": "Network",
         "crazysim.train.runs": "run run_many",
+        "crazysim.train.search": "tune",
         "crazysim.train.show": "film plot_episode",
         "crazysim.train.training": "load_policy",
     },

@@ -59,6 +59,14 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--no-film", action="store_true", help="write no film")
     check_help = "fly the task without training and for ten iterations, say what is wrong with it, and write nothing"
     add("--check", action="store_true", help=check_help)
+    tune_help = (
+        "first search hyperparameters, or --tune rewards also factors of the terms of the reward, and train with the "
+        "best; print them, and write them as tune.json"
+    )
+    searches = ("hyperparameters", "rewards")
+    add("--tune", nargs="?", const=searches[0], choices=searches, help=tune_help)
+    tune_seconds_help = "time for the search, s; by default 60 on a GPU, 300 on a CPU"
+    add("--tune-seconds", type=size(60), metavar="SECONDS", help=tune_seconds_help)
 
     add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
     add("--worlds", type=number(), default=1000, help="number of initial states")
@@ -173,6 +181,8 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
         create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
         findings = check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
         return int(bool(findings))
+    if options.tune:
+        settings["config"] |= _tune(options, settings)
     if options.seeds is None and not options.sweep:
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
         return None
@@ -180,6 +190,26 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
     seeds = options.seeds or [options.seed or 0]
     run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
     return None
+
+
+def _tune(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, Any]:
+    from crazysim.train.config import TrainConfig
+    from crazysim.train.search import tune
+    from crazysim.train.training import require_no_run
+
+    require(not options.resume, "expected --tune or --resume, got both. A resumed run keeps its hyperparameters.")
+    config = TrainConfig.create(options.task, **{name: settings[name] for name in ("algorithm", "options", "config")})
+    require(config.algorithm == "ppo", f"expected --tune with PPO, got {config.algorithm}. Use --algorithm ppo.")
+    folder = options.out or Path("out") / config.title
+    require_no_run(folder)
+    return tune(
+        options.task,
+        folder,
+        search=options.tune,
+        seconds=options.tune_seconds,
+        options=settings["options"],
+        config=settings["config"],
+    )
 
 
 def _exit(*_: object) -> NoReturn:

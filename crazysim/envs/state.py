@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,9 @@ from crazysim.tables import read_numbers
 ENV_RECORD_NAME = "environment"
 """Key of the environment's record in the plugins of its data."""
 
+T = TypeVar("T")
+TERM_PREFIX = "reward "
+"""Prefix of the names of the terms of a reward, as in ``RewardTerms``."""
 PRIVILEGED = "privileged"
 """Name of the observation that only a critic may use; see ``PrivilegedObservation``."""
 
@@ -280,3 +284,8 @@ def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
         f"{np.shape(pos)}. Use (1, n_drones, 3) for the same goals in every world.",
     )
     return jnp.broadcast_to(jnp.asarray(goals, template.dtype), template.shape)
+
+
+def terms_of(values: Mapping[str, T]) -> dict[str, T]:
+    """Return the terms of a reward among metrics of ``evaluate``, or in ``info``, by the name of the term."""
+    return {name.removeprefix(TERM_PREFIX): x for name, x in values.items() if name.startswith(TERM_PREFIX)}

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from crazysim.train.evaluation import evaluate
     from crazysim.train.networks import Network
     from crazysim.train.runs import run, run_many
+    from crazysim.train.search import tune
     from crazysim.train.show import film, plot_episode
     from crazysim.train.training import load_policy
 
@@ -25,6 +26,7 @@ __all__ = [
     "plot_episode",
     "run",
     "run_many",
+    "tune",
 ]
 
 __getattr__ = lazy_getattr(__name__)

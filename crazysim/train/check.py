@@ -11,12 +11,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.envs.env import Env
-from crazysim.envs.state import Obs
+from crazysim.envs.state import Obs, terms_of
 from crazysim.envs.task import Task
-from crazysim.errors import ConfigError, expect
 from crazysim.train.config import TrainConfig
-from crazysim.train.evaluation import describe_flight, evaluate, held_out_key, terms_of
+from crazysim.train.evaluation import describe_flight, evaluate
+from crazysim.train.ppo import check_demonstration
 from crazysim.train.runs import run
 from crazysim.train.show import read_curve
 
@@ -48,7 +47,7 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
     }
     if demonstrate := getattr(env.task, "demonstrate", None):
         flights[DEMONSTRATION] = demonstrate
-        _check_demonstration(env, demonstrate)
+        check_demonstration(env)
     metrics = {name: evaluate(env, policy) for name, policy in flights.items()}
     for name, flown in metrics.items():
         log(f"{name}: {describe_flight(flown, env.task.unit)}")
@@ -70,18 +69,6 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
     if not findings:
         log("nothing was found")
     return findings
-
-
-def _check_demonstration(env: Env, demonstrate: Callable[[Obs], Array]) -> None:
-    shape = (N_WORLDS, env.sim.n_drones, env.actions.size)
-    try:
-        action = jax.eval_shape(demonstrate, jax.eval_shape(env.reset, held_out_key()).obs)
-    except Exception as error:
-        raise ConfigError(
-            f"expected {type(env.task).__name__}.demonstrate(obs) as a function from observations to actions {shape}, "
-            f"got {type(error).__name__}: {str(error)[:300]}. Make it a @staticmethod, or use demonstrate(self, obs)."
-        ) from error
-    expect(getattr(action, "shape", None) == shape, f"actions {shape} of demonstrate(obs)", action)
 
 
 def _noise(obs: Obs, n_actions: int) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazysim.core.settings import positive_integer
+from crazysim.core.settings import find_device, positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import Env
 from crazysim.envs.references import absolute_reference, is_reference, reference_of, split_reference
@@ -26,14 +26,20 @@ ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 """Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
 
 
+WORLDS = {"cpu": 2048, "gpu": 4096}
+"""Default number of parallel worlds, by platform."""
+DEMONSTRATIONS = 80
+"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it."""
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Algorithm and hyperparameters that are known to solve a task."""
 
     algorithm: str = "ppo"
     """Name of the algorithm, a key of ``ALGORITHMS``."""
-    n_worlds: int = 1024
-    """Number of parallel worlds."""
+    n_worlds: int | None = None
+    """Number of parallel worlds; None for ``WORLDS`` of the device."""
     config: dict[str, Any] = field(default_factory=dict)
     """Hyperparameters that differ from the defaults of the algorithm."""
     practice: dict[str, Any] = field(default_factory=dict)
@@ -46,27 +52,35 @@ class Recipe:
     """Recipe of the teacher that ``run`` trains first; None if the recipe needs none."""
 
 
-_LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
+_SHORT_ROLLOUTS = {"n_steps": 32, "minibatches": 8, "discount": 0.98, "gae_lambda": 0.95, "entropy": 0.0}
+"""Hyperparameters of tasks in which rewards follow their actions at once."""
+_LONG_ROLLOUTS = {"hidden": (128, 128), "gae_lambda": 0.95, "entropy": 0.0}
 """Hyperparameters of tasks in which rewards follow seconds after the actions that earn them."""
 _CAMERA_POLICY = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
 """Hyperparameters with which PPO learns to fly from camera images."""
 
 RECIPES: dict[str, Recipe] = {
-    "hover": Recipe(config={"iterations": 80, "minibatches": 16, "learning_rate": 2e-3}),
-    "reach_vel": Recipe(config={"iterations": 100}),
-    "recover": Recipe(config={"iterations": 150, "minibatches": 16}),
+    "hover": Recipe(
+        n_worlds=1024, config={**_SHORT_ROLLOUTS, "iterations": 80, "minibatches": 16, "learning_rate": 2e-3}
+    ),
+    "reach_vel": Recipe(n_worlds=1024, config={**_SHORT_ROLLOUTS, "iterations": 100}),
+    "recover": Recipe(n_worlds=1024, config={**_SHORT_ROLLOUTS, "iterations": 150, "minibatches": 16}),
     "race": Recipe(
         n_worlds=2048,
-        config={"iterations": 150, "n_steps": 64, "minibatches": 16, "entropy": 0.01, "init_std": 0.7},
+        config={
+            "iterations": 150,
+            "minibatches": 16,
+            "discount": 0.98,
+            "gae_lambda": 0.95,
+            "init_std": 0.7,
+        },
         practice={"practice": True},
     ),
     "multi_race": Recipe(
         n_worlds=2048,
         config={
             "iterations": 250,
-            "n_steps": 64,
-            "minibatches": 32,
-            "discount": 0.99,
+            "gae_lambda": 0.95,
             "entropy": 0.003,
             "init_std": 0.7,
         },
@@ -82,10 +96,9 @@ RECIPES: dict[str, Recipe] = {
             n_worlds=2048,
             config={
                 "iterations": 300,
-                "n_steps": 64,
                 "minibatches": 16,
                 "discount": 0.95,
-                "entropy": 0.01,
+                "gae_lambda": 0.95,
                 "init_std": 0.7,
             },
             options={"gates_observed": True, "camera": ()},
@@ -110,10 +123,10 @@ RECIPES: dict[str, Recipe] = {
             "critic": "all_drones",
         },
     ),
-    "chase": Recipe(n_worlds=2048, config={"iterations": 300, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
+    "chase": Recipe(n_worlds=2048, config={"minibatches": 16, "gae_lambda": 0.95, "entropy": 0.0}),
     "land": Recipe(
         n_worlds=2048,
-        config={"iterations": 200, "n_steps": 64, "minibatches": 32, "discount": 0.99, "entropy": 0.003},
+        config={"iterations": 200, "gae_lambda": 0.95, "entropy": 0.003},
     ),
     "land_on_marker": Recipe(n_worlds=4096, config={**_CAMERA_POLICY, "iterations": 150}),
     "follow_car": Recipe(n_worlds=2048, config={**_CAMERA_POLICY, "iterations": 100}),
@@ -153,6 +166,8 @@ def _own_recipe(task: str) -> Recipe:
         recipe = DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
     fields = {f.name for f in dataclasses.fields(Recipe)} - {"config"}
     config = recipe.config | {name: value for name, value in cls.recipe.items() if name not in fields}
+    if recipe.algorithm == "ppo" and hasattr(cls, "demonstrate"):
+        config = {"demonstrations": DEMONSTRATIONS} | config
     given = {name: value for name, value in cls.recipe.items() if name in fields}
     return dataclasses.replace(recipe, **given, config=config)
 
@@ -262,7 +277,6 @@ class TrainConfig:
             seed = resumed.seed if seed is None else seed
             if algorithm in (None, resumed.algorithm):
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
-        n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
         for name, value in (("options", options), ("config", config)):
             expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
@@ -271,6 +285,9 @@ class TrainConfig:
         if devices is not None:
             options["device"] = evaluation_device(options.get("device"), devices)
         seed = 0 if seed is None else seed
+        n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
+        if n_worlds is None:
+            n_worlds = WORLDS["cpu" if find_device(options.get("device", "cpu")).platform == "cpu" else "gpu"]
         return TrainConfig(task, recipe.algorithm, seed, n_worlds, options, config, network=network, devices=devices)
 
     @property

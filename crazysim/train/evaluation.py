@@ -16,7 +16,7 @@ from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.rollout import Transition, rollout
-from crazysim.envs.state import Obs
+from crazysim.envs.state import TERM_PREFIX, Obs, terms_of
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policies, Policy
@@ -24,8 +24,6 @@ from crazysim.train.networks import Policies, Policy
 EVALUATION_SEED = 0x5EED
 """Seed of the held-out initial states. Training keys are made with ``fold_in``, so they differ from the key of this
 seed."""
-TERM_PREFIX = "reward "
-"""Prefix of the names of the terms of a reward, as in ``RewardTerms``."""
 
 
 def held_out_key() -> Array:
@@ -118,9 +116,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
         "nonfinite": jnp.any(history["nonfinite"] & ~was_over, axis=0),
         "reward": jnp.where(is_flying, history["reward"], 0.0).sum(axis=0),
         "terms": {
-            name[len(TERM_PREFIX) :]: split_blocks(jnp.where(is_flying, x, 0.0)).mean(axis=(2, 3))
-            for name, x in history.items()
-            if name.startswith(TERM_PREFIX)
+            name: split_blocks(jnp.where(is_flying, x, 0.0)).mean(axis=(2, 3)) for name, x in terms_of(history).items()
         },
     }
     succeeded = history["succeeded"]
@@ -196,11 +192,6 @@ def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dic
         "reward": float(flight["reward"][worlds].mean()),
         **{f"{TERM_PREFIX}{name}": float(x[:, block].sum()) for name, x in flight["terms"].items()},
     }
-
-
-def terms_of(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Return the contributions of the terms to the mean return, by the name of the term."""
-    return {name.removeprefix(TERM_PREFIX): x for name, x in metrics.items() if name.startswith(TERM_PREFIX)}
 
 
 def describe_flight(metrics: Mapping[str, float], unit: str) -> str:

@@ -21,7 +21,7 @@ WEIGHT_NAMES = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""
 LIMIT_NAMES = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
-COUNT_NAMES = ("memory",)
+COUNT_NAMES = ("memory", "demonstrations")
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 MAX_COUNT, MAX_SIZE = 2**26, 2**14
 """Largest whole number, and largest size of a layer or a memory."""
@@ -40,7 +40,9 @@ def check_hyperparameters(config: Any) -> None:
     """Check the fields of a frozen ``Config``, and convert them to Python numbers and tuples."""
     for field in dataclasses.fields(config):
         value, default = getattr(config, field.name), field.default
-        if isinstance(default, tuple):
+        if field.name == "rewards":
+            value = _check_factors(value)
+        elif isinstance(default, tuple):
             value = _check_sizes(field.name, value)
         elif field.name in CHOICES_BY_NAME:
             value = _check_choice(field.name, value, CHOICES_BY_NAME[field.name])
@@ -63,6 +65,17 @@ def _check_text(name: str, value: object) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"expected {name} as a text, got {value!r}. Use for example 'out/hover'.")
     return value
+
+
+def _check_factors(value: Any) -> tuple[tuple[str, float], ...]:
+    try:
+        factors = sorted((str(name), float(factor)) for name, factor in dict(value).items())
+        require(all(map(math.isfinite, dict(factors).values())), "", ValueError)
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f'expected rewards as finite factors by the name of a term, got {value!r}. Use for example {{"near": 0.3}}.'
+        ) from None
+    return tuple(factors)
 
 
 def _check_sizes(name: str, value: object) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ one seed; ``iterate`` applies them to all seeds of a program.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,8 +18,10 @@ from jax import Array
 
 from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, Obs, flatten
+from crazysim.envs.state import EnvState, Obs, flatten, terms_of
 from crazysim.envs.statistics import RunningStats
+from crazysim.envs.task import sum_terms
+from crazysim.errors import ConfigError, expect, require
 from crazysim.train.convolution import images_of
 from crazysim.train.critic import critic_input, critic_obs, policy_obs, rescale_value, return_std
 from crazysim.train.hyperparameters import check_hyperparameters
@@ -28,18 +30,21 @@ from crazysim.train.networks import ApplyLayers, Network, Policy, Weights, choos
 from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
 from crazysim.train.seeds import Step, for_each_seed, rollout_seeds, split_blocks, split_keys, stack_configs
 
+LEAST_STD = 0.1
+"""Standard deviation of actions, in [-1, 1], around a demonstration that is learnt exactly."""
+
 
 @dataclass(frozen=True)
 class Config:
     """Hyperparameters of PPO."""
 
-    iterations: int = 200
+    iterations: int = 300
     """Number of iterations, each a rollout and the updates on its samples."""
-    n_steps: int = 32
+    n_steps: int = 64
     """Environment steps per world in one rollout."""
     epochs: int = 4
     """Passes over the samples of a rollout."""
-    minibatches: int = 8
+    minibatches: int = 32
     """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of policy and value function; not used with a custom network."""
@@ -54,13 +59,13 @@ class Config:
     ``all_drones_privileged``, also the true states and parameters of all drones of the world."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
-    discount: float = 0.98
+    discount: float = 0.99
     """Discount factor per environment step."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.98
     """Lambda of generalised advantage estimation."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
-    entropy: float = 0.0
+    entropy: float = 0.01
     """Coefficient of the entropy bonus."""
     value_weight: float = 0.5
     """Coefficient of the value loss."""
@@ -68,6 +73,11 @@ class Config:
     """Largest global norm of a gradient; larger ones are scaled down to it."""
     init_std: float = 0.5
     """Initial standard deviation of the actions."""
+    demonstrations: int = 0
+    """Iterations at the start in which the policy learns the actions of the task's ``demonstrate`` where it flies
+    itself, and the value function its returns."""
+    rewards: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
+    """Factors of terms of the reward in training, such as ``{"progress": 3.0}``; other terms stay as they are."""
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -150,6 +160,8 @@ class Sample(PyTree):
     """Reward, plus the discounted value of the final state where the episode was truncated."""
     done: Array
     """True where the episode ended with the step."""
+    shown: Array | None = None
+    """Actions of the demonstration; None without demonstrations."""
 
 
 def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | None = None) -> Learner:
@@ -165,8 +177,12 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     """
     config = configs[0]
     check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
+    if config.demonstrations:
+        check_demonstration(env)
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
     state, hidden = env.reset(k_env), config.hidden if network is None else ()
+    terms, names = terms_of(state.info), dict(config.rewards)
+    expect(names.keys() <= terms.keys(), f"factors of terms of the reward among {', '.join(terms)}", list(names))
     obs = policy_obs(state.obs, config.critic)
     images = images_of(env, obs) if config.convolution else ()
     network = choose_network(config.memory, network, config.convolution, images)
@@ -195,44 +211,79 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite; ``ratio_off`` is the
     mean distance of the probability ratio from 1; ``value_error`` is the mean value loss.
     """
+    return advance(learner, env, stack_configs(configs))
+
+
+def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
+    """Return the results of ``iterate``, without compiling it, with the hyperparameters of ``stack_configs``."""
     key, k_fly, k_learn = split_keys(learner.agents.key, 3)
-    agents, config, n_steps = learner.agents.replace(key=key), stack_configs(configs), configs[0].n_steps
+    agents, n_seeds = learner.agents.replace(key=key), len(learner.agents.key)
     initial_memory = (agents.network.make_memory(*learner.env.reward.shape),) * 2
+    show = env.task.demonstrate if config.demonstrations else None
     state, memory, records = rollout_seeds(
-        env, learner.env, act, record, (agents, config), k_fly, n_steps, initial_memory, learner.memory
+        env,
+        learner.env,
+        partial(act, show=show),
+        record,
+        (agents, config),
+        k_fly,
+        config.n_steps,
+        initial_memory,
+        learner.memory,
     )
-    blocks = split_blocks((learner.memory, state.obs, memory[1]), len(configs))
-    axes = (0, 0, 1, 0, 0, 0, 0)
-    agents, metrics = for_each_seed(learn, agents, config, records, *blocks, k_learn, axes=axes, mesh=env.sim.mesh)
+    blocks = split_blocks((learner.memory, state.obs, memory[1]), n_seeds)
+    axes = (0, 0, 1, 0, 0, 0, 0, 0)
+    imitates = jnp.broadcast_to(learner.iteration < config.demonstrations, n_seeds)
+    agents, metrics = for_each_seed(
+        learn, agents, config, records, *blocks, k_learn, imitates, axes=axes, mesh=env.sim.mesh
+    )
     return Learner(agents, state, memory, learner.iteration + 1), metrics
 
 
-def act(agent: Agent, config: Config, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+def act(
+    agent: Agent,
+    config: Config,
+    obs: Obs,
+    memory: Any,
+    key: Array,
+    show: Callable[[Obs], Array] | None = None,
+) -> tuple[Array, Any, Any]:
     """Draw an action, and return it with the memories of policy and critic after the step."""
     raw_obs, x = agent.observe(obs, config)
     output, policy_memory = forward(agent.network, agent.policy, x[..., : agent.n_obs], memory[0], agent.apply_layers)
     value, value_memory = agent.estimate_value(x, memory[1], config)
     mean = jnp.tanh(output)
     action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
-    extras = raw_obs, x, action, log_prob(mean, agent.log_std, action), value, value_memory
+    shown = None if show is None else jnp.clip(show(policy_obs(obs, config.critic)), -1.0, 1.0).astype(mean.dtype)
+    extras = raw_obs, x, action, log_prob(mean, agent.log_std, action), value, value_memory, shown
     return action, (policy_memory, value_memory), extras
 
 
 def record(agent: Agent, config: Config, step: Step, extras: Any) -> tuple[Sample, Array, dict[str, Array]]:
     """Return the sample of a step, its observations before normalisation, and what metrics are made of."""
-    raw_obs, obs, action, action_log_prob, value, memory = extras
+    raw_obs, obs, action, action_log_prob, value, memory, shown = extras
     # An episode that was cut off would have gone on: the critic estimates what it would have got.
     final_value, _ = agent.estimate_value(agent.observe(step.final_obs, config)[1], memory, config)
     is_cut_off = (step.truncated & ~step.terminated)[:, None]
-    reward = step.reward + config.discount * jnp.where(is_cut_off, final_value, 0.0)
+    factors: Any = config.rewards
+    scaled = {name: x * factors[name] if name in factors else x for name, x in step.terms.items()}
+    reward = sum_terms(scaled) if factors else step.reward
+    reward = reward + config.discount * jnp.where(is_cut_off, final_value, 0.0)
     done = jnp.broadcast_to(step.done[:, None], reward.shape)
     # Means would make the devices communicate in each step.
     outcome = {"reward": step.reward, "terminated": step.terminated, "error": step.error}
-    return Sample(obs, action, action_log_prob, value, reward, done), raw_obs, outcome
+    return Sample(obs, action, action_log_prob, value, reward, done, shown), raw_obs, outcome
 
 
 def learn(
-    agent: Agent, config: Config, records: Any, memory: Any, last_obs: Obs, last_memory: Any, key: Array
+    agent: Agent,
+    config: Config,
+    records: Any,
+    memory: Any,
+    last_obs: Obs,
+    last_memory: Any,
+    key: Array,
+    imitates: Array,
 ) -> tuple[Agent, dict[str, Array]]:
     """Update the agent with the records of its rollout, and return it with the metrics of the iteration.
 
@@ -245,7 +296,7 @@ def learn(
     targets = (targets - returns.mean) / return_std(returns)
     parameters = (agent.policy, agent.log_std, rescale_value(agent.value, agent.returns, returns))
     data = samples, advantages, targets, jax.tree.map(lambda x: x[None], memory)
-    loss = partial(compute_loss, agent, config)
+    loss = partial(compute_loss, agent, config, imitates)
     parameters, optimizer, losses = run_epochs(loss, parameters, agent.optimizer, data, config, key)
     stats = agent.stats.update(raw_obs)
     metrics = losses | {
@@ -277,7 +328,9 @@ def estimate_advantages(samples: Sample, last_value: Array, config: Config) -> t
     return advantages, advantages + samples.value
 
 
-def compute_loss(agent: Agent, config: Config, parameters: Any, minibatch: Any) -> tuple[Array, dict[str, Array]]:
+def compute_loss(
+    agent: Agent, config: Config, imitates: Array, parameters: Any, minibatch: Any
+) -> tuple[Array, dict[str, Array]]:
     """Compute the loss of policy and value function on a minibatch: clipped objective, value error and entropy."""
     policy, log_std, value = parameters
     sample, advantage, target, memory = minibatch
@@ -288,9 +341,31 @@ def compute_loss(agent: Agent, config: Config, parameters: Any, minibatch: Any) 
     ratio = jnp.exp(log_prob(mean, log_std, sample.action) - sample.log_prob)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
     objective = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - config.clip, 1 + config.clip) * advantage).mean()
+    if sample.shown is not None:
+        # Likelihood of the demonstrated actions with some noise, so that exploration does not end.
+        square = jnp.square(sample.shown - mean) + LEAST_STD**2
+        likelihood = -(0.5 * square / jnp.exp(2 * log_std) + log_std).sum(axis=-1).mean()
+        objective = jnp.where(imitates, likelihood, objective)
     value_loss = 0.5 * jnp.square(values - target).mean()
     total_loss = -objective + config.value_weight * value_loss - config.entropy * log_std.sum()
     return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
+
+
+def check_demonstration(env: Env) -> None:
+    """Check that the task of an environment shows an action for each observation."""
+    name, shape = type(env.task).__name__, (env.sim.n_worlds, env.sim.n_drones, env.actions.size)
+    require(
+        hasattr(env.task, "demonstrate"),
+        f"expected a task with demonstrations, got {name}. Define demonstrate(obs), or use demonstrations=0.",
+    )
+    try:
+        action = jax.eval_shape(env.task.demonstrate, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    except Exception as error:
+        raise ConfigError(
+            f"expected {name}.demonstrate(obs) as a function from observations to actions {shape}, got "
+            f"{type(error).__name__}: {str(error)[:300]}. Make it a @staticmethod, or use demonstrate(self, obs)."
+        ) from error
+    expect(getattr(action, "shape", None) == shape, f"actions {shape} of demonstrate(obs)", action)
 
 
 def log_prob(mean: Array, log_std: Array, action: Array) -> Array:

@@ -16,7 +16,7 @@ from crazysim.engine.pytree import PyTree, float_dtype, static
 from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.rollout import Transition, rollout
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.state import EnvState, Obs, terms_of
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
@@ -26,7 +26,7 @@ class SeedConfig(PyTree):
     """Hyperparameters of one seed, read like those of its ``Config``, or of all seeds."""
 
     values: dict[str, Any]
-    """The ``SWEEPABLE`` ones by name: () each, or (n_seeds,) each."""
+    """The ``SWEEPABLE`` ones, and factors of rewards, by name: () each, or (n_seeds,) each."""
     common: Any = static()
     """``Config`` with the others, which are the same for all seeds."""
 
@@ -43,7 +43,11 @@ def stack_configs(configs: Sequence[T]) -> T:
     The values are host arrays, so that those of a single seed are scalar constants of the compiled program.
     """
     names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
-    values = {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
+    values: dict[str, Any] = {
+        name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names
+    }
+    if factors := [dict(config.rewards) for config in configs if getattr(config, "rewards", ())]:
+        values["rewards"] = {name: np.array([x[name] for x in factors], float_dtype()) for name in factors[0]}
     return cast(T, SeedConfig(values, configs[0]))
 
 
@@ -110,6 +114,8 @@ class Step(PyTree):
     """True where the episode reached its time limit. (n_worlds,)"""
     error: Array
     """Errors of the task. (n_worlds, n_drones)"""
+    terms: dict[str, Array]
+    """Terms of the reward by name, if the environment has ``RewardTerms``. (n_worlds, n_drones) each"""
     final_obs: Obs
     """Observations at the end of the step, before a new episode begins. (n_worlds, n_drones, k) each"""
 
@@ -156,7 +162,8 @@ def rollout_seeds(
         return join_blocks(action), join_blocks(memory), extras
 
     def keep(x: Transition) -> Any:
-        step = Step(x.reward, x.terminated, x.truncated, x.state.info["error"], x.final_obs)
+        info = x.state.info
+        step = Step(x.reward, x.terminated, x.truncated, info["error"], terms_of(info), x.final_obs)
         return each(record, *seeds, split(step), x.extras)
 
     return rollout(env, state, policy, keys, n_steps, keep, initial_memory, memory)

@@ -15,14 +15,14 @@ from jax import Array
 from crazysim.envs.env import Env
 from crazysim.envs.phases import select_states
 from crazysim.envs.random import check_key
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.state import EnvState, Obs, terms_of
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points, draw_text
 from crazysim.storage import MAX_TEXT_BYTES, as_path, open_file, wrap_read_errors, write_figure
-from crazysim.train.evaluation import TERM_PREFIX, act, as_tree, fly_episodes, held_out_key, initial_memory
+from crazysim.train.evaluation import act, as_tree, fly_episodes, held_out_key, initial_memory
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
@@ -60,8 +60,8 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path, unit: str)
     _use_log_scale(axes[2])
     first_curve = next(iter(curves.values()))
     steps = np.array([point["env_steps"] for point in first_curve]) / 1e6
-    for name in (name for name in first_curve[-1] if name.startswith(TERM_PREFIX)):
-        axes[3].plot(steps, [point[name] for point in first_curve], label=name.removeprefix(TERM_PREFIX))
+    for name in terms_of(first_curve[-1]):
+        axes[3].plot(steps, [terms_of(point)[name] for point in first_curve], label=name)
     axes[3].plot(steps, [point["reward"] for point in first_curve], "k--", label="sum")
     axes[3].legend(fontsize="small")
     steps_label = "environment steps, millions"
@@ -113,6 +113,24 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path, uni
     axes[0].set_ylim(SUCCESS_LIMITS)
     axes[0].legend(fontsize="small")
     axes[0].set_title("median, quartiles and extremes", fontsize=9)
+    _save_figure(figure, path)
+
+
+def plot_search(values: dict[str, list[float]], success: list[float], path: Path) -> None:
+    """Plot the success of all candidates of a search, %, over each of their settings.
+
+    Args:
+        values: Value of each candidate, by the name of the setting.
+        success: Success of each candidate, %.
+        path: Image to write, such as a ``.png``.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    figure, axes = _make_figure(len(values))
+    for axis, (name, x) in zip(axes, values.items(), strict=True):
+        axis.scatter(x, success, s=12)
+        axis.set(xlabel=name, ylabel="success, %", ylim=SUCCESS_LIMITS)
     _save_figure(figure, path)
 
 
@@ -180,7 +198,13 @@ def _make_figure(n: int) -> Any:
         import matplotlib.pyplot as plt
     except ImportError as error:
         raise ImportError(not_installed("plots need", "matplotlib", "train")) from error
-    figure, axes = plt.subplots(1, n, figsize=(4 * n, 3.5), constrained_layout=True)
+    n_rows = -(-n // 5)
+    n_columns = -(-n // n_rows)
+    size = (4 * n_columns, 3.5 * n_rows)
+    figure, grid = plt.subplots(n_rows, n_columns, figsize=size, constrained_layout=True, squeeze=False)
+    for axis in grid.flat[n:]:
+        axis.remove()
+    axes = grid.flatten()[:n]
     for axis in axes:
         axis.grid(alpha=0.3)
     return figure, axes

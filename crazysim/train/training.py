@@ -31,7 +31,7 @@ from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
-from crazysim.envs.wrappers import AutoReset, PrivilegedObservation
+from crazysim.envs.wrappers import AutoReset, PrivilegedObservation, RewardTerms
 from crazysim.errors import ConfigError, DivergedError, require, require_callable
 from crazysim.progress import progress_bar
 from crazysim.storage import MAX_TEXT_BYTES, as_path, make_folder, read_text, write_file
@@ -226,7 +226,7 @@ class _Run:
         """Compile iteration and evaluation, and make or load the learner and the kept policies."""
         n_trainings, sim = len(self.trainings), self.env.sim
         algorithm, network = ALGORITHMS[self.config.algorithm], self.config.network
-        arguments = self._wrapped_env(), self.hyperparameters
+        arguments = wrap_env(self.env, self.hyperparameters[0]), self.hyperparameters
         seed_keys = [jax.random.key(training.config.seed) for training in self.trainings]
         keys = jax.jit(lambda keys: jnp.stack([jax.random.fold_in(key, 1) for key in keys]))(seed_keys)
         init_fn = algorithm.init if network is None else partial(algorithm.init, network=network)
@@ -272,14 +272,6 @@ class _Run:
             training.kept_policy = policy
         self.metrics: dict[str, Array] = {}
         self.saved_iteration, self.save_time = int(self.learner.iteration), time.perf_counter()
-
-    def _wrapped_env(self) -> Env:
-        if self.config.algorithm == "apg":
-            return self.env
-        if self.config.algorithm == "dagger":
-            return AutoReset(dagger.wrap_with_teacher(self.env, self.hyperparameters[0]))
-        is_privileged = self.config.config["critic"] in PRIVILEGED_CRITICS
-        return AutoReset(PrivilegedObservation(self.env) if is_privileged else self.env)
 
     @property
     def seconds(self) -> float:
@@ -373,6 +365,10 @@ class _Run:
             f"{self.steps_per_iteration:,} steps in {repetition}{config.n_worlds:,} worlds, {devices}"
             f"{sim.control.value} commands, {self.engine}" + (f"; continues after iteration {n_done}" if n_done else "")
         )
+        if (n_shown := self.config.config.get("demonstrations", 0)) > n_done:
+            self.log(
+                f"the first {n_shown} iterations learn from demonstrate(obs); leave out: --config demonstrations=0"
+            )
         if self.stored_hash != self.code_hash:
             self.log("the file of the task has changed since the checkpoint was written; it is used as it is now")
         if n_done >= self.n_iterations:
@@ -403,6 +399,17 @@ class _Run:
             policy = jax.device_put(training.kept_policy, self.eval_env.sim.device)
             results[training.name] = TrainResult(training.folder, point, policy, self.eval_env)
         return results
+
+
+def wrap_env(env: Env, config: Any) -> Env:
+    """Return the training environment of an algorithm with the wrappers that its ``Config`` needs."""
+    if isinstance(config, apg.Config):
+        return env
+    if isinstance(config, dagger.Config):
+        return AutoReset(dagger.wrap_with_teacher(env, config))
+    if config.critic in PRIVILEGED_CRITICS:
+        env = PrivilegedObservation(env)
+    return AutoReset(RewardTerms(env) if config.rewards else env)
 
 
 def require_no_run(folder: Path) -> None:

@@ -286,7 +286,7 @@ def test_a_custom_network_is_trained_saved_and_loaded(tmp_path):
     obs, memory = jax.jit(result.env.reset)(jax.random.key(0)).obs, policy.initial_memory(8, 1)
     np.testing.assert_array_equal(policy.act(obs, memory)[0], result.policy.act(obs, memory)[0])
     assert evaluate(result.env, policy)["nonfinite"] == 0
-    init = jax.jit(lambda key: ppo.init(AutoReset(result.env), (ppo.Config(),), key[None], network))
+    init = jax.jit(lambda key: ppo.init(AutoReset(result.env), (ppo.Config(minibatches=2),), key[None], network))
     start = take_seed(init(jax.random.key(0)).as_policy(), 0)
     changed = jax.tree.map(lambda x, y: bool(np.any(x != y)), start.body, policy.body)
     assert all(jax.tree.leaves(changed)), "all weights are trained"
