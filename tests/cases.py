@@ -97,6 +97,12 @@ def with_states(data, **changes):
     return data.replace(states=states.replace(**{k: broadcast_like(v, getattr(states, k)) for k, v in changes.items()}))
 
 
+def with_record(plugin, data, **changes):
+    """Return the data with some fields of a plugin's record replaced; values are broadcast and cast."""
+    record = plugin.read(data)
+    return plugin.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
+
+
 def broadcast_like(value, template):
     """Return a value as an array of a template's shape and type; NumPy arrays are broadcast without a compiled call."""
     if isinstance(value, jax.Array):

@@ -9,6 +9,7 @@ from crazysim.control import state2attitude
 from crazysim.drones import load_airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted, load_fn_params, load_params, supported_dynamics
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.sim.sim import rotor_vel_limits
 
 SHAPES = {
     "first_principles": {
@@ -52,3 +53,10 @@ def test_law_09_wrong_names_are_refused():
         load_control_params("pid", "cf2x_L250")
     with pytest.raises(ConfigError, match="shared by all fitted models"):
         load_fn_params(fitted.dynamics, "cf2x_L250")
+
+
+def test_limits_of_the_rotors():
+    low, high = rotor_vel_limits("first_principles", "cf2x_L250")
+    k0, k1, k2 = load_params("first_principles", "cf2x_L250")["rpm2thrust"]
+    np.testing.assert_allclose([k0 + k1 * w + k2 * w**2 for w in (low, high)], [0.012817578393, 0.12], rtol=1e-5)
+    np.testing.assert_allclose(rotor_vel_limits("so_rpy", "cf2x_L250"), [4 * 0.012817578393, 0.48], rtol=1e-9)

@@ -327,3 +327,20 @@ def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings
     with announce_if_slow("compiling what lasts", "5 s", delay=0.0):
         assert shown.wait(60), "the notice comes while the work is done"
     assert capsys.readouterr().err.startswith("compiling what lasts: 5 s on two cores")
+
+
+def test_a_command_prints_its_cache_once_and_keeps_the_cache_of_jax(settings, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
+    enable_for_command()
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert str(tmp_path / "kept") in printed
+    assert "1 GB" in printed
+    jax.config.update("jax_compilation_cache_dir", None)
+    enable_for_command()
+    kept = str(default_folder())
+    assert jax.config.jax_compilation_cache_dir == kept
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "other"))
+    enable_for_command()
+    assert jax.config.jax_compilation_cache_dir == kept
+    assert capsys.readouterr().err == ""

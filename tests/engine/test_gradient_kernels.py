@@ -267,3 +267,10 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
     n_states = interval + max(-(-n_steps // interval), 1)
     assert memory.shape == (blocks, n_states * 24 * kernel.threads)
     assert memory.size * 4 <= cuda.MAX_GRADIENT_MEMORY_BYTES
+
+
+@pytest.mark.long("compiles tangents in two engines")
+@needs_compiler
+def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
+    ((fast, *_), (plain, *_)), point = make_losses(n_steps=jnp.int32(3))
+    assert_close(jax.jvp(fast, (point,), (point,)), jax.jvp(plain, (point,), (point,)))

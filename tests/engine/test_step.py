@@ -441,3 +441,25 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     inputs = step.flatten(sim.data).inputs()
     lowered = plan.traced_count_step.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert lowered.as_text().count(cuda.PTX_TARGET) == 1  # one kernel for all stages and steps
+
+
+def test_vmap_over_commands_and_parameters_is_a_loop():
+    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
+    data, step = scatter_drones(sim), Step(sim.step_pipeline)
+    commands = (
+        np.asarray(data.controls.attitude.staged_cmd) * np.linspace(0.5, 1.5, 4, dtype=np.float32)[:, None, None, None]
+    )
+    masses = np.asarray(data.params.mass) * np.linspace(0.9, 1.1, 4, dtype=np.float32)[:, None]
+
+    def fly(command, mass):
+        ready = F.attitude_control(data.replace(params=data.params.replace(mass=mass)), command)
+        return step(ready, jnp.int32(7)).states
+
+    cases = [(jax.vmap(fly), masses), (jax.vmap(fly, (0, None)), np.asarray(data.params.mass))]
+    compiled = jax.jit(fly)
+    for batched_fly, mass in cases:
+        many = jax.device_get(jax.jit(batched_fly)(commands, mass))
+        for k in range(4):
+            single = compiled(commands[k], mass[k] if mass.ndim > 1 else mass)
+            for name in ("pos", "vel"):
+                np.testing.assert_allclose(getattr(many, name)[k], getattr(single, name), rtol=1e-5, atol=1e-6)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import with_states
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.engine.backends import native
@@ -17,21 +18,13 @@ WIDTH, HEIGHT, FOVY = 24, 16, 70.0
 HIT_FIELDS = ("body_index", "distance", "normal", "point")
 
 
-def place_drones(sim, pos, quat=None):
-    """Move drones to positions (n_worlds, n_drones, 3); level unless a quaternion is given."""
-    states = sim.data.states.replace(pos=np.float32(pos))
-    if quat is not None:
-        states = states.replace(quat=np.float32(quat))
-    sim.data = sim.data.replace(states=states)
-
-
 @pytest.fixture(scope="module")
 def room():
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
     ball = sim.scene.add("sphere", pos=[1.5, 0.2, 1.1], radius=0.2)
     box = sim.scene.add("box", pos=[0, 0, -50], size=(0.2, 0.4, 0.3))
-    place_drones(sim, [[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
+    sim.data = with_states(sim.data, pos=[[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
     return sim, ball, box
 
 
@@ -90,7 +83,7 @@ def test_depth_equals_the_depth_of_mujocos_renderer(room, cameras, camera, hide_
     original_data = sim.data
     rng = np.random.default_rng(2)
     quat = [0, 0, 0, 1] + 0.2 * rng.normal(size=(2, 2, 4))
-    place_drones(sim, np.asarray(sim.data.states.pos), quat / np.linalg.norm(quat, axis=-1, keepdims=True))
+    sim.data = with_states(sim.data, quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True))
     sim.data = box.set_pose(sim.data, [1.0, -0.4, 0.8], [0.1, 0.2, 0.3, 0.9])
     for world in range(2):
         picture = sim.render("depth_array", world, camera, width=96, height=64)
@@ -135,7 +128,7 @@ def test_a_range_finder_measures_in_a_step():
     sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
     sim.scene.add("sphere", pos=[0, 1.2, 1.0], radius=0.2)
     sim.add(RangeFinder(max_range=3.0, drones=True))
-    place_drones(sim, [[[0, 0, 1], [0, -1, 1]], [[1, 0, 2], [1, -0.5, 5]]], np.tile([0, 0, 0, 1.0], (2, 2, 1)))
+    sim.data = with_states(sim.data, pos=[[[0, 0, 1], [0, -1, 1]], [[1, 0, 2], [1, -0.5, 5]]], quat=[0, 0, 0, 1.0])
     sim.step()
     distance = np.asarray(sim.data.plugins["range_finder"].distance)
     names = list(RangeFinder.MULTI_RANGER)
@@ -155,7 +148,7 @@ def test_rays_in_a_step_meet_loads_at_their_present_poses():
     load = sim.add(SlungLoad(mass=0.005, length=0.5, size=0.1))
     sim.add(RangeFinder([[0, 0, -1], [1, 0, 0]], max_range=3.0))
     sim.sync(0)
-    place_drones(sim, [[[0, 0, 2]], [[5, 5, 2]]])
+    sim.data = with_states(sim.data, pos=[[[0, 0, 2]], [[5, 5, 2]]])
     sim.data = load.hang(sim.data)
     sim.step()
     distance = np.asarray(sim.data.plugins["range_finder"].distance)
@@ -212,7 +205,7 @@ def test_a_range_finder_finds_the_first_of_many_objects(x64, rng):
 def test_a_range_finder_measures_at_its_rate():
     sim = Sim(control="attitude")
     sim.add(RangeFinder([[0, 0, -2]], freq=50))
-    place_drones(sim, [[[0, 0, 1]]])
+    sim.data = with_states(sim.data, pos=[[[0, 0, 1]]])
     sim.step(10)
     first = np.asarray(sim.data.plugins["range_finder"].distance).item()
     sim.step(9)
@@ -236,7 +229,7 @@ def mixed_scene():
     sim.scene.add("box", "fixed", pos=[2, 0, 1], quat=[0.1, 0.2, 0.3, 0.9], size=(0.5, 1.0, 1.5), mocap=False)
     quat = np.random.default_rng(1).normal(size=(2, 1, 4))
     sim.scene.add(ALL_KINDS, "moving", pos=[0, 2, 1], quat=quat)
-    place_drones(sim, [[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
+    sim.data = with_states(sim.data, pos=[[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
     return sim
 
 
@@ -366,7 +359,7 @@ def forest():
     ):
         pos, quat = rng.uniform([-6, -6, 0.2], [6, 6, 3], (count, 3)), rng.normal(size=(count, 4))
         sim.scene.add(primitive, name, count=count, pos=pos, quat=quat, **options)
-    place_drones(sim, [[[0, 0, 1.0], [1.5, 0.2, 1.2]]])
+    sim.data = with_states(sim.data, pos=[[[0, 0, 1.0], [1.5, 0.2, 1.2]]])
     return sim
 
 
@@ -410,7 +403,7 @@ def test_rays_whose_kernel_is_refused_are_cast_by_xla_with_a_warning(monkeypatch
     for engine in ("plain", "auto"):
         sim = Sim(engine=engine)
         sim.scene.add(wedge, "wedge", pos=[1, 0, 1])
-        place_drones(sim, [[[0, 0, 1]]])
+        sim.data = with_states(sim.data, pos=[[[0, 0, 1]]])
         if engine == "plain":
             depths.append(sim.depth("fpv_cam", 13, 9))
         else:

@@ -206,7 +206,7 @@ def test_law_09_wrong_files(tmp_path, files, message):
         load_jet_table(tmp_path)
 
 
-@pytest.mark.parametrize("table, message", [
+WRONG_TABLES = [
     (JetTable([500.0]), "got neither"),
     (JetTable([500.0, 400.0], np.zeros((2, 2, 2, 2))), "ascending"),
     (JetTable([500.0], np.zeros((2, 2, 2, 2))), r"pressure of shape \(1, n_x, n_y, n_z\)"),
@@ -215,29 +215,27 @@ def test_law_09_wrong_files(tmp_path, files, message):
     (JetTable([500.0], np.zeros((1, 2, 2, 2)), spacing=-1.0), "expected spacing to be positive"),
     (JetTable([500.0], np.full((1, 2, 2, 2), np.inf)), "finite"),
     (np.zeros(3), "expected table of RotorJet as JetTable"),
+]
+LOAD = SlungLoad(0.1, in_scene=False)
+SHARED = SharedLoad(0.1, in_scene=False, name="shared")
+
+
+@pytest.mark.parametrize("load, settings, remedy", [
+    *[(LOAD, {"table": table}, words) for table, words in WRONG_TABLES],
+    (LOAD, {"panel": 0.0}, "panel"),
+    (LOAD, {"air_density": 0.0}, "air_density"),
+    (None, {}, r"Use sim\.add"),
+    (SHARED, {}, "'shared'"),
+    (SHARED, {"load": "shared"}, "loads of one drone each"),
 ])  # fmt: skip
-def test_law_09_wrong_tables(table, message):
-    sim = Sim(drone="bumblebee", control="rotor_vel")
-    sim.add(SlungLoad(0.1, in_scene=False))
-    with pytest.raises(ConfigError, match=message):
-        sim.add(RotorJet(table))
-
-
-def test_law_09_wrong_settings():
+def test_law_09_wrong_settings(load, settings, remedy):
     sim = Sim(n_drones=2, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler")
-    with pytest.raises(ConfigError, match=r"Use sim\.add"):
-        sim.add(RotorJet())
-    sim.add(SharedLoad(0.1, in_scene=False), name="shared")
-    with pytest.raises(ConfigError, match="'shared'"):
-        sim.add(RotorJet())
-    with pytest.raises(ConfigError, match="loads of one drone each"):
-        sim.add(RotorJet(load="shared"))
-    other = Sim(drone="bumblebee")
-    other.add(SlungLoad(0.1, in_scene=False))
-    with pytest.raises(ConfigError, match="panel"):
-        other.add(RotorJet(panel=0.0))
-    with pytest.raises(ConfigError, match="air_density"):
-        other.add(RotorJet(air_density=0.0))
-    fitted = Sim(dynamics="so_rpy")
+    if load is not None:
+        sim.add(load)
+    with pytest.raises(ConfigError, match=remedy):
+        sim.add(RotorJet(**settings))
+
+
+def test_law_09_fitted_dynamics_have_no_rotors_with_jets():
     with pytest.raises(ConfigError, match="acts on single rotors"):
-        fitted.add(RotorJet())
+        Sim(dynamics="so_rpy", plugins=[RotorJet()])

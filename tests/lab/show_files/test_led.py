@@ -75,32 +75,23 @@ def test_a_public_light_program_gives_its_colours():
     np.testing.assert_allclose(result, expected, atol=1e-4)
 
 
-WRONG_PROGRAMS = {
-    "unknown command": ([7, 1, 0x16], "0x16"),
-    "unused command": ([0x0F], "0x0f"),
-    "missing argument": ([4, 1, 2], "argument"),
-    "endless number": ([2, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x00], "at most 268435455"),
-    "large number": ([2, 0xFF, 0xFF, 0xFF, 0xFF, 0x0F], "at most 268435455"),
-    "end of no loop": ([13], "start of a loop"),
-    "deep loops": ([12, 2] * 5, "at most 4 deep"),
-    "endless loop in no time": ([12, 0, 13], "at most"),
-    "jump in no time": ([18, 0], "at most"),
-    "loops of loops": ([12, 255] * 4 + [1] + [13] * 4, "at most"),
-    "jump outside": ([18, 100], "byte 100"),
-}
+WRONG_PROGRAMS = [
+    ([7, 1, 0x16], "0x16"),
+    ([0x0F], "0x0f"),
+    ([4, 1, 2], "argument"),
+    ([2, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x00], "at most 268435455"),
+    ([2, 0xFF, 0xFF, 0xFF, 0xFF, 0x0F], "at most 268435455"),
+    ([13], "start of a loop"),
+    ([12, 2] * 5, "at most 4 deep"),
+    ([12, 0, 13], "at most"),
+    ([18, 0], "at most"),
+    ([12, 255] * 4 + [1] + [13] * 4, "at most"),
+    ([18, 100], "byte 100"),
+]
+"""Bytes of programs that are refused, and words of the error."""
 
 
-@pytest.mark.parametrize(("program", "message"), WRONG_PROGRAMS.values(), ids=WRONG_PROGRAMS)
-def test_wrong_programs(program, message):
-    with pytest.raises(ConfigError, match=message):
-        decode_lights(bytes(program))
-
-
-def test_text_that_is_not_base64_and_too_long_programs_are_refused():
-    with pytest.raises(ConfigError, match="base64"):
-        decode_lights("?")
-    with pytest.raises(ConfigError, match="at most 1048576 bytes"):
-        decode_lights(bytes(2**20 + 1))
+def test_programs_are_bytes_or_base64():
     assert np.array_equal(decode_lights(base64.b64encode(bytes([7, 0])).decode()).starts[-1], WHITE)
 
 
@@ -153,14 +144,16 @@ def test_encoded_lights_use_the_shortest_commands():
     ]
 
 
-def test_wrong_lights():
-    with pytest.raises(ConfigError, match="0 to 1"):
-        Lights.of_pieces([0.0], [[255, 0, 0]])
-    with pytest.raises(ConfigError, match="ascending"):
-        Lights.of_pieces([1.0, 0.0], np.zeros((2, 3)))
-    with pytest.raises(ConfigError, match="shapes"):
-        Lights.of_pieces([0.0], np.zeros((2, 3)))
-    with pytest.raises(ConfigError, match="one drone"):
-        encode_lights(Lights.stack([Lights.constant()]))
-    with pytest.raises(ConfigError, match="at least one drone"):
-        Lights.stack([])
+@pytest.mark.parametrize("make, remedy", [
+    (lambda: Lights.of_pieces([0.0], [[255, 0, 0]]), "0 to 1"),
+    (lambda: Lights.of_pieces([1.0, 0.0], np.zeros((2, 3))), "ascending"),
+    (lambda: Lights.of_pieces([0.0], np.zeros((2, 3))), "shapes"),
+    (lambda: encode_lights(Lights.stack([Lights.constant()])), "one drone"),
+    (lambda: Lights.stack([]), "at least one drone"),
+    (lambda: decode_lights("?"), "base64"),
+    (lambda: decode_lights(bytes(2**20 + 1)), "at most 1048576 bytes"),
+    *[(lambda x=program: decode_lights(bytes(x)), words) for program, words in WRONG_PROGRAMS],
+])  # fmt: skip
+def test_wrong_lights_and_programs_are_refused(make, remedy):
+    with pytest.raises(ConfigError, match=remedy):
+        make()

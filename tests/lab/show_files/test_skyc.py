@@ -169,23 +169,23 @@ def test_wrong_shows_are_refused_with_the_place(name, path, value, message):
     assert "my.skyc" in str(refused.value)
 
 
-def test_files_that_are_no_shows(tmp_path):
-    for name, content in {
-        "empty": b"",
-        "text": b"no zip",
-        "damaged": skyc_files.pack_archive(skyc_files.create_lab_show())[:-40],
-    }.items():
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(ConfigError, match="zip archive"):
-            load_show(tmp_path / name)
-    with pytest.raises(ConfigError, match=r"show\.json"):
-        parse_show(skyc_files.pack_archive({"cues.json": "{}"}))
-    with pytest.raises(ConfigError, match="JSON"):
-        parse_show(skyc_files.pack_archive({"show.json": "{"}))
-    with pytest.raises(ConfigError, match="existing file"):
-        load_show(tmp_path / "nowhere.skyc")
-    with pytest.raises(ConfigError, match="existing file"):
-        load_show(tmp_path)
+@pytest.mark.parametrize("content, remedy", [
+    (b"", "zip archive"),
+    (b"no zip", "zip archive"),
+    (skyc_files.pack_archive(skyc_files.create_lab_show())[:-40], "zip archive"),
+    (skyc_files.pack_archive({"cues.json": "{}"}), r"show\.json"),
+    (skyc_files.pack_archive({"show.json": "{"}), "JSON"),
+    (skyc_files.pack_archive({"show.json": b"[" * 10**6}), "JSON"),
+])  # fmt: skip
+def test_files_that_are_no_shows(content, remedy):
+    with pytest.raises(ConfigError, match=remedy):
+        parse_show(content)
+
+
+def test_names_that_are_no_shows(tmp_path):
+    for path in (tmp_path / "nowhere.skyc", tmp_path):
+        with pytest.raises(ConfigError, match="existing file"):
+            load_show(path)
     with pytest.raises(ConfigError, match=r"\.skyc"):
         save_show(parse_show(skyc_files.pack_archive(skyc_files.create_lab_show())), tmp_path / "show.zip")
 
@@ -210,8 +210,6 @@ def test_archives_that_decompress_to_too_much_are_refused():
         wrong_sizes[start : start + 4] = (10).to_bytes(4, "little")
     with pytest.raises(ConfigError):
         parse_show(bytes(wrong_sizes))
-    with pytest.raises(ConfigError, match="JSON"):
-        parse_show(skyc_files.pack_archive({"show.json": b"[" * 10**6}))
     points = [[k / 100, [0, 0, 0], []] for k in range(20_001)]
     with pytest.raises(ConfigError, match="at most 20000 entries"):
         parse_show(

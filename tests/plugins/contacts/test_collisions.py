@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cases import broadcast_like, with_params, with_states
+from cases import with_params, with_record, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ContactResponse, Hook, Sim, SlungLoad
@@ -33,12 +33,6 @@ def remove_gravity(sim):
 def fix_drones(sim):
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
-
-
-def with_load(load, data, **changes):
-    """Return data in which fields of the load's record have other values."""
-    record = load.read(data)
-    return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
 
 
 def leave_out_drones(sim):
@@ -77,7 +71,7 @@ def test_a_swing_ends_at_an_obstacle_with_the_restitution():
     record = response.read(sim.data).replace(restitution=restitution[:, None, None].astype(np.float32))
     angle = 0.5
     sim.data = response.write(sim.data, record)
-    sim.data = with_load(load, sim.data, pos=[-LENGTH * np.sin(angle), 0, 3 - LENGTH * np.cos(angle)])
+    sim.data = with_record(load, sim.data, pos=[-LENGTH * np.sin(angle), 0, 3 - LENGTH * np.cos(angle)])
     fall = np.sqrt(2 * 9.81 * LENGTH * (1 - np.cos(angle)))
     track = []
     for _ in range(200):
@@ -136,7 +130,7 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(x64, rng):
         quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
     )  # fmt: skip
     load_pos = np.asarray(data.states.pos) + rng.uniform(-0.12, 0.12, (n, 2, 3))
-    before = with_load(load, data, pos=load_pos, vel=2 * rng.normal(size=(n, 2, 3)))
+    before = with_record(load, data, pos=load_pos, vel=2 * rng.normal(size=(n, 2, 3)))
     after = step(before, np.int32(1))
     for old, new in zip(momentum(load, before, 0.2), momentum(load, after, 0.2), strict=True):
         np.testing.assert_allclose(new, old, atol=1e-12)
@@ -159,7 +153,7 @@ def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(x64, rng):
     heap = np.array([0, 0, 3.0])
     pos = heap + rng.uniform(-0.08, 0.08, (n, 3, 3))
     tip = heap + rng.uniform(-0.08, 0.08, (n, 3, 3))
-    data = with_load(hook, sim.data, pos=pos + [0, 0, 0.1], tip_pos=tip, **state)
+    data = with_record(hook, sim.data, pos=pos + [0, 0, 0.1], tip_pos=tip, **state)
     records = (hook.read(x) for x in (data, step(data, np.int32(1))))
     old, new = (np.concatenate([x.vel, x.tip_vel], axis=1) for x in records)
     np.testing.assert_allclose((mass * new).sum(1), (mass * old).sum(1), atol=1e-12)
@@ -179,9 +173,9 @@ def test_an_empty_hook_stops_at_an_obstacle_and_pushes_a_load():
     leave_out_drones(sim)
     tip = np.asarray(sim.data.states.pos) - [0, 0, 0.4]
     sim.data = box.set_pose(sim.data, [[tip[0, 0] + [0.0245 + 0.05 + 0.01, 0, 0]], [[9, 9, 9]]])
-    sim.data = with_load(hook, sim.data, tip_pos=tip, tip_vel=[1.0, 0, 0], reach=0.001)
+    sim.data = with_record(hook, sim.data, tip_pos=tip, tip_vel=[1.0, 0, 0], reach=0.001)
     pos = np.stack([np.full((1, 3), 5.0), tip[1] + [0.0245 + RADIUS + 0.01, 0, 0.021 + 0.01]])
-    sim.data = with_load(hook, sim.data, pos=pos)
+    sim.data = with_record(hook, sim.data, pos=pos)
     sim.step(10)
     record = hook.read(sim.data)
     np.testing.assert_allclose(np.asarray(record.tip_vel)[:, 0, 0], [-0.5, 0.25], atol=0.01)
@@ -193,7 +187,7 @@ def test_a_contact_report_contains_empty_hooks():
     sim = build(n_drones=2)
     hook = sim.add(Hook(mass=0.1, load_at=[0, 0, 1.0]))
     tip = np.asarray(sim.data.states.pos)[:, ::-1]
-    sim.data = with_load(hook, sim.data, tip_pos=tip)
+    sim.data = with_record(hook, sim.data, tip_pos=tip)
     report = sim.contact_report(floor=False, drones=False)
     assert report.object_names == ("load:0", "load:1", "load_hook:0", "load_hook:1")
     np.testing.assert_array_equal(
@@ -209,7 +203,7 @@ def test_a_wall_that_stops_a_load_holds_back_the_drone():
     sim.add(ContactResponse(restitution=0.0))
     leave_out_drones(sim)
     start = np.asarray(sim.data.states.pos)
-    sim.data = with_load(load, with_states(sim.data, vel=[0.5, 0, 0]), pos=start + [LENGTH, 0, 0], vel=[0.5, 0, 0])
+    sim.data = with_record(load, with_states(sim.data, vel=[0.5, 0, 0]), pos=start + [LENGTH, 0, 0], vel=[0.5, 0, 0])
     sim.step(100)
     pos, vel = np.asarray(sim.data.states.pos), np.asarray(sim.data.states.vel)
     assert np.abs(vel[0, 0, 0]) < 0.27  # overlaps are separated at 0.25 m/s at most
@@ -233,10 +227,10 @@ def test_the_bounce_has_gradients(x64):
     pos[0] += [0.01, 0, -0.06]
     pos[2, :, 1] += 2.0
     pos[3] = [5, 0, 3]
-    data = with_load(load, load.release(sim.data), pos=pos, vel=[0, 0, 1.0])
+    data = with_record(load, load.release(sim.data), pos=pos, vel=[0, 0, 1.0])
 
     def drone_speeds(speed, states, record):
-        moved = with_load(load, load.write(data.replace(states=states), record), vel=np.array([0.1, 0, 1.0]) * speed)
+        moved = with_record(load, load.write(data.replace(states=states), record), vel=np.array([0.1, 0, 1.0]) * speed)
         for stage in stages:
             moved = stage(moved)
         return jnp.sum(moved.states.vel[..., 2]), moved.states.vel[0, 0, 2]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, broadcast_like, build_stagewise_step, with_params, with_states
+from cases import INTEGRATORS, build_stagewise_step, with_params, with_record, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim
@@ -24,12 +24,6 @@ def build(n_worlds=1, n_drones=1, height=500.0, **kwargs):
     sim = Sim(n_worlds, n_drones, **options)
     sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
     return sim
-
-
-def with_load(load, data, **changes):
-    """Return the data with changed fields of the load's record."""
-    record = load.read(data)
-    return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
 
 
 def momentum(load, data):
@@ -55,7 +49,7 @@ def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
     """In free fall the tension is the only force: 10 s at 500 Hz, attached at the centre of mass and off it."""
     sim, attach = build(2, integrator=integrator), np.array([(0, 0, 0), OFFSET])
     load = sim.add(SlungLoad(mass=LOAD, attach=attach[:, None], in_scene=False))
-    sim.data = with_load(load, sim.data, vel=(1.0, 0.5, 0.0))
+    sim.data = with_record(load, sim.data, vel=(1.0, 0.5, 0.0))
     (p0, l0), e0 = momentum(load, sim.data), relative_energy(load, sim.data)
     n = 5000
     sim.step(n)
@@ -78,7 +72,7 @@ def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
     load = sim.add(SlungLoad(mass=LOAD, cable=cable, in_scene=False))
     angle = np.linspace(0.2, 2.5, 8)
     pos = np.stack([0.4 * np.sin(angle), 0 * angle, 2 - 0.4 * np.cos(angle)], axis=-1)[:, None]
-    sim.data = with_load(load, sim.data, pos=pos)
+    sim.data = with_record(load, sim.data, pos=pos)
 
     def energy():
         r, s = load.read(sim.data), sim.data.states
@@ -116,7 +110,7 @@ def test_a_cable_that_becomes_taut_ends_the_relative_motion_along_it(x64):
     sim, restitution = build(2, integrator="rk4", engine="interpret"), np.array([0.0, 0.6])
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution[:, None], in_scene=False))
     start = np.asarray(sim.data.states.pos)
-    sim.data = with_load(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
+    sim.data = with_record(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
     sim.step(15)  # 3 cm: still slack
     v, u = np.asarray(sim.data.states.vel)[:, 0, 2], np.asarray(load.read(sim.data).vel)[:, 0, 2]
     np.testing.assert_allclose(v - u, 1.0, atol=1e-9)
@@ -177,7 +171,7 @@ def test_law_08_gradients_are_central_differences(x64):
 def test_a_released_load_comes_to_rest_on_the_floor(x64):
     sim = build(height=1.0)
     load = sim.add(SlungLoad(mass=LOAD, cable=True, size=(0.1, 0.1, 0.06), in_scene=False))
-    sim.data = with_load(load, load.release(sim.data), vel=(0.5, 0.0, 0.0))
+    sim.data = with_record(load, load.release(sim.data), vel=(0.5, 0.0, 0.0))
     sim.step(500)
     pos, vel = (np.asarray(x)[0, 0] for x in (load.read(sim.data).pos, load.read(sim.data).vel))
     np.testing.assert_allclose(pos[2], 0.03, atol=1e-12)
@@ -190,7 +184,7 @@ def test_loads_are_objects_of_the_scene():
     load = sim.add(SlungLoad(mass=0.05, cable=True, size=0.05))
     pos = np.asarray(load.read(sim.data).pos).copy()
     pos[1, 0] = np.asarray(sim.data.states.pos)[1, 1]  # into the other drone
-    sim.data = with_load(load, sim.data, pos=pos)
+    sim.data = with_record(load, sim.data, pos=pos)
     report = sim.contact_report(floor=False, drones=False)
     assert report.object_names == ("load:0", "load:1")
     touched = np.asarray(report.objects)
@@ -209,7 +203,7 @@ def test_direction_and_its_rate(x64):
     sim = build()
     load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
     sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
-    sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
+    sim.data = with_record(load, sim.data, vel=(0.3, 0.2, 0.1))
     q, rate = (np.asarray(x) for x in jax.jit(direction)(sim.data))
     np.testing.assert_allclose(q[0, 0], [0, 0, -1], atol=1e-12)
     lever = np.cross([1.0, 2.0, 3.0], OFFSET)

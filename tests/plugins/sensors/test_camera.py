@@ -5,19 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import with_states
 
 from crazysim import Camera, RangeFinder, Sim, Terrain, rotation
 
 SIZE = {"width": 9, "height": 6}
-
-
-def place_drones(sim, pos, quat=(0.0, 0, 0, 1)):
-    states = sim.data.states
-    pos, quat = (
-        jnp.broadcast_to(jnp.asarray(x, jnp.float32), (*states.pos.shape[:2], len(x[0]) if np.ndim(x) > 1 else len(x)))
-        for x in (pos, quat)
-    )
-    sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +21,7 @@ def flight():
         Camera(**SIZE, fovy=60.0, rpy=(0.1, 0.4, -0.2), outputs=outputs, freq=50, latency=0.03, drones=False)
     )
     sim.scene.add("sphere", pos=[1.4, 0.1, 0.9], radius=0.3, mocap=False)
-    place_drones(sim, [[0.0, 0, 1], [0.5, -0.4, 1.2]])
+    sim.data = with_states(sim.data, pos=[[0.0, 0, 1], [0.5, -0.4, 1.2]])
     take_image, images, records = jax.jit(camera.image_fn(sim)), [], []
     for _ in range(15):
         sim.step()
