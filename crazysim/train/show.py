@@ -49,27 +49,23 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path, unit: str)
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    figure, axes = _make_figure(4)
+    first_curve = next(iter(curves.values()))
+    rewards = {**terms_of(first_curve[-1]), "sum": 0.0}
+    figure, axes = _make_figure(3 + len(rewards))
     for name, curve in curves.items():
         steps = np.array([point["env_steps"] for point in curve]) / 1e6
-        seconds = [point["seconds"] for point in curve]
         success = [100 * point["success"] for point in curve]
         axes[0].plot(steps, success, label=name)
-        axes[1].plot(seconds, success)
+        axes[1].plot([point["seconds"] for point in curve], success)
         axes[2].plot(steps, [point["error"] for point in curve], marker=".")  # there is no error if all drones crash
     _use_log_scale(axes[2])
-    first_curve = next(iter(curves.values()))
     steps = np.array([point["env_steps"] for point in first_curve]) / 1e6
-    for name in terms_of(first_curve[-1]):
-        axes[3].plot(steps, [terms_of(point)[name] for point in first_curve], label=name)
-    axes[3].plot(steps, [point["reward"] for point in first_curve], "k--", label="sum")
-    axes[3].legend(fontsize="small")
-    steps_label = "environment steps, millions"
-    labels = ("success, %", "success, %", f"mean error, {unit}", "reward in an episode, by term")
-    for axis, x, y in zip(
-        axes, (steps_label, "time with compilation, s", steps_label, steps_label), labels, strict=True
-    ):
-        axis.set(xlabel=x, ylabel=y)
+    for axis, name in zip(axes[3:], rewards, strict=True):
+        axis.plot(steps, [terms_of(point).get(name, point["reward"]) for point in first_curve])
+    labels = ("success, %", "success, %", f"mean error, {unit}", *(f"reward, {name}" for name in rewards))
+    for axis, y in zip(axes, labels, strict=True):
+        axis.set(xlabel="environment steps, millions", ylabel=y)
+    axes[1].set_xlabel("time with compilation, s")
     for axis in axes[:2]:
         axis.set_ylim(SUCCESS_LIMITS)
     if len(curves) > 1:
@@ -157,21 +153,19 @@ def plot_episode(
     flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
     terms, is_over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
     t = env.task.seconds * (1 + np.arange(len(is_over))) / len(is_over)
-    figure, axes = _make_figure(3)
-    for name, x in terms.items():
-        axes[0].plot(t, x, label=name)
-        axes[1].plot(t, np.cumsum(x), label=name)
-    axes[1].plot(t, np.cumsum(sum(terms.values())), "k--", label="sum")
+    rewards = {**terms, "sum": sum(terms.values())}
+    figure, axes = _make_figure(1 + len(rewards))
     error = flight["error"].reshape(len(is_over), -1)
-    axes[2].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
+    axes[0].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
     if "succeeded" not in flight:  # otherwise the tolerance does not decide
-        axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
-    labels = ("reward of a step, by term", "reward until then, by term", f"error, {env.task.unit}")
-    for axis, y in zip(axes, labels, strict=True):
+        axes[0].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
+    axes[0].legend(fontsize="small")
+    for axis, x in zip(axes[1:], rewards.values(), strict=True):
+        axis.plot(t, np.cumsum(x))
+    for axis, y in zip(axes, (f"error, {env.task.unit}", *(f"reward until then, {k}" for k in rewards)), strict=True):
         axis.set(xlabel="time in the episode, s", ylabel=y)
-        axis.legend(fontsize="small")
     has_succeeded = flight["succeeded"].all(axis=-1) if "succeeded" in flight else np.zeros_like(is_over[-1])
-    axes[0].set_title(
+    figure.suptitle(
         f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.0%} fly until the end, "
         + f"{has_succeeded.mean():.0%} succeed, " * ("succeeded" in flight)
         + f"{(is_over[-1] & ~has_succeeded).mean():.0%} crash",
