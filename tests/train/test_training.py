@@ -267,7 +267,7 @@ def test_evaluations_hold_the_terms_of_the_reward(uninterrupted_run, tmp_path, m
     )
     over_time = plot_episode(uninterrupted_run.env, uninterrupted_run.policy, tmp_path / "episode.png")
     assert (tmp_path / "episode.png").stat().st_size > 5000
-    assert labels[-1] == "error, m"
+    assert (labels[0], labels[-1]) == ("error, m", "reward until then, sum")
     assert {name: x.shape for name, x in over_time.items()} == dict.fromkeys(
         ("proximity", "spin", "action_rate", "crash"), (20,)
     )
