@@ -93,12 +93,18 @@ def check_student(result):
     assert student > 0.95
 
 
+def check_success(metrics):
+    """Check that a training of less than half of its iterations hovers."""
+    assert metrics["success"] > 0.9
+
+
 CHECKS = {
     "crazyswarm2": check_landing,
     "fit_flight": check_fit,
     "hooked_load": check_damping,
     "mixed_fleet": check_separation,
     "mixed_reality": check_mixed_reality,
+    "one_file_ppo": check_success,
     "pick_and_place": check_placement,
     "race": check_race,
     "replayed_twin": check_replay,
@@ -108,9 +114,13 @@ CHECKS = {
 """Further checks of the values that ``main`` of an example returns."""
 
 
-SETTINGS = {"student": {"iterations": 40}}
+SETTINGS = {"student": {"iterations": 40}, "one_file_ppo": {"iterations": 40, "starts": 200}}
 """Arguments of ``main`` for quicker tests."""
-LONG_REASONS = {"student": "trains two policies", "waypoints": "trains a policy unless student has"}
+LONG_REASONS = {
+    "one_file_ppo": "trains a policy",
+    "student": "trains two policies",
+    "waypoints": "trains a policy unless student has",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
