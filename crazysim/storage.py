@@ -78,9 +78,6 @@ def read_bytes(path: str | Path, max_bytes: int) -> bytes:
     Args:
         path: The file.
         max_bytes: Largest size, bytes.
-
-    Raises:
-        ConfigError: If it does not exist, cannot be read, or is larger.
     """
     try:
         parts, size = [], 0
@@ -103,7 +100,6 @@ def open_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> BinaryIO:
 
     Raises:
         OSError: If it does not exist, is a folder, or cannot be read.
-        ConfigError: If it is a device or a pipe, or is larger than ``max_bytes``.
     """
     check_file(path, max_bytes)
     return open(path, "rb")
@@ -114,7 +110,6 @@ def check_file(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> None:
 
     Raises:
         OSError: If it does not exist, or is a folder.
-        ConfigError: If it is a device or a pipe, or is larger than ``max_bytes``.
     """
     try:
         status = os.stat(os.fspath(path))
@@ -138,9 +133,6 @@ def read_text(path: str | Path, max_bytes: int) -> str:
     Args:
         path: The file.
         max_bytes: Largest size, bytes.
-
-    Raises:
-        ConfigError: If it does not exist, cannot be read, is larger, or is not text in UTF-8.
     """
     try:
         text = read_bytes(path, max_bytes).decode("utf-8-sig")
@@ -158,9 +150,6 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
     Args:
         path: The file.
         guide: Page that describes the format, for messages.
-
-    Raises:
-        ConfigError: If it cannot be read, is larger than ``MAX_TOML_BYTES``, or is not TOML.
     """
     text = read_text(path, MAX_TOML_BYTES)
     try:
@@ -386,8 +375,6 @@ def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
         name: Name of the file, for messages.
 
     Raises:
-        ConfigError: If it has more than ``MAX_ARRAYS`` arrays, unpacks to much more than its size, or has an array with
-            fewer bytes than its header states.
         Exception: Of any type, if it is damaged; see ``wrap_read_errors``.
     """
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * file.seek(0, os.SEEK_END))

@@ -45,11 +45,7 @@ def add_options(add: Callable[..., Any]) -> None:
 
 
 def has_several_hosts(options: argparse.Namespace) -> bool:
-    """Return True if a command runs on several hosts.
-
-    Raises:
-        ConfigError: If ``--host-id`` or ``--hosts`` is given without ``--coordinator``.
-    """
+    """Return True if a command runs on several hosts."""
     require(
         options.coordinator is not None or (options.host_id is None and options.hosts is None),
         "expected --coordinator with --host-id and --hosts, got none. Use the address of host 0, such as "
@@ -64,9 +60,6 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     Args:
         command: The command.
         options: Options of the command, including those of ``add_options``.
-
-    Raises:
-        ConfigError: If the options are invalid, or no hosts are found.
     """
     addresses = _host_addresses(options)
 

@@ -105,9 +105,6 @@ def require_screen(remedy: str) -> None:
 
     Args:
         remedy: Options to use instead, for the message.
-
-    Raises:
-        ConfigError: If there is none.
     """
     require(has_screen(), f"expected a screen for --window, got none. Use {remedy}.")
 
@@ -122,9 +119,6 @@ def load_policy_and_env(
         device: Device of the environment; None for the device of the training.
         n_worlds: Number of worlds of the environment.
         task: Reference of the task, if it has moved since training; None for the reference in the run.
-
-    Raises:
-        ConfigError: If the run is damaged, or if the task has other observations.
     """
     from crazysim.train.interface import check_policy
     from crazysim.train.training import load_policy

@@ -136,9 +136,6 @@ class Controller:
         """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.
 
         Override it for parameters that do not follow from the declarations of their class alone.
-
-        Raises:
-            ConfigError: If the airframe lacks a value that the controller needs.
         """
         return None if self.params_type is None else self.params_type.create(airframe)
 

@@ -195,11 +195,7 @@ def enum_member(enum: type[E], name: str, value: object) -> E:
 
 
 def find_device(device: str | jax.Device) -> jax.Device:
-    """Return the device with a name such as ``cpu`` or ``gpu:1``.
-
-    Raises:
-        ConfigError: If there is no such device on this host.
-    """
+    """Return the device with a name such as ``cpu`` or ``gpu:1``."""
     if isinstance(device, jax.Device):
         if device.process_index != jax.process_index():
             raise ConfigError(f"expected a device of this host, got {device}. Use one of jax.local_devices().")

@@ -28,9 +28,6 @@ measured separately can have it. RotorPy's Crazyflie has 1%."""
 def check_airframe(airframe: Airframe) -> None:
     """Check shapes, ranges and the consistency of an airframe's numbers.
 
-    Raises:
-        ConfigError: If no drone with these numbers can fly.
-
     Warns:
         AirframeWarning: If the largest moment of inertia exceeds the sum of the other two by up to 5%.
     """

@@ -123,12 +123,7 @@ def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
 
 
 def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
-    """Check that lags and damping of an airframe are slow enough for the rate of physics steps.
-
-    Raises:
-        ConfigError: If a rate is above ``MAX_LAG_STEP * freq``; the message states the lowest ``freq`` that suffices
-            for the first such rate.
-    """
+    """Check that lags and damping of an airframe are slow enough for the rate of physics steps."""
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
     rates_by_path: dict[str, np.ndarray] = {}
     if dynamics == Dynamics.first_principles:

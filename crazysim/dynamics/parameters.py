@@ -26,9 +26,6 @@ def load_params(
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.
-
-    Raises:
-        ConfigError: If the drone has no parameters for the model.
     """
     require(
         dynamics in tuple(Dynamics),

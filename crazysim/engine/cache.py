@@ -229,10 +229,6 @@ def enable_cache(
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Smallest duration of a compilation to keep its program, s.
         enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
-
-    Raises:
-        ConfigError: If ``cache_path`` cannot be made or written, belongs to another user, can be written by others, or
-            its disk is full.
     """
     if cache_path is None:
         path = _usable_default_folder()

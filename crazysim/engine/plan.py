@@ -122,9 +122,6 @@ class Planner(NamedTuple):
             data: The data, or its shapes and types.
             trace: Function that traces the compiled step of a plan, as its first call would, so that planning raises
                 the errors of the trace.
-
-        Raises:
-            ConfigError: If ``fused`` was chosen and has no kernel; with ``strict``, if something is unsupported.
         """
         if self.engine == "plain":
             return self._plan_plain(data, "it was chosen")

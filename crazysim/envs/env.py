@@ -173,10 +173,6 @@ class Env(ABC):
             state: The state of all worlds.
             pos: Goals, world frame, m: one for all drones (3,), one per world (n_worlds, 3), or one per drone
                 (n_worlds, n_drones, 3); an axis of worlds or drones may have length 1.
-
-        Raises:
-            ConfigError: If the goals of the task are not positions, if ``pos`` has another shape, or if it contains
-                host numbers that are not finite. Other goals that are not finite end the episode at the next step.
         """
         with use_device_of(state.full_data.core.steps):
             pos = validate_goals(pos, state)

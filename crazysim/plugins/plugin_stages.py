@@ -164,9 +164,6 @@ def replay_edit(before: Pipeline, after: Pipeline, pipeline: Pipeline, renewed: 
         after: The pipeline after the edit.
         pipeline: A pipeline like ``before``, with more, fewer or other stages.
         renewed: Names of stages that the pipeline may have in another version.
-
-    Raises:
-        ConfigError: If the user has replaced a stage that the pipeline lacks, or has in another version.
     """
     changed = {name: fn for name, fn in after.items() if before.get(name) is not fn}
     for name in changed.keys() & before.keys():

@@ -151,11 +151,7 @@ def _set_collision_bits(geom: mujoco.MjsGeom, collides: bool) -> None:
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Return the compiled model.
-
-    Raises:
-        ConfigError: With MuJoCo's message, if the spec cannot be compiled.
-    """
+    """Return the compiled model."""
     try:
         with warnings.catch_warnings():
             # Users attach bodies without a prefix, as the scene's documentation shows; nothing is saved here.
@@ -166,11 +162,7 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
-    """Return the model as arrays on a device.
-
-    Raises:
-        ConfigError: With MJX's message, if MJX does not support the scene.
-    """
+    """Return the model as arrays on a device."""
     with _explain_mjx_errors():
         return mjx.put_model(mj_model, device=device)
 

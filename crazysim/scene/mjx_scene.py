@@ -35,11 +35,7 @@ class MjxScene:
 
     @property
     def model(self) -> mjx.Model:
-        """Model on the device, shared by all worlds.
-
-        Raises:
-            ConfigError: If MJX does not support the scene.
-        """
+        """Model on the device, shared by all worlds."""
         model = self._model
         if model is None:
             model = build.put_model(self._mj_model, self._device)

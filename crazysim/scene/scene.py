@@ -214,11 +214,7 @@ class Scene:
             raise
 
     def compile(self) -> None:
-        """Compile the spec, close the window, and reset bodies that are moved through ``mjx_data``.
-
-        Raises:
-            ConfigError: If the spec does not compile or lacks a drone; the scene is then unchanged.
-        """
+        """Compile the spec, close the window, and reset bodies that are moved through ``mjx_data``."""
         self._compile()
         self.revision += 1  # the spec may have been edited by hand
         self._compiled_revision = self.revision
@@ -355,9 +351,6 @@ class Scene:
             hide_own: True for a drone to be invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
-
-        Raises:
-            ConfigError: If there is no such camera, or the images do not fit into memory.
         """
         if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
@@ -401,7 +394,6 @@ class Scene:
 
         Raises:
             ImportError: If ``renderer="splax"`` and splax is not installed.
-            ConfigError: If ``renderer="splax"`` and the simulation is not on a GPU.
         """
         from crazysim.scene import build_splat_fn
 

@@ -353,9 +353,6 @@ class Sim:
         """Remove a plugin, with its record and its stages; stages that it had replaced return.
 
         Objects that it moved, such as loads, stay in the scene where they are.
-
-        Raises:
-            ConfigError: If another plugin needs it, or you have replaced one of its stages; nothing is removed.
         """
         self.plugins.remove(plugin)
 
@@ -483,11 +480,7 @@ class Sim:
 
     @locked
     def step(self, n_steps: int = 1) -> None:
-        """Advance every world by a number of physics steps; any number uses the same compilation.
-
-        Raises:
-            ConfigError: If a world would have taken more than ``engine.record.MAX_STEPS`` since its last reset.
-        """
+        """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()
         self.plugins.check()
@@ -626,11 +619,7 @@ class Sim:
         return self._scene.renderer.viewer
 
     def build_mjx(self) -> None:
-        """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
-
-        Raises:
-            ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
-        """
+        """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is."""
         self._scene.compile()
 
     @locked

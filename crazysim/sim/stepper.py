@@ -165,9 +165,6 @@ class Stepper:
         Args:
             n_steps: Number of steps.
             times: Number of times that they will be taken.
-
-        Raises:
-            ConfigError: If a world would have taken more than ``MAX_STEPS`` since its last reset.
         """
         n_steps *= times
         if self._max_step_count is None or self._max_step_count + n_steps > MAX_STEPS:

@@ -301,9 +301,6 @@ class TrainConfig:
 
         Args:
             n_seeds: Number of seeds; each has ``n_worlds`` worlds.
-
-        Raises:
-            ConfigError: As ``make_env``; if a device does not exist, or if the worlds cannot be distributed evenly.
         """
         entry_of(self.task, is_named=False)
         n_worlds = n_seeds * self.n_worlds

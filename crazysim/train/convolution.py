@@ -62,9 +62,6 @@ def find_images(sizes: Mapping[str, int], formats: Mapping[str, Mapping[str, Any
     Args:
         sizes: Sizes of the observations by name.
         formats: Formats of the observations that are images, from ``Env.image_formats``.
-
-    Raises:
-        ConfigError: If there is no image.
     """
     images, start = [], 0
     for name in sorted(sizes):

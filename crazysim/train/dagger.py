@@ -146,11 +146,7 @@ class TeacherObservation(Wrapper):
 
 
 def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
-    """Return an environment that adds the observations of the teacher in ``config.teacher``.
-
-    Raises:
-        ConfigError: If there is no teacher, or the student's task does not have the teacher's task record.
-    """
+    """Return an environment that adds the observations of the teacher in ``config.teacher``."""
     require(config.teacher, "expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
     _, teacher_config, _ = _load_teacher_run(config.teacher)
     entry = entry_of(teacher_config.task, is_named=False)
@@ -272,8 +268,6 @@ def imitate(
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
 
     Raises:
-        ConfigError: If a hyperparameter is unknown or invalid, or if a trained teacher has other observations, another
-            command level or another rate.
         DivergedError: If weights or losses become non-finite, or the teacher's actions are NaN.
     """
     require(isinstance(config, (Mapping, type(None))), f"expected config as a dict of values by name, got {config!r}")

@@ -52,9 +52,6 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
     Args:
         device: Platform of the devices; if ``devices`` is a number, it may also be the name of the first device.
         devices: The devices.
-
-    Raises:
-        ConfigError: If a device does not exist, or if ``devices`` is not one of the forms of ``Devices``.
     """
     selection, first_device = _read_devices(devices), find_device(device)
     platform, available = first_device.platform, jax.devices(first_device.platform)
@@ -83,9 +80,6 @@ def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, An
         device: Platform of the devices, or one of them.
         devices: The devices.
         n_worlds: Number of worlds of all seeds.
-
-    Raises:
-        ConfigError: If a device does not exist, or if the worlds cannot be distributed evenly.
     """
     training_devices = find_devices(device, devices)
     n = len(training_devices)

@@ -144,9 +144,6 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         or at the end of the episode if the task defines ``succeeded``; NaN if there is none;
         ``reward``: mean return of an episode;
         ``reward NAME``: contribution of each term to the mean return.
-
-    Raises:
-        ConfigError: If a trained policy has other observations, another command level, rate or task.
     """
     check_policy(policy, env)
     check_key(held_out_key() if key is None else key)

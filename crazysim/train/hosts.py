@@ -25,21 +25,13 @@ def is_first_host() -> bool:
 
 
 def require_same_versions() -> None:
-    """Check that all hosts have the same versions of crazysim and JAX; call it before a backend starts.
-
-    Raises:
-        ConfigError: On all hosts, if one of them has another version.
-    """
+    """Check that all hosts have the same versions of crazysim and JAX; call it before a backend starts."""
     versions = {"crazysim": crazysim.__version__, "JAX": jaxcompat.versions()}
     _require_same_values("versions", versions, "Install the same versions on all hosts.")
 
 
 def require_same_settings(settings: Mapping[str, Any]) -> None:
-    """Check that all hosts have the same settings of a training, which JSON can represent.
-
-    Raises:
-        ConfigError: On all hosts, if one of them has another setting.
-    """
+    """Check that all hosts have the same settings of a training, which JSON can represent."""
     _require_same_values("settings", settings, "Start all hosts with the same settings, files and checkpoint.")
 
 

@@ -209,10 +209,6 @@ def choose_network(
         network: Custom network; None for the built-in one.
         convolution: Channels of the layers of the convolution of the built-in network; empty for no convolution.
         images: Images among the observations, for the convolution.
-
-    Raises:
-        ConfigError: If ``network`` is not a ``Network``, or is given together with a convolution or a size of the
-            memory.
     """
     if network is None:
         base = gru_network(memory) if memory else MEMORYLESS_NETWORK

@@ -197,10 +197,6 @@ def make_variants(
         seeds: Seeds.
         sweep: Values of hyperparameters by name.
         config: Hyperparameters of all trainings, which a sweep must not change.
-
-    Raises:
-        ConfigError: If there are no seeds or no values, if one of them occurs twice, or if a hyperparameter to sweep
-            is not one of ``SWEEPABLE`` or is also in ``config``.
     """
     expect(isinstance(sweep, Mapping), "sweep as a dict of values by name", sweep, "Use {'clip': [0.1, 0.2]}.")
     for name, values in {"seeds": seeds, **sweep}.items():

@@ -130,12 +130,7 @@ def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: A
 
 
 def copy_library(library: str | Path) -> str:
-    """Load a copy of a library with its current content, and return the path of the copy.
-
-    Raises:
-        ConfigError: If the library cannot be loaded, lacks a function, needs too much memory, or was compiled with
-            another version of ``firmware.h``.
-    """
+    """Load a copy of a library with its current content, and return the path of the copy."""
     remedy, path = f"Compile it as {CFirmware.include / 'firmware.h'} says.", Path(library)
     try:
         content = read_bytes(path, MAX_LIBRARY_BYTES)

@@ -94,11 +94,7 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
 
 
 def solve_on_host(compute_gain: Callable[..., Array], *args: Any) -> np.ndarray:
-    """Return ``compute_gain(*args)``, computed in float64 on the CPU.
-
-    Raises:
-        ConfigError: If the Riccati equation has no stabilising solution.
-    """
+    """Return ``compute_gain(*args)``, computed in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         args = jax.tree.map(lambda x: np.asarray(x, np.float64), args, is_leaf=lambda x: isinstance(x, list))
         return check_gain(np.asarray(jax.jit(compute_gain)(*args)))

@@ -121,11 +121,7 @@ def gain_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def check_gain(K: Any) -> Any:
-    """Return a gain after checking on the host that it is finite.
-
-    Raises:
-        ConfigError: If the gain is not finite, because the Riccati equation has no stabilising solution.
-    """
+    """Return a gain after checking on the host that it is finite."""
     require(
         np.all(np.isfinite(K)),
         "expected a Riccati equation with a stabilising solution, got none: an unstable or marginal mode is not "

@@ -55,10 +55,6 @@ def to_out_of_tree(
 
     Returns:
         Paths of both files.
-
-    Raises:
-        ConfigError: If the policy has a memory, commands positions, or commands rotor speeds of other than four rotors;
-            if the drone's state and a goal do not give all observations; or if ``freq`` does not divide 1000.
     """
     require_type(policy, Policy, POLICY_REMEDY)
     require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")

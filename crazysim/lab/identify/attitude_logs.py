@@ -30,9 +30,6 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
 
     Returns:
         The same columns, and ``dt``, s, (n - 1,), and ``rpy``, rad, (n, 3).
-
-    Raises:
-        ConfigError: If a column is missing, the time does not increase, or nearly all positions are outliers.
     """
     keys = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
     require(

@@ -88,7 +88,6 @@ def read_bag(path: Path, repairs: list[str], requested_columns: Columns | None =
         requested_columns: Names of the columns; None for the default names.
 
     Raises:
-        ConfigError: If a topic or a field is missing, or topics are ambiguous.
         ImportError: If rosbags is not installed.
     """
     with optional_import("ROS bags need", "rosbags", "logs"):

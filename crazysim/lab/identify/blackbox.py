@@ -46,9 +46,6 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        ConfigError: If columns are missing, or too many rows are damaged.
     """
     header = find_header(path)
     if header is None:

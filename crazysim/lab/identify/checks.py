@@ -98,9 +98,6 @@ def check_motion(
         data: Columns by field of ``Columns``, in the units of a log.
         derived_keys: Fields that were differentiated, not measured; also ``quat`` if the attitude was given as angles.
         repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        ConfigError: If the columns contradict each other; the message names a change that would help, if any.
     """
     is_kept = np.ones(len(t), bool)
     for pair, width in _rate_pairs(t, data, derived_keys):

@@ -25,9 +25,6 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        ConfigError: If the first line has no names, or too many rows have another number of cells.
     """
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header, *lines = [*file] or [""]

@@ -91,9 +91,6 @@ def read_log(
         motion: Motion capture of the same flight, whose columns are added to the log. If its clock differs from the
             clock of the log, its times are shifted so that the angular velocities agree.
         between: Start and end of the part that is read, s after the first sample.
-
-    Raises:
-        ConfigError: If columns are missing, or the samples cannot be repaired.
     """
     repairs: list[str] = []
     if isinstance(columns, str):

@@ -49,10 +49,6 @@ def resample(
         repairs: List that descriptions of repairs are appended to.
         columns: Names of the columns; None for the default names. Attitudes are made continuous before they are
             interpolated.
-
-    Raises:
-        ConfigError: If no two streams overlap, a stream has fewer than two samples, or position or attitude are too
-            slow.
     """
     columns = columns or Columns()
     quat, angles = ([unsigned_name(x) for x in names] for names in (columns.quat, columns.rpy))

@@ -38,9 +38,6 @@ def check_period(name: str, t: NDArray) -> None:
     Args:
         name: Name of the log, for messages.
         t: Time, s. (n,)
-
-    Raises:
-        ConfigError: If the interval is too short or too long; the message names the probable unit of the time.
     """
     steps = np.diff(t[np.isfinite(t)])
     steps = steps[steps > 0]

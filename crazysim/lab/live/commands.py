@@ -98,9 +98,6 @@ def parse_command(message: Message | ShowFile, drone: int | None = None) -> Comm
     Args:
         message: Message.
         drone: ID of the drone if the message has none; None for all.
-
-    Raises:
-        ConfigError: If the command does not exist, or its argument is invalid.
     """
     if isinstance(message, ShowFile):
         return LoadShow(parse_show(message.content, "a received show"))

@@ -84,9 +84,6 @@ def fly_policy(
         seconds: Duration, s.
         freq: Commands per second, Hz.
         level: Command level.
-
-    Raises:
-        ConfigError: If the link refuses a command, or a ``TrainedPolicy`` was trained with another level or rate.
     """
     if isinstance(policy, TrainedPolicy):
         policy.require_commands(Control(level).value, freq)

@@ -32,11 +32,7 @@ MAX_LISTED_PROCESSES = 3
 
 
 def check_speed(speed: Speed) -> Speed:
-    """Check a speed, and return it.
-
-    Raises:
-        ConfigError: If it is neither a positive number nor ``"max"``.
-    """
+    """Check a speed, and return it."""
     if speed == "max":
         return "max"
     require(

@@ -113,10 +113,6 @@ class PolicyPilot:
         Args:
             live: Loop.
             pos: Goal, world frame, m. (3,)
-
-        Raises:
-            ConfigError: If the task has no goals that can be set, the goal lies outside of its arena, or no drone is
-                selected.
         """
         require(live.selected is not None, "expected a selected drone, got none. Click on one, or press tab.")
         pos = np.asarray(pos, float)

@@ -199,11 +199,7 @@ class StreamListener(CommandQueue):
 
 
 def connect(host: str, port: int, timeout: float) -> socket.socket:
-    """Return a connection.
-
-    Raises:
-        ConfigError: If the timeout is out of range, or there is no server.
-    """
+    """Return a connection."""
     read_number("timeout", timeout, TIMEOUT_RANGE)
     try:
         return socket.create_connection((host, port), timeout)

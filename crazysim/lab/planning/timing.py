@@ -104,9 +104,6 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
         solve: Function from durations, s (n_pieces,), to coefficients (n_pieces, 4, degree + 1).
         durations: First guess, s. (n_pieces,)
         limits: Limits.
-
-    Raises:
-        ConfigError: If the limits cannot be met however slow the flight, or do not bound its speed.
     """
 
     def exceeded_limits(factor: float) -> list[str]:

@@ -55,9 +55,6 @@ def minimum_snap(
             elsewhere. (n, 3)
         accelerations: Accelerations, m/s^2; NaN and None as for ``velocities``. (n, 3)
         jerks: Jerks, m/s^3; NaN and None as for ``velocities``. (n, 3)
-
-    Raises:
-        ConfigError: If the waypoints cannot be flown within the limits or corridors.
     """
     return _plan_trajectory(waypoints, durations, (velocities, accelerations, jerks), limits, yaw, corridors)
 
@@ -85,9 +82,6 @@ def minimum_jerk(
         corridors: As for ``minimum_snap``. () or (n - 1,)
         velocities: As for ``minimum_snap``. (n, 3)
         accelerations: As for ``minimum_snap``. (n, 3)
-
-    Raises:
-        ConfigError: As for ``minimum_snap``.
     """
     return _plan_trajectory(waypoints, durations, (velocities, accelerations), limits, yaw, corridors)
 

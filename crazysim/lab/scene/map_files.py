@@ -48,7 +48,6 @@ def read_map(path: str | Path) -> MapFile:
 
     Raises:
         DamagedFileError: If the file is damaged, cut off, or of another kind.
-        ConfigError: If it does not exist, or has another suffix, no points, or coordinates that are not finite.
     """
     reader = MAP_READERS.get(Path(path).suffix.lower())
     if reader is None:

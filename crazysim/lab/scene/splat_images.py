@@ -127,7 +127,6 @@ def import_splax() -> ModuleType:
 
     Raises:
         ImportError: If it is not installed.
-        ConfigError: If SciPy was imported before, without the setting that splax needs.
     """
     try:
         import splax

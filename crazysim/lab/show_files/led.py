@@ -53,10 +53,6 @@ def decode_lights(
         until: Time at which the program is stopped, s; endless loops end there.
         location: File and location in it, for messages.
         max_repeated: Largest number of commands that loops and jumps may repeat.
-
-    Raises:
-        ConfigError: If the program is malformed: an unknown command, a missing argument, a jump to nowhere, loops that
-            are too deep or never advance in time, or too many commands.
     """
     if isinstance(program, str):
         try:

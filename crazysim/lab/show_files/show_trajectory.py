@@ -34,9 +34,6 @@ def parse_trajectory(value: object, location: str, yaw_control: object = None) -
         location: File and location in it, for messages.
         yaw_control: Skybrush's ``yawControl`` object, whose setpoints, degrees, are connected linearly and replace the
             yaw of the points; None if there is none.
-
-    Raises:
-        ConfigError: If the trajectory is invalid; the message names the location.
     """
     value = checks.require_object(value, location)
     checks.require_version_one(value, location)

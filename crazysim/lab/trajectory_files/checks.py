@@ -36,11 +36,7 @@ def raise_error(expected: str, got: str, location: str) -> NoReturn:
 
 
 def parse_json(content: bytes | str, location: str) -> Any:
-    """Return the value of a JSON document.
-
-    Raises:
-        ConfigError: If the content is not valid JSON.
-    """
+    """Return the value of a JSON document."""
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -48,9 +48,6 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
         ends: End of each piece, s. (n_pieces,)
         coefficients: Coefficients of x, y, z, m, and yaw, rad, in the pieces' times scaled to [0, 1]. (n_pieces, 4,
             degree + 1)
-
-    Raises:
-        ConfigError: If a piece begins more than a millimetre or 0.1 degrees, plus rounding, from the previous end.
     """
     end_values = coefficients[:-1].sum(axis=-1)
     jumps = np.abs(coefficients[1:, :, 0] - end_values)

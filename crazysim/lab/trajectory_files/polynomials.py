@@ -42,9 +42,6 @@ def pack_poly4d(trajectory: Trajectory) -> bytes:
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
-
-    Raises:
-        ConfigError: If its degree is higher.
     """
     return trajectory_rows(trajectory).astype("<f4")[:, [*range(1, POLY4D_FLOATS), 0]].tobytes()
 
@@ -55,9 +52,6 @@ def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Traj
     Args:
         content: Contents of the memory.
         location: File, for messages.
-
-    Raises:
-        ConfigError: If the size is wrong, or a number is out of range.
     """
     return Trajectory.of_pieces(*read_poly4d(content, location))
 
@@ -124,10 +118,6 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
-
-    Raises:
-        ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the previous piece
-            ends, or a coordinate exceeds 32.767 m or 3276.7 degrees, the largest values of 16 bits.
     """
     ends, c = _crazyflie_pieces(trajectory)
     require_no_jumps(ends, c)
@@ -163,9 +153,6 @@ def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> 
     Args:
         content: Contents of the memory; bytes after a piece of zero duration are ignored.
         location: File, for messages.
-
-    Raises:
-        ConfigError: If the contents end within a piece, have no piece, or are too long.
     """
     durations, pieces, _ = read_compressed(content, location)
     if not len(pieces):

@@ -88,11 +88,7 @@ class Comparison:
 
 
 def read_flight(path: str | Path) -> Flight:
-    """Return the flight of a log of NanoBench, a table with ``COLUMNS``.
-
-    Raises:
-        ConfigError: If a column is missing, or there is no setpoint.
-    """
+    """Return the flight of a log of NanoBench, a table with ``COLUMNS``."""
     path = Path(path)
     columns = read_columns(path, COLUMNS)
     t, logged_pos, setpoints = columns[0], columns[1:4], columns[4:]
@@ -121,9 +117,6 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
     Args:
         name: Name of the log, for messages.
         height: Height of the setpoint, m. (n,)
-
-    Raises:
-        ConfigError: If no setpoint is above the floor.
     """
     commanded = np.flatnonzero(height > 0)
     require(len(commanded), f"{name}: expected a setpoint above the floor, got none. Give the log of a flight.")

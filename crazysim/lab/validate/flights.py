@@ -27,11 +27,7 @@ IDSIA_MASS = 0.045
 
 
 def find_logs(folder: Path, pattern: str) -> list[Path]:
-    """Return the logs of a folder, ``.npz`` and ``.csv``, sorted.
-
-    Raises:
-        ConfigError: If there are none.
-    """
+    """Return the logs of a folder, ``.npz`` and ``.csv``, sorted."""
     paths = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
     require(
         paths,

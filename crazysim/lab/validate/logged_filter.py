@@ -35,9 +35,6 @@ def read_filter_log(path: Path) -> dict[str, NDArray]:
 
     The names are ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and ``quat`` of motion capture (see ``thrust_attitudes``),
     ``est_pos`` and ``est_quat`` of the filter on board, and ``goal``, m.
-
-    Raises:
-        ConfigError: If a column is missing, or there is no setpoint.
     """
     names = {
         "accel": [f"imu_acc_{k}" for k in "xyz"],

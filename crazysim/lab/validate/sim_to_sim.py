@@ -130,11 +130,7 @@ def export_policy(name: str, folder: Path | None = None) -> ExportedPolicy:
 
 
 def compile_header(header: Path, n_obs: int, n_actions: int) -> PolicyFunction:
-    """Return the function of an exported C header, compiled next to it.
-
-    Raises:
-        ConfigError: If there is no compiler.
-    """
+    """Return the function of an exported C header, compiled next to it."""
     if (compiler := native.compiler()) is None:
         raise ConfigError("expected a C++ compiler for the policies in C, got none. Install g++ or set CXX.")
     source, library = header.with_suffix(".cpp"), header.with_suffix(".so")

@@ -139,7 +139,6 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
     Raises:
         UnknownNameError: If the source is neither the name of a vehicle nor a file.
-        ConfigError: If a table or key is unknown or missing, or a number is out of range.
     """
     return _load_model(source, ())
 

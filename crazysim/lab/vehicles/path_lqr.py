@@ -53,11 +53,7 @@ class PathLQR(PathController):
     """Weight of the steering angle."""
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PathLQRGains:
-        """Return the gains, computed in float64.
-
-        Raises:
-            ConfigError: If no gain stabilises the vehicle, or a weight has the wrong shape.
-        """
+        """Return the gains, computed in float64."""
         speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
         Q, R = weight_matrix("Q", self.Q, 4), weight_matrix("R", [self.R], 1)
         table = solve_on_host(GAIN_FUNCTIONS[vehicle.dynamics], car, speeds.ravel(), 1 / freq, Q, R)

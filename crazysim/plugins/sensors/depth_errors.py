@@ -108,11 +108,7 @@ class Distortion:
         )
 
     def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points at distance 1 that have image positions, the inverse of ``distort``. (...) each
-
-        Raises:
-            ConfigError: If an image position has no point, or several, because the distortion folds the image.
-        """
+        """Return the points at distance 1 that have image positions, the inverse of ``distort``. (...) each"""
         # (u, v) is the point, (a, b) its image position, and xx, xy, yy are the derivatives at the point.
         u, v = x.copy(), y.copy()
         with np.errstate(all="ignore"):

@@ -18,9 +18,6 @@ def add_cflib_driver(swarm: Swarm) -> list[str]:
 
     It may be called before or after ``cflib.crtp.init_drivers()``. If two swarms have drones of the same name, the
     swarm that was added last takes precedence.
-
-    Raises:
-        ConfigError: If cflib is not installed.
     """
     with optional_import("links of cflib need", "cflib", "radio", ConfigError):
         import cflib.crtp

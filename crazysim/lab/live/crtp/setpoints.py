@@ -23,7 +23,6 @@ def handle_generic(commander: Commander, data: bytes) -> None:
     """Carry out the command in a packet to the generic commander: a type, then numbers (crtp_commander_generic.c).
 
     Raises:
-        ConfigError: If the commander refuses the command, or the type is not supported.
         struct.error: If the data have a wrong length.
     """
     kind, content = data[0], data[1:]
@@ -53,7 +52,6 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
     The layout is defined in crtp_commander_high_level.c.
 
     Raises:
-        ConfigError: If the commander refuses the command, or the type is not supported.
         struct.error: If the data have a wrong length.
     """
     kind, content = data[0], data[1:]

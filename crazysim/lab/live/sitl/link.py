@@ -80,11 +80,7 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
 
 
 def bind_socket(kind: socket.SocketKind, host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a port of this machine.
-
-    Raises:
-        ConfigError: If the port has no valid number, or is in use.
-    """
+    """Return a socket that is bound to a port of this machine."""
     check_address(host, port)
     bound_socket = socket.socket(socket.AF_INET, kind)
     if kind == socket.SOCK_STREAM:

@@ -94,9 +94,6 @@ class SoftwareInTheLoop(Closeable):
             seconds: Simulated time, s.
             speed: Simulated seconds per second, or ``"max"``; None for real time with a firmware that has a clock
                 of its own, and as fast as possible in lockstep.
-
-        Raises:
-            ConfigError: If the time or the speed is out of range, or a firmware does not answer in time.
         """
         seconds = read_number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:

@@ -103,11 +103,7 @@ class Parameters(Mapping[str, float]):
         return np.array([self._values[name] for name in INITIAL_POSE])
 
     def get_value(self, name: str) -> float:
-        """Return the value of a parameter.
-
-        Raises:
-            ConfigError: If the simulation does not have the parameter.
-        """
+        """Return the value of a parameter."""
         self._require_parameter(name)
         return self._values[name]
 
