@@ -181,6 +181,7 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
         create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
         findings = check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
         return int(bool(findings))
+    require(options.tune or not options.tune_seconds, "expected --tune-seconds with --tune, got it alone. Add --tune.")
     if options.tune:
         settings["config"] |= _tune(options, settings)
     if options.seeds is None and not options.sweep:

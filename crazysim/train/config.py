@@ -29,7 +29,7 @@ ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 WORLDS = {"cpu": 2048, "gpu": 4096}
 """Default number of parallel worlds, by platform."""
 DEMONSTRATIONS = 80
-"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it."""
+"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it; at most half."""
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,6 @@ def _own_recipe(task: str) -> Recipe:
         recipe = DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
     fields = {f.name for f in dataclasses.fields(Recipe)} - {"config"}
     config = recipe.config | {name: value for name, value in cls.recipe.items() if name not in fields}
-    if recipe.algorithm == "ppo" and hasattr(cls, "demonstrate"):
-        config = {"demonstrations": DEMONSTRATIONS} | config
     given = {name: value for name, value in cls.recipe.items() if name in fields}
     return dataclasses.replace(recipe, **given, config=config)
 
@@ -280,6 +278,8 @@ class TrainConfig:
         for name, value in (("options", options), ("config", config)):
             expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
+        if recipe.algorithm == "ppo" and hasattr(entry.task, "demonstrate") and "demonstrations" not in config:
+            config["demonstrations"] = min(DEMONSTRATIONS, int(config.get("iterations", ppo.Config.iterations)) // 2)
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
         if devices is not None:

@@ -182,7 +182,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
     state, hidden = env.reset(k_env), config.hidden if network is None else ()
     terms, names = terms_of(state.info), dict(config.rewards)
-    expect(names.keys() <= terms.keys(), f"factors of terms of the reward among {', '.join(terms)}", list(names))
+    expect(names.keys() <= terms.keys(), f"rewards of terms among {', '.join(terms)}", list(names))
     obs = policy_obs(state.obs, config.critic)
     images = images_of(env, obs) if config.convolution else ()
     network = choose_network(config.memory, network, config.convolution, images)
@@ -358,14 +358,21 @@ def check_demonstration(env: Env) -> None:
         hasattr(env.task, "demonstrate"),
         f"expected a task with demonstrations, got {name}. Define demonstrate(obs), or use demonstrations=0.",
     )
+    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
     try:
-        action = jax.eval_shape(env.task.demonstrate, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+        action = jax.eval_shape(env.task.demonstrate, obs)
     except Exception as error:
+        remedy = "Make it a @staticmethod, or use demonstrate(self, obs)."
+        if isinstance(error, KeyError):
+            remedy = f"The observations are {', '.join(obs)}."
         raise ConfigError(
             f"expected {name}.demonstrate(obs) as a function from observations to actions {shape}, got "
-            f"{type(error).__name__}: {str(error)[:300]}. Make it a @staticmethod, or use demonstrate(self, obs)."
+            f"{type(error).__name__}: {str(error)[:300]}. {remedy}"
         ) from error
-    expect(getattr(action, "shape", None) == shape, f"actions {shape} of demonstrate(obs)", action)
+    got = getattr(action, "shape", action)
+    expect(
+        got == shape, f"{name}.demonstrate(obs) of shape {shape}, in [-1, 1] as {env.sim.control.value} commands", got
+    )
 
 
 def log_prob(mean: Array, log_std: Array, action: Array) -> Array:

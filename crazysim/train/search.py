@@ -20,6 +20,7 @@ from jax import Array
 
 from crazysim.core.settings import find_device
 from crazysim.engine.cache import announce_if_slow, keep_programs
+from crazysim.envs.registry import entry_of
 from crazysim.envs.state import terms_of
 from crazysim.envs.task import Task
 from crazysim.envs.wrappers import RewardTerms
@@ -62,7 +63,7 @@ class Size:
     n_worlds: int
     """Number of worlds of each."""
     iterations: int = 100
-    """Number of iterations of a round."""
+    """Number of iterations of a round; fewer if the training has fewer."""
 
 
 SIZES = {"cpu": Size(300.0, 4, 512), "gpu": Size(60.0, 16, 2048)}
@@ -120,7 +121,7 @@ def tune(
     candidates = [Candidate({}), *(trial.draw(random) for _ in range(trial.size.n_places - 1))]
     log(
         f"searching {', '.join(trial.names)} for {seconds:.0f} s: {trial.size.n_places} policies a round, each "
-        f"{trial.size.iterations} iterations in {trial.size.n_worlds:,} worlds"
+        f"{trial.iterations} iterations in {trial.size.n_worlds:,} worlds"
     )
     n_places, best = trial.size.n_places, candidates[0]
     for number in range(1, MAX_ROUNDS + 1):
@@ -139,13 +140,18 @@ def tune(
         log(f"round {number}: {_describe(best, trial.unit)}; {time.perf_counter() - start_time:.0f} s")
         if time.perf_counter() - start_time + duration > seconds:  # the next round would not end in time
             break
+    recipe = best.settings if best.score[0] else {}
     if folder is not None:
-        _write(as_path(folder), trial, candidates, best, log)
-    if best.settings:
-        log(f"to keep it, write into the class: recipe = {json.dumps(best.settings)}")
+        _write(as_path(folder), trial, candidates, recipe, log)
+    if number == 1:
+        log(f"one round is partly luck, since the best of {n_places} was taken; use --tune-seconds {5 * seconds:g}")
+    if not best.score[0]:
+        log("no policy succeeded, so nothing is changed; see --check, and define demonstrate(obs)")
+    elif recipe:
+        log(f"to keep it, write into the class: recipe = {json.dumps(trial.class_recipe | recipe)}")
     else:
         log("nothing better than the settings with which the search began was found")
-    return best.settings
+    return recipe
 
 
 class _Trial:
@@ -155,8 +161,10 @@ class _Trial:
         platform = find_device(config.options.get("device", "cpu")).platform
         self.size = SIZES["cpu" if platform == "cpu" else "gpu"]
         n_places, n_worlds = self.size.n_places, self.size.n_worlds
-        n_shown = min(config.config["demonstrations"], self.size.iterations // 4)
-        hyperparameters = config.config | {"iterations": self.size.iterations, "demonstrations": n_shown}
+        self.iterations = min(self.size.iterations, config.config["iterations"])
+        n_shown = min(config.config["demonstrations"], self.iterations // 4)
+        hyperparameters = config.config | {"iterations": self.iterations, "demonstrations": n_shown}
+        self.class_recipe = dict(entry_of(config.task).task.recipe)
         self.config = dataclasses.replace(config, n_worlds=n_worlds, config=hyperparameters)
         env = self.config.make_training_env(n_places)
         self.eval_env, self.unit = self.config.make_env(n_places * N_STARTS), env.task.unit
@@ -210,13 +218,13 @@ class _Trial:
             learner = self.advance(learner, values)
             evaluations = [self._evaluate(learner)]
         i = 1
-        for i in range(2, self.size.iterations + 1):
+        for i in range(2, self.iterations + 1):
             learner = self.advance(learner, values)
-            if i * N_EVALUATIONS % self.size.iterations == 0:
+            if i * N_EVALUATIONS % self.iterations < N_EVALUATIONS:
                 evaluations.append(self._evaluate(learner))
                 if time.perf_counter() > deadline:
                     break
-        if i < self.size.iterations and any(candidate.curves for candidate in candidates):
+        if i < self.iterations and any(candidate.curves for candidate in candidates):
             return  # a round that was cut short does not count against others
         for i, (candidate, _) in enumerate(places):
             results = [evaluation[i] for evaluation in evaluations[1:]]
@@ -236,16 +244,19 @@ def _describe(candidate: Candidate, unit: str) -> str:
 
 
 def _write(
-    folder: Path, trial: _Trial, candidates: list[Candidate], best: Candidate, log: Callable[[str], None]
+    folder: Path, trial: _Trial, candidates: list[Candidate], recipe: dict[str, Any], log: Callable[[str], None]
 ) -> None:
     make_folder(folder)
     rows = [dataclasses.asdict(candidate) | {"success": candidate.score[0]} for candidate in candidates]
-    write_file(folder / TUNE_FILE, json.dumps({"recipe": best.settings, "candidates": rows}, indent=1))
+    size = {"iterations": trial.iterations, "n_worlds": trial.size.n_worlds, "n_starts": N_STARTS}
+    found = {"recipe": recipe, **size, "start": trial.config.config, "candidates": rows}
+    write_file(folder / TUNE_FILE, json.dumps(found, indent=1))
     first = {name: trial.config.config[name] for name in trial.ranges} | dict.fromkeys(trial.terms, 1.0)
     settings = [first | candidate.settings | candidate.settings.get("rewards", {}) for candidate in candidates]
     values = {name: [x[name] for x in settings] for name in trial.names}
     try:
-        plot_search(values, [candidate.score[0] for candidate in candidates], folder / "tune.png")
+        success = [candidate.score[0] for candidate in candidates]
+        plot_search(values, success, [x.settings for x in candidates].index(recipe), folder / "tune.png")
         log(f"wrote {folder / TUNE_FILE}, {folder / 'tune.png'}")
     except ImportError as error:
         log(f"wrote {folder / TUNE_FILE}; no plot: {error}")

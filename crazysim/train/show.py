@@ -112,12 +112,13 @@ def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path, uni
     _save_figure(figure, path)
 
 
-def plot_search(values: dict[str, list[float]], success: list[float], path: Path) -> None:
+def plot_search(values: dict[str, list[float]], success: list[float], best: int, path: Path) -> None:
     """Plot the success of all candidates of a search, %, over each of their settings.
 
     Args:
         values: Value of each candidate, by the name of the setting.
         success: Success of each candidate, %.
+        best: Index of the candidate that was chosen, which gets a cross.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -126,7 +127,9 @@ def plot_search(values: dict[str, list[float]], success: list[float], path: Path
     figure, axes = _make_figure(len(values))
     for axis, (name, x) in zip(axes, values.items(), strict=True):
         axis.scatter(x, success, s=12)
+        axis.plot(x[best], success[best], "rx")
         axis.set(xlabel=name, ylabel="success, %", ylim=SUCCESS_LIMITS)
+        axis.locator_params(axis="x", nbins=4)
     _save_figure(figure, path)
 
 

@@ -664,11 +664,12 @@ def _iteration_bar(total: int, n_done: int, enabled: bool, run: _Run) -> Iterato
         shown: dict[str, str] = {}
 
         def show(metrics: dict[str, Any], iterations: int = 1) -> None:
-            shown.update({k: f"{np.median(metrics[k]):.3f}" for k in ("success", "error", "reward") if k in metrics})
+            numbers = {k: float(np.median(metrics[k])) for k in ("success", "error", "reward") if k in metrics}
+            shown.update({k: "none" if math.isnan(x) else f"{x:.3f}" for k, x in numbers.items()})
             bar.set_postfix(shown, refresh=False)
             bar.update(iterations)
             if bar.disable and not iterations:  # no terminal: a line at each evaluation
-                numbers = ", ".join(f"{name} {value}" for name, value in shown.items())
-                run.log(f"iteration {int(run.learner.iteration)} of {total}: {numbers}; {run.seconds:.0f} s")
+                text = ", ".join(f"{name} {value}" for name, value in shown.items())
+                run.log(f"iteration {int(run.learner.iteration)} of {total}: {text}; {run.seconds:.0f} s")
 
         yield show

@@ -65,7 +65,9 @@ def test_a_search_compares_settings_and_then_seeds(tmp_path):
     assert all(0.9 <= x["gae_lambda"] <= 0.99 and x["rewards"].keys() == set(reward_terms()) for x in drawn)
     assert len({str(x) for x in drawn}) == len(drawn)
     assert (tmp_path / "tune.png").exists()
-    assert "4 policies a round" in lines[0]
+    assert "4 policies a round, each 5 iterations" in lines[0]
+    assert ("no policy succeeded" in lines[-1]) == (first["success"] == 0)
+    assert not recipe or first["success"] > 0
     TrainConfig.create("hover", config=recipe)  # a recipe that trains
 
 
@@ -104,7 +106,7 @@ def test_factors_change_the_terms_of_the_reward():
     tripled = fly(**{names[0]: 3.0})
     np.testing.assert_allclose(tripled - fly(), 2 * alone[0], atol=1e-5)
     assert np.abs(tripled - fly()).max() > 1e-4
-    with pytest.raises(ConfigError, match=r"among .*, got \['wrong'\]"):
+    with pytest.raises(ConfigError, match=r"rewards of terms among .*, got \['wrong'\]"):
         fly(wrong=2.0)
 
 
@@ -137,7 +139,8 @@ def test_demonstrations_are_learnt_and_then_improved():
 
 
 def test_a_class_with_a_demonstration_begins_with_it():
-    assert TrainConfig.create(TASK).config["demonstrations"] > 0
+    assert TrainConfig.create(TASK).config["demonstrations"] == 80
+    assert TrainConfig.create(TASK, config={"iterations": 50}).config["demonstrations"] == 25
     assert TrainConfig.create(TASK, config={"demonstrations": 0}).config["demonstrations"] == 0
     assert TrainConfig.create("hover").config["demonstrations"] == 0
 
@@ -146,7 +149,8 @@ def test_a_class_with_a_demonstration_begins_with_it():
     ("task", "message"),
     [
         (Hover, "demonstrations, got Hover.*demonstrations=0"),
-        (type("Flat", (Hover,), {"demonstrate": lambda self, obs: obs["vel"]}), r"actions \(2, 1, 4\) of demonstrate"),
+        (type("Flat", (Hover,), {"demonstrate": lambda self, obs: obs["vel"]}), r"shape \(2, 1, 4\).*got \(2, 1, 3\)"),
+        (type("Typo", (Hover,), {"demonstrate": lambda self, obs: obs["gaol"]}), "observations are .*vel"),
         (type("NoSelf", (Hover,), {"demonstrate": lambda obs: obs}), "@staticmethod"),
     ],
 )
