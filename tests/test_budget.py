@@ -24,7 +24,7 @@ BUDGET = {
     "plugins": 4874,
     "scene": 2569,
     "sim": 914,
-    "train": 2434,
+    "train": 2453,
     "trajectories": 496,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
