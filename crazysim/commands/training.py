@@ -63,8 +63,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "first search hyperparameters, or --tune rewards also factors of the terms of the reward, and train with the "
         "best; print them, and write them as tune.json"
     )
-    searches = ("hyperparameters", "rewards")
-    add("--tune", nargs="?", const=searches[0], choices=searches, help=tune_help)
+    add("--tune", nargs="?", const="hyperparameters", choices=("hyperparameters", "rewards"), help=tune_help)
     tune_seconds_help = "time for the search, s; by default 60 on a GPU, 300 on a CPU"
     add("--tune-seconds", type=size(60), metavar="SECONDS", help=tune_seconds_help)
 
