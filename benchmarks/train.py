@@ -45,7 +45,7 @@ from measure import describe_machine, round_digits, run_in_process
 import crazysim
 from crazysim.commands.training import parse_seeds
 from crazysim.envs.registry import TASKS, entry_of
-from crazysim.train.config import RECIPES, Recipe, TrainConfig
+from crazysim.train.config import ALGORITHMS, RECIPES, WORLDS, Recipe
 from crazysim.train.show import read_curve
 from crazysim.train.training import CHECKPOINT_FILE, TEACHER_FOLDER, kept_point, least_kept_success, stored_configs
 from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
@@ -154,9 +154,9 @@ def group_runs(keys: list[tuple[Any, ...]], max_size: int) -> list[list[tuple[An
         subgroups += [group[i : i + size] for i in range(0, len(group), size)]
 
     def n_samples(subgroup: list[tuple[Any, ...]]) -> int:
-        config = TrainConfig.create(subgroup[0][0])
-        settings = config.algorithm_config()
-        return len(subgroup) * config.n_worlds * settings.iterations * settings.n_steps
+        recipe = RECIPES.get(subgroup[0][0], Recipe())
+        config = ALGORITHMS[recipe.algorithm].Config(**recipe.config)
+        return len(subgroup) * (recipe.n_worlds or WORLDS["gpu"]) * config.iterations * config.n_steps
 
     return sorted(subgroups, key=n_samples, reverse=True)
 
