@@ -213,21 +213,19 @@ class _Trial:
         base = self.config.config
         configs = [ppo.Config(**base | candidate.settings) for candidate, _ in places]
         values = jax.device_put(stack_configs(configs).values, self.eval_env.sim.device)
+        device, evaluations = self.eval_env.sim.device, []
         with announce_if_slow("compiling the search", "10 to 60 s"):
-            learner = self.init(jax.device_put(np.array([seed for _, seed in places]), self.eval_env.sim.device))
-            learner = self.advance(learner, values)
-            evaluations = [self._evaluate(learner)]
-        i = 1
-        for i in range(2, self.iterations + 1):
-            learner = self.advance(learner, values)
-            if i * N_EVALUATIONS % self.iterations < N_EVALUATIONS:
+            learner = self.advance(self.init(jax.device_put(np.array([seed for _, seed in places]), device)), values)
+        for n_done in range(1, self.iterations + 1):
+            learner = learner if n_done == 1 else self.advance(learner, values)
+            if n_done * N_EVALUATIONS % self.iterations < N_EVALUATIONS:
                 evaluations.append(self._evaluate(learner))
-                if time.perf_counter() > deadline:
+                if time.perf_counter() > deadline and n_done < self.iterations:
+                    if any(candidate.curves for candidate in candidates):
+                        return  # a round that is cut short does not count against others
                     break
-        if i < self.iterations and any(candidate.curves for candidate in candidates):
-            return  # a round that was cut short does not count against others
         for i, (candidate, _) in enumerate(places):
-            results = [evaluation[i] for evaluation in evaluations[1:]]
+            results = [evaluation[i] for evaluation in evaluations]
             candidate.curves.append([result["success"] for result in results])
             errors = [result["error"] for result in results if result["error"] == result["error"]]
             candidate.errors.append(min(errors, default=1e9))
