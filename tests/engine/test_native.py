@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from random import Random
 
 import pytest
 from cases import shared_sim
@@ -272,26 +273,36 @@ def compiler_commands(folder):
     return [line for line in done.stdout.splitlines() if str(folder) in line and "kernel.cpp" in line]
 
 
-def test_a_compiler_that_is_killed_by_an_interrupt_does_not_refuse_its_kernel():
+@pytest.mark.parametrize("ended", [False, True])
+def test_an_interrupt_at_any_time_kills_all_compilers(ended):
     """``KernelError`` would make another engine compile for minutes in a program that is to end."""
     slow = "constexpr long f() { long s = 0; for (long i = 0; i < 1000000000; i++) s += i; return s; }"
     slow += "constexpr long x = f();"
     flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
     command = [*native.compiler_command(), *flags]
-    futures = []
+    random = Random(1)
+    for _ in range(20):
+        futures = []
 
-    def interrupt_when_the_compiler_runs():
-        with native.compiling_threads(1) as pool:
-            futures.append(pool.submit(native._compile, command, slow))
-            while not native._COMPILER_PIPES:
-                time.sleep(0.01)
-            raise KeyboardInterrupt
+        def interrupt_after(seconds, futures=futures):
+            signal.setitimer(signal.ITIMER_REAL, seconds)
+            with native.compiling_threads(2) as pool:
+                futures.extend(pool.submit(native._compile, command, slow) for _ in range(4))
+                if not ended:
+                    time.sleep(60)
 
-    with pytest.raises(KeyboardInterrupt):
-        interrupt_when_the_compiler_runs()
-    assert isinstance(futures[0].exception(), RuntimeError)
-    assert not isinstance(futures[0].exception(), KernelError)
-    assert not native._INTERRUPTED.is_set()
+        previous = signal.signal(signal.SIGALRM, signal.default_int_handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                interrupt_after(random.uniform(0.01, 0.05))
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, previous)
+        for future in futures:
+            if not future.cancelled():
+                assert isinstance(future.exception(), RuntimeError)
+                assert not isinstance(future.exception(), KernelError)
+        assert not native._COMPILER_PIPES
 
 
 @pytest.mark.long("three processes import JAX")

@@ -293,22 +293,21 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     Args:
         n: Number of threads; None for the default of ``ThreadPoolExecutor``.
     """
-    try:
-        with ThreadPoolExecutor(n) as executor:
-            try:
-                yield executor
-            except (KeyboardInterrupt, SystemExit):
-                executor.shutdown(wait=False, cancel_futures=True)
-                _INTERRUPTED.set()
-                for pipe in list(_COMPILER_PIPES):
-                    pipe.close()
-                raise
-    finally:
-        _INTERRUPTED.clear()
+    interrupted = getattr(_THREAD, "interrupted", None) or threading.Event()  # threads of threads end with them
+    with ThreadPoolExecutor(n, initializer=setattr, initargs=(_THREAD, "interrupted", interrupted)) as executor:
+        try:
+            yield executor
+            executor.shutdown()
+        except (KeyboardInterrupt, SystemExit):
+            interrupted.set()
+            for pipe in list(_COMPILER_PIPES):
+                pipe.close()
+            executor.shutdown(cancel_futures=True)
+            raise
 
 
-_INTERRUPTED = threading.Event()
-"""Set after an interrupt, until the threads of ``compiling_threads`` have ended."""
+_THREAD = threading.local()
+"""``interrupted`` is the event of the threads that a thread belongs to: an interrupt has killed their compilers."""
 _COMPILER_PIPES: set[IO[str]] = set()
 """Pipes of the running compilers; closing a pipe kills its compiler."""
 
@@ -329,6 +328,9 @@ def _run_compiler(
             raise KernelError(f"{words[0]} cannot be run: {error}") from error
         with process:
             _COMPILER_PIPES.add(write_end)
+            interrupted = getattr(_THREAD, "interrupted", None)
+            if interrupted and interrupted.is_set():  # just now: it found no pipe to close
+                write_end.close()
             try:
                 stdout, stderr = process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
@@ -338,7 +340,8 @@ def _run_compiler(
                 ) from None
             finally:
                 _COMPILER_PIPES.discard(write_end)
+                killed = write_end.closed
                 write_end.close()
-    if _INTERRUPTED.is_set():
+    if killed:
         raise RuntimeError(f"{words[0]} was interrupted")
     return subprocess.CompletedProcess(list(words), process.returncode, stdout, stderr)
