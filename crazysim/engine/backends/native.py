@@ -328,11 +328,12 @@ def _run_compiler(
             raise KernelError(f"{words[0]} cannot be run: {error}") from error
         with process:
             _COMPILER_PIPES.add(write_end)
-            interrupted = getattr(_THREAD, "interrupted", None)
-            if interrupted and interrupted.is_set():  # just now: it found no pipe to close
+            if getattr(_THREAD, "interrupted", threading.Event()).is_set():  # just now: it found no pipe to close
                 write_end.close()
             try:
                 stdout, stderr = process.communicate(timeout=seconds)
+                if write_end.closed:
+                    raise RuntimeError(f"{words[0]} was interrupted")
             except subprocess.TimeoutExpired:
                 raise KernelError(
                     f"{words[0]} took longer than {seconds:g} s; set CRAZYSIM_COMPILE_TIMEOUT to a larger number of "
@@ -340,8 +341,5 @@ def _run_compiler(
                 ) from None
             finally:
                 _COMPILER_PIPES.discard(write_end)
-                killed = write_end.closed
                 write_end.close()
-    if killed:
-        raise RuntimeError(f"{words[0]} was interrupted")
     return subprocess.CompletedProcess(list(words), process.returncode, stdout, stderr)

@@ -20,21 +20,14 @@ def is_enabled() -> bool:
     return bool(os.environ.get(DUMP_VARIABLE))
 
 
-def write(name: str, text: str) -> Path | None:
+def write(name: str, text: str) -> None:
     """Write a text into the folder, in a file whose name begins with the process ID and a running number.
 
     Args:
         name: Name of the text, such as ``"attitude_controller.jaxpr"``; characters other than letters, digits, points
             and hyphens become underscores.
         text: Text to write.
-
-    Returns:
-        The file, or None if no folder is set.
     """
-    if not is_enabled():
-        return None
     folder = Path(os.environ[DUMP_VARIABLE])
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{os.getpid()}-{next(_file_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
-    write_file(file, text)
-    return file
+    write_file(folder / f"{os.getpid()}-{next(_file_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}", text)
