@@ -40,12 +40,7 @@ TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
 
 
 def check_flag(name: str, value: object) -> bool:
-    """Return a setting that is on or off.
-
-    Args:
-        name: Name of the setting, for messages.
-        value: The setting.
-    """
+    """Return a setting that is on or off."""
     expect(isinstance(value, (bool, np.bool_)), f"{name} as True or False", value)
     return bool(value)
 
@@ -63,10 +58,7 @@ def check_value(
     """Check a value by the types of its annotation.
 
     Args:
-        name: Name for messages.
-        value: The value.
         value_types: Types that it may have, from ``annotated_types``; empty for any.
-        allowed: Range of numbers.
         shapes: Shapes of numbers; None for any.
         whole: True for whole numbers, which they must be in any case if ``int`` is the only numeric type.
         remedy: Sentence for the end of messages.
@@ -145,7 +137,6 @@ def require_memory(what: str, n_bytes: float, remedy: str, device: jax.Device, n
         what: The arrays, for the message.
         n_bytes: Lower bound of their size, bytes.
         remedy: Sentence for the end of the message.
-        device: Device of the arrays, or one of several.
         n_devices: Number of devices among which the arrays are divided.
     """
     n_devices = 1 if device.platform == "cpu" else n_devices  # several on a host share its memory

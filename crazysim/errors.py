@@ -73,8 +73,6 @@ def address_message(host: str, port: int, error: Exception, prefix: str = "") ->
     """Return the message about an address at which a server cannot listen.
 
     Args:
-        host: Host of the address.
-        port: Port of the address.
         error: The error that was raised when the server tried to listen.
         prefix: Text before the name of the setting, such as ``"--"`` for an option of a command.
     """

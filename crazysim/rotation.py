@@ -168,8 +168,8 @@ def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = Tr
         q: Attitude, body to world, unit, xyzw. (..., 4)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         dt: Duration, s.
-        normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. Attitudes at
-            intermediate points of a Runge-Kutta step do not need it.
+        normalize: Whether to scale the result to unit length, which keeps rounding errors from accumulating. Attitudes
+            at intermediate points of a Runge-Kutta step do not need it.
     """
     is_float32 = ang_vel.dtype == jnp.float32
     if normalize:

@@ -76,7 +76,6 @@ def read_bytes(path: str | Path, max_bytes: int) -> bytes:
     """Return the contents of a file.
 
     Args:
-        path: The file.
         max_bytes: Largest size, bytes.
     """
     try:
@@ -131,7 +130,6 @@ def read_text(path: str | Path, max_bytes: int) -> str:
     """Return the contents of a text file, without a byte order mark.
 
     Args:
-        path: The file.
         max_bytes: Largest size, bytes.
     """
     try:
@@ -148,7 +146,6 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Args:
-        path: The file.
         guide: Page that describes the format, for messages.
     """
     text = read_text(path, MAX_TOML_BYTES)
@@ -166,7 +163,6 @@ def wrap_read_errors(path: str | Path, content: str, remedy: str) -> Iterator[No
     ``ImportError`` of a missing library, are passed on.
 
     Args:
-        path: The file.
         content: Description of its contents, such as ``"a recorded flight"``.
         remedy: Sentence about what to do.
 
@@ -215,12 +211,7 @@ def _machine() -> str:
 
 
 def remove_abandoned_files(folder: Path, pattern: str) -> None:
-    """Remove this user's files and folders of processes that have ended without removing them.
-
-    Args:
-        folder: Folder that holds them.
-        pattern: Pattern of their names.
-    """
+    """Remove this user's files and folders of processes that have ended without removing them."""
     for path in folder.glob(pattern):
         with suppress(OSError):
             status = path.lstat()
@@ -322,7 +313,6 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     """Check that a file can be written, before the work that produces its contents; an existing file is not changed.
 
     Args:
-        path: The file.
         suffixes: Accepted endings of its name; empty for any.
 
     Raises:
@@ -369,10 +359,6 @@ class ZipReader:
 
 def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
     """Return the arrays of an ``.npz`` file by name, after comparing their checksums.
-
-    Args:
-        file: The file.
-        name: Name of the file, for messages.
 
     Raises:
         Exception: Of any type, if it is damaged; see ``wrap_read_errors``.

@@ -85,11 +85,7 @@ def read_numbers(
     """Return a number or an array of numbers, checked and read-only, as float64, or int64 for whole numbers.
 
     Args:
-        name: Name for messages.
-        value: The number or array.
-        allowed: Range of all entries.
         shapes: Allowed shapes; None for any that is not empty.
-        whole: True for whole numbers.
         owner: Kind and name of the owner, for the beginning of messages.
         remedy: Sentence for the end of messages.
     """
@@ -107,12 +103,7 @@ def read_numbers(
 
 
 def read_floats(name: str, value: Any) -> NDArray[np.float64]:
-    """Return a number or an array of numbers of any shape in float64, read-only; NaN and infinity are allowed.
-
-    Args:
-        name: Name for messages.
-        value: The number or array.
-    """
+    """Return a number or an array of numbers of any shape in float64, read-only; NaN and infinity are allowed."""
     return _as_array(name, value)
 
 
@@ -159,8 +150,6 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n_rotors: int
     Args:
         owner: Kind and name of the number's owner, for messages.
         path: Table and key.
-        value: The number or array.
-        key: Its shapes and range.
         n_rotors: Number of rotors, the length ``"n"`` in shapes.
     """
     shapes = tuple(tuple(n_rotors if length == "n" else length for length in shape) for shape in key.shapes)

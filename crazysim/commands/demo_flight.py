@@ -47,16 +47,7 @@ def run_demo_flight(
     out: Path = Path("out"),
     film: bool = True,
 ) -> None:
-    """Fly, print figures, and write ``flight.journal``, ``tracks.png`` and ``flight.mp4`` into a folder.
-
-    Args:
-        n_worlds: Number of worlds.
-        n_drones: Number of drones per world.
-        seconds: Duration of the flight, s.
-        device: Device of the simulation, such as ``"cpu"``.
-        out: Folder of the files.
-        film: True to write a film.
-    """
+    """Fly, print figures, and write ``flight.journal``, ``tracks.png`` and ``flight.mp4`` into a folder."""
     require(
         1 / FPS <= seconds < math.inf,
         f"expected --seconds of at least {1 / FPS}, and finite, got {seconds}. Use 10, for example.",
@@ -134,7 +125,6 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
 
     Args:
         time: Time of every world, s. (n_worlds, 1)
-        n_drones: Number of drones.
 
     Returns:
         Position, velocity, acceleration, identity quaternion, zero body rates. (n_worlds, n_drones, 16)
@@ -165,7 +155,6 @@ def jerk_feedforward(time: Array, n_drones: int) -> Array:
 
     Args:
         time: Time of every world, s. (n_worlds, 1)
-        n_drones: Number of drones.
 
     Returns:
         Jerk, m/s^3, and zeros. (n_worlds, n_drones, 8)

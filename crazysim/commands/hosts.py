@@ -58,7 +58,6 @@ def run_on_hosts(command: Callable[[argparse.Namespace], int | None], options: a
     """Run a command on this host together with other hosts, and return the exit status.
 
     Args:
-        command: The command.
         options: Options of the command, including those of ``add_options``.
     """
     addresses = _host_addresses(options)

@@ -115,9 +115,7 @@ def load_policy_and_env(
     """Return the policy of a run, its configuration, and an environment with the observations of the policy.
 
     Args:
-        folder: Folder of the run.
         device: Device of the environment; None for the device of the training.
-        n_worlds: Number of worlds of the environment.
         task: Reference of the task, if it has moved since training; None for the reference in the run.
     """
     from crazysim.train.interface import check_policy

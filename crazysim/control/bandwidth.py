@@ -126,7 +126,6 @@ def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limi
     """Return the bandwidth of position and attitude loop of an airframe.
 
     Args:
-        airframe: The airframe.
         freq: Rate of the controller, Hz.
         lag_rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
         limits_reaction: True for a controller that does not compensate the reaction to accelerating rotors.

@@ -125,8 +125,6 @@ def attitude_torque(matrix: Array, ang_vel: Array, desired: Attitude, *, params:
     Args:
         matrix: Rotation matrix, body to world. (..., 3, 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-        desired: Attitude to track.
-        params: Gains and inertia.
 
     Returns:
         Torque, body frame, N m. (..., 3)

@@ -127,7 +127,6 @@ def indi_control(
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         setpoint: Setpoint with the leading axes of the state.
-        memory: Memory of the last tick.
         freq: Rate of this controller, Hz.
         params: Gains, shared or with the leading axes of the state.
 

@@ -80,10 +80,8 @@ def desired_force(
     Args:
         pos: Position, world frame, m. (..., 3)
         vel: Velocity, world frame, m/s. (..., 3)
-        setpoint: Setpoint.
         integral: Integral of the position error, m s. (..., 3)
         freq: Rate of this controller, Hz.
-        params: Gains.
     """
     p, error = params, setpoint.pos - pos
     integral = clip(integral + error / freq, -p.integral_max, p.integral_max)
@@ -111,9 +109,7 @@ def torque_of_rotation(
         axes_des: Desired rotation matrix. (..., 3, 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         ang_vel_des: Desired body rates, rad/s. (..., 3)
-        memory: Memory of the controller.
         freq: Rate of this controller, Hz.
-        params: Gains.
     """
     p, m = params, memory
     error = rotation_error(axes, axes_des)

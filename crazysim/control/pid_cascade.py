@@ -77,9 +77,7 @@ def desired_velocity(
         pos: Position, world frame, m. (..., 3)
         heading: Cosine and sine of the yaw. (..., 2)
         pos_des: Desired position, world frame, m. (..., 3)
-        memory: Memory of the loop.
         freq: Rate of this loop, Hz.
-        loop: Gains and limits.
 
     Returns:
         Desired velocity, heading frame, m/s (..., 3); new memory.
@@ -97,9 +95,7 @@ def desired_attitude(
         vel: Velocity, world frame, m/s. (..., 3)
         heading: Cosine and sine of the yaw. (..., 2)
         vel_des: Desired velocity, heading frame, m/s. (..., 3)
-        memory: Memory of the loop.
         freq: Rate of this loop, Hz.
-        params: Gains and limits of the cascade.
 
     Returns:
         Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); new memory.
@@ -121,9 +117,7 @@ def desired_rates(
     Args:
         rpy: Roll, pitch, yaw, degrees. (..., 3)
         rpy_des: Desired roll, pitch, yaw, degrees. (..., 3)
-        memory: Memory of the loop.
         freq: Rate of this loop, Hz.
-        loop: Gains and limits.
     """
     return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, is_angle=(False, False, True))
 
@@ -136,9 +130,7 @@ def desired_torque(
     Args:
         ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
         ang_vel_des: Desired angular velocity, body frame, degrees/s. (..., 3)
-        memory: Memory of the loop.
         freq: Rate of this loop, Hz.
-        loop: Gains and limits.
     """
     torque, memory = pid_step(ang_vel_des - ang_vel, ang_vel, memory, freq, loop=loop)
     return clip(torque, -TORQUE_MAX, TORQUE_MAX), memory

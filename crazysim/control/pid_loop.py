@@ -88,7 +88,7 @@ class PIDLoopMemory(PyTree):
         Args:
             mask: True where the loops are reset. (1,)
             measured: New last measured values. (3,)
-            resets_filter: True to reset the filter of the derivative too.
+            resets_filter: Whether to reset the filter of the derivative too.
         """
         return PIDLoopMemory(
             integral=None if self.integral is None else jnp.where(mask, 0.0, self.integral),
@@ -115,7 +115,6 @@ def pid_step(
     Args:
         error: Desired minus measured values. (..., 3)
         measured: Measured values. (..., 3)
-        memory: Memory of the loops.
         freq: Rate, Hz.
         loop: Gains and limits, shared or with the leading axes of the error.
         is_angle: True for loops of angles in degrees that wrap around.
@@ -144,10 +143,8 @@ def continue_integral(memory: PIDLoopMemory, output: Array, desired_output: Arra
     """Return the memory with integrals that give desired outputs, as far as the limits of the integrals allow.
 
     Args:
-        memory: Memory of the loops.
         output: Outputs with this memory. (3,)
         desired_output: Desired outputs. (3,)
-        loop: Gains and limits.
     """
     integral_max: Any = loop.integral_max
     if loop.ki is None:

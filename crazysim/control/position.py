@@ -71,7 +71,6 @@ def position_params(airframe: Airframe, delay: float, freq: int) -> PositionPara
     setpoint at a speed from which it can stop.
 
     Args:
-        airframe: The airframe.
         delay: Delay of the loop that follows the specific force, s.
         freq: Rate of the controller, Hz.
     """
@@ -116,7 +115,6 @@ def specific_force(
         vel: Velocity, world frame, m/s. (..., 3)
         known_acc: Acceleration by the known forces other than gravity, world frame, m/s^2. (..., 3)
         setpoint: Setpoint with the leading axes of the state.
-        memory: Memory of the last tick.
         freq: Rate of the controller, Hz.
         params: Gains and limits, shared or with the leading axes of the state.
 

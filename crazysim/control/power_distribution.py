@@ -61,7 +61,7 @@ def distribute_power(
         thrust: Thrust of each motor, PWM. (..., 1)
         torque: Torque about the body axes, PWM. (..., 3)
         params: Parameters, shared or with the leading axes of the command.
-        whole_numbers: True to truncate to integers where the firmware does; the gradient ignores the truncation.
+        whole_numbers: Whether to truncate to integers where the firmware does; the gradient ignores the truncation.
 
     Returns:
         PWM of each motor. (..., n_rotors)

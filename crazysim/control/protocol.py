@@ -148,9 +148,6 @@ class Controller:
 
         Args:
             data: ``SimData`` of one drone.
-            command: The setpoint.
-            memory: Memory of the drone.
-            params: Parameters of the drone.
         """
         raise NotImplementedError(f"controller {self.name!r} has an outer_freq, and does not define outer")
 
@@ -163,8 +160,6 @@ class Controller:
             command: Setpoint at the level ``state``; otherwise the command of the level that the controller follows.
                 This is the command in force at the level ``data.controls.mode``, or the command of the controller that
                 has this controller as ``inner``. (4,)
-            memory: Memory of the drone.
-            params: Parameters of the drone.
 
         Returns:
             A command of the level ``output``, such as collective thrust, N, and body torque, N m (4,), or rotor
@@ -182,7 +177,6 @@ class Controller:
             data: ``SimData`` of one drone.
             command: Setpoint or command, as in ``update``.
             memory: Memory at the time when the controller was last active.
-            params: Parameters of the drone.
             rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
         """
         return memory
@@ -191,7 +185,6 @@ class Controller:
         """Return the controller to use for a command level and dynamics; None if commands need none.
 
         Args:
-            control: Command level.
             fitted_model: Name of the fitted model; None for dynamics with rotors.
         """
         return self
@@ -227,7 +220,6 @@ def controller_chain(
 
     Args:
         controller: Controller of the command level; None if commands need none.
-        control: Command level.
 
     Returns:
         Pairs of a command level and the controller that follows it, the highest level first, and the level of the

@@ -99,11 +99,6 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
 
     If airframes have different numbers of rotors, axes over rotors are padded to the largest number. The padding
     repeats the last rotor in ``PER_ROTOR_FIELDS`` and is zero in other fields, such as a mixing matrix.
-
-    Args:
-        airframes: Airframe of each drone.
-        create: Function that returns the record of one airframe.
-        n_worlds: Number of worlds.
     """
     airframes = as_airframes(airframes)
     distinct_airframes = list({id(airframe): airframe for airframe in airframes}.values())

@@ -42,7 +42,6 @@ def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) 
 
     Args:
         condition: The condition. ()
-        fn: The function.
         value: Its argument, any tree of arrays.
     """
     carry = condition, value

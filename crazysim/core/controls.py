@@ -160,7 +160,6 @@ def check_same_controllers(controls: SimControls, reference: SimControls, name: 
     """Check that controllers have records of the same structure as in a simulation, with memory of the same shapes.
 
     Args:
-        controls: Commands and controllers to check.
         reference: Commands and controllers of the simulation.
         name: Name of the simulation's controller.
     """
@@ -235,10 +234,6 @@ class SimControls(PyTree):
         """Return the records of controllers at rest, with the gains of each drone's airframe.
 
         Args:
-            n_worlds: Number of worlds.
-            n_drones: Number of drones per world.
-            control: Command level.
-            dynamics: Dynamics model.
             airframes: Airframe of all drones, or of each.
             freqs: Rates at which commands of each level take effect, Hz.
             controller: Controller of the command level; None if commands need none.

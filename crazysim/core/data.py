@@ -104,10 +104,7 @@ class SimStateDeriv(PyTree):
         """Return a derivative of zeros.
 
         Args:
-            n_worlds: Number of worlds.
-            n_drones: Number of drones per world.
             device: Device of the arrays; None for NumPy arrays.
-            n_rotors: Number of rotors.
         """
         sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
         zeros = {name: host_array(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
@@ -279,9 +276,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
     """Return the parameters of drones for a dynamics model: shared, or one per drone where airframes differ.
 
     Args:
-        dynamics: Dynamics model.
         airframe: One airframe for all drones, or a list with one for each.
-        n_worlds: Number of worlds.
     """
     n_rotors = max_n_rotors(airframe)
 
@@ -324,8 +319,6 @@ def require_states(data: object, names: Iterable[str] = STATE_SIZES, *, batched:
     """Check that an argument is the data of a simulation, and shapes and types of its states.
 
     Args:
-        data: The argument.
-        names: States to check.
         batched: False to accept data of one world or of one drone, as functions of them receive it.
     """
     require_data(data)

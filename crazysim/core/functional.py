@@ -46,7 +46,7 @@ def state_control(
         data: Data of a simulation built with ``control="state"``.
         controls: Position, velocity, acceleration, quaternion (xyzw), body rates; None with ``pos``.
             (n_worlds, n_drones, 16)
-        check_finite: True to also check JAX arrays that are not traced, which waits for the device. Other input is
+        check_finite: Whether to also check JAX arrays that are not traced, which waits for the device. Other input is
             always checked.
         pos: Position, world frame, m; None with ``controls``. (..., 3)
         vel: Velocity, world frame, m/s, with ``pos``. (..., 3)
@@ -178,7 +178,6 @@ def stage_command(data: SimData, command: Array, feedforward: Array | None = Non
     commands at the next tick of their controller.
 
     Args:
-        data: The simulation.
         command: Command in the units of ``data.controls.mode``. (..., k)
         feedforward: Feedforward of a setpoint; None for ``default_feedforward(command)``. (..., 8)
     """

@@ -59,8 +59,6 @@ def hold_on_ground(s: SimState, deriv: SimStateDeriv, ground: Array | float) -> 
     the velocities of the previous step, which the stage that stops drones at the ground has set to zero.
 
     Args:
-        s: States.
-        deriv: Their derivative.
         ground: Height of the ground, world frame, m. (..., 1)
     """
     is_on_ground = (s.pos[..., 2:] == ground) | (s.pos[..., 2:] == ground + FLOOR_HEIGHT)
@@ -103,8 +101,6 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, is_final: b
     """Return the data advanced by ``dt`` seconds along a derivative.
 
     Args:
-        data: Data at the start of the step.
-        deriv: Derivative of the states.
         dt: Duration, s.
         is_final: True at the end of a step, to normalise quaternions and limit angular velocities. False at
             intermediate points of a step.

@@ -18,12 +18,7 @@ F = TypeVar("F")
 
 
 def check_pipeline(name: str, pipeline: object) -> Pipeline:
-    """Check and return a pipeline that a user assigns.
-
-    Args:
-        name: Name of the pipeline, for messages.
-        pipeline: The pipeline.
-    """
+    """Check and return a pipeline that a user assigns."""
     expect(
         isinstance(pipeline, dict) and pipeline,
         f"{name} as a dict with a function for each name of a stage",

@@ -115,10 +115,8 @@ def param(
         scope: ``"parameter"`` for a number for all drones or one per drone, ``"shared"`` for one for all drones, or
             ``"drone"`` for a state that begins an episode with this number; ``"member"`` in a population.
         airframe: Dotted path or function of the airframe that gives the number if it is None.
-        low: Smallest value allowed.
-        high: Largest value allowed.
-        positive: True to refuse zero and negative values.
-        per_axis: True to accept one number for all axes of a vector.
+        positive: Whether to refuse zero and negative values.
+        per_axis: Whether to accept one number for all axes of a vector.
         dtype: Type; None for the type of the states.
         whole: True for a whole number, of the type of the states unless ``dtype`` is another.
         shapes: Shapes of a shared number, ``"any"`` for an axis of any length.
@@ -209,7 +207,6 @@ def airframe_numbers(sim: Simulation, get_number: Callable[[Airframe], ArrayLike
     """Return a quantity of the airframes for ``check_parameter``: one value for all drones, or one per drone.
 
     Args:
-        sim: The simulation.
         get_number: Function from an airframe to a number or array. (*core)
         core: Shape with ``"rotors"`` to pad the arrays with zeros for rotors that a drone lacks; other shapes change
             nothing.
@@ -247,14 +244,12 @@ def check_parameter(
     """Return a setting as an array that all drones share, or with one entry per drone.
 
     Args:
-        sim: The simulation.
-        name: Name of the setting in messages.
         value: One number for every entry (not for vectors), ``core``, or (n_worlds, n_drones, *core); the last axis
             may be omitted where it has length one.
         core: Shape of the value of one drone.
         allowed: Range of all entries, such as ``crazysim.tables.range_between(low=0.0)``.
         dtype: Type; None for the type of the states.
-        per_axis: True to accept one number for all axes of a vector.
+        per_axis: Whether to accept one number for all axes of a vector.
         n_members: Number of members of a population, for a number of its members instead of the drones; it may also be
             (n_members, *core), the same in all worlds.
 
@@ -293,8 +288,6 @@ def bind_leaf(
     """Return the array of a field for all worlds.
 
     Args:
-        sim: The simulation.
-        name: Name of the field in messages.
         value: The user's number, or None.
         metadata: Declaration of the field.
         n_members: Number of members of the population to which the field belongs; None for a field of drones.
@@ -406,7 +399,6 @@ class Plugin(PyTree):
         """Return the plugin with arrays for its numbers and states: the given values, the user's, the airframe's or 0.
 
         Args:
-            sim: The simulation.
             values: Values of fields. If a value is None, the user's number is still checked.
         """
         bound: dict[str, Any] = {**values, "is_bound": True}
@@ -439,7 +431,6 @@ class Plugin(PyTree):
         """Return a stage that calls a method of this class on the plugin in ``data.plugins``.
 
         Args:
-            method: The method, such as ``self.discharge``.
             scope: Scope that the method is written for; None for ``self.scope``.
             when: As in ``crazysim.stage``.
             details: Further arguments of ``Stage``.
@@ -489,11 +480,7 @@ class Plugin(PyTree):
         return not all(f.metadata.get("static") for f in dataclasses.fields(cls))
 
     def record(self, sim: Simulation) -> PyTree | None:
-        """Return what ``data.plugins`` has for all worlds: the plugin with arrays, or None if it needs none.
-
-        Args:
-            sim: The simulation that the plugin is being added to.
-        """
+        """Return what ``data.plugins`` has for all worlds: the plugin with arrays, or None if it needs none."""
         if not self.has_arrays():
             return None
         remedy = "Return self.with_arrays(sim, ...) there."
@@ -689,12 +676,7 @@ def drawn_data(data: SimData) -> SimData:
 
 
 def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
-    """Return a list of plugins, after checking its type.
-
-    Args:
-        name: Name of the argument in messages.
-        plugins: The plugins.
-    """
+    """Return a list of plugins, after checking its type."""
     example = {"sensors": "IMU()", "camera": "Camera(16, 12)"}.get(name, "Wind()")
     is_list = isinstance(plugins, (list, tuple)) and all(isinstance(plugin, Plugin) for plugin in plugins)
     expect(is_list, f"{name} as a list of plugins", plugins, f"Use {name}=[{example}], say.")
@@ -706,7 +688,6 @@ def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
 
     Args:
         plugins: The plugins; if several measure the same state, the last one is used.
-        data: The data of one drone.
     """
     measured = {}
     for plugin in plugins:

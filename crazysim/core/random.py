@@ -27,8 +27,6 @@ def seed_sim(data: SimData, seed: int | Array, device: jax.Device | None = None)
     """Return the data with another seed or key for all random numbers drawn from now on.
 
     Args:
-        data: Data of the simulation.
-        seed: Seed or key.
         device: Device of the key; None for the default device.
     """
     key = as_key(seed)
@@ -122,7 +120,6 @@ def uniform_at(words: Array, index: Array | np.ndarray, dtype: Any = jnp.float32
     Args:
         words: Two words of a key, uint32. (..., 2)
         index: Indices, integers; they broadcast with the leading axes of ``words``. (...)
-        dtype: Type of the numbers.
     """
     with np.errstate(over="ignore"):
         bits = mix_bits(mix_bits(words[..., 0] + index.astype(np.uint32) * GOLDEN_STRIDE) ^ words[..., 1])

@@ -43,8 +43,6 @@ def positive_integer(name: str, value: object, at_most: int | None = None) -> in
     """Return a positive integer.
 
     Args:
-        name: Name of the setting, for messages.
-        value: The setting.
         at_most: Largest value; None for any.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
@@ -92,11 +90,7 @@ def setting(
     ``check_settings`` checks the values. Numbers of fields without a declaration must be finite.
 
     Args:
-        default: Default value.
-        default_factory: Function that returns the default value.
-        low: Smallest value allowed.
-        high: Largest value allowed.
-        positive: True to refuse zero and negative values.
+        positive: Whether to refuse zero and negative values.
         shapes: Shapes of an array, ``"any"`` for an axis of any length; None for any shape.
         keep: False for a setting of a plugin that is None in ``data.plugins``, such as an array for the scene.
     """
@@ -280,7 +274,6 @@ def control_freqs(
     The allocation and fitted dynamics have no memory, so their rate may be as low as the rate of physics steps.
 
     Args:
-        control: Command level.
         freq: Rate of physics steps, Hz.
         rates: Requested rates, Hz. Only the rate of the last level is used; None for the default, the largest
             divisor of ``freq`` up to 500 Hz.
@@ -344,8 +337,6 @@ def controller_at_rates(
     from ``default_rates``.
 
     Args:
-        controller: The controller.
-        control: Command level.
         freq: Rate of physics steps, Hz.
         requested_rates: Requested rates, Hz; None for the rates of the controller.
     """

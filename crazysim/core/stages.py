@@ -122,7 +122,6 @@ def stop_at_ground(s: SimState, ground: Array | float) -> SimState:
     Drones that stand at the height of the ground itself, such as those at their start, stay there.
 
     Args:
-        s: States.
         ground: Height of the ground, world frame, m. (..., 1)
     """
     height, climb_rate = s.pos[..., 2:], s.vel[..., 2:]
@@ -156,8 +155,6 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
     restored to its default value, but keeps its shape.
 
     Args:
-        data: The simulation.
-        default_data: The data to return to.
         mask: True in the worlds to reset; None for all. (n_worlds,)
     """
     mask = as_mask(mask, data.core.steps.shape[:1])

@@ -65,7 +65,6 @@ class Airframe:
         """Return one number or array by its dotted path, such as ``rigid_body.mass``.
 
         Args:
-            path: Table and key.
             shape: Expected shape; None for any.
         """
         if path not in self.values:

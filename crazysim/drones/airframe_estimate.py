@@ -137,7 +137,6 @@ def estimate_airframe(
         cells: Number of battery cells in series.
         capacity: Charge of the battery, A h.
         resistance: Internal resistance of the battery, ohm.
-        name: Name of the airframe.
     """
     for key, value in (
         ("mass", mass),

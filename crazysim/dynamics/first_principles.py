@@ -118,7 +118,6 @@ def saturate(cmd: Array, params: Params) -> Array:
 
     Args:
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
-        params: Parameters with the limits.
 
     Returns:
         Rotor speeds, rpm. (..., n_rotors)

@@ -61,7 +61,6 @@ class AirframeParams(PyTree):
         """Return the shared parameters of an airframe.
 
         Args:
-            airframe: The airframe.
             values: Values of fields without a declaration, or in place of it.
         """
         metadata = {field.name: field.metadata for field in dataclasses.fields(cls)}

@@ -22,7 +22,6 @@ def load_params(
     ``thrust_min`` and ``thrust_max`` are limits of one rotor.
 
     Args:
-        dynamics: Dynamics model.
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.

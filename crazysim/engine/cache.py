@@ -228,7 +228,7 @@ def enable_cache(
             folder that cannot be used.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Smallest duration of a compilation to keep its program, s.
-        enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
+        enable_xla_caches: Whether to let XLA keep files, too, in addition to JAX's.
     """
     if cache_path is None:
         path = _usable_default_folder()
@@ -332,7 +332,6 @@ def trim(root: Path, limit: int = MAX_CACHE_BYTES) -> None:
     """Remove the least recently used programs of a folder and its subfolders if they take more than ``limit`` bytes.
 
     Args:
-        root: Folder of the cache.
         limit: Largest size of all programs, bytes.
     """
     files = []

@@ -22,7 +22,7 @@ def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str]
 
     Args:
         problems: Unsupported operations, each with the reason. If empty, nothing is reported.
-        strict: True to raise an error instead of the warning.
+        strict: Whether to raise an error instead of the warning.
         reported: Texts of the warnings that were given before; the text of a new warning is added.
         remedy: Remedy for the error: the beginning of a sentence that ends with ``or use strict=False``.
     """

@@ -55,8 +55,6 @@ def map_indices(
     The results have no derivative. Under ``vmap`` the kernel is called for one batch at a time.
 
     Args:
-        fn: The function.
-        n: Number of indices.
         tables: The tables that the function reads. (n_rows, k) each
         platform: Platform of the kernel, ``"cpu"`` or ``"gpu"``; None for XLA without a kernel.
         compile_now: False to compile the kernel only when JAX compiles a program that uses the results.
@@ -87,7 +85,6 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
     """Return the block of a function of an index and tables; its inputs are the index and the tables.
 
     Args:
-        fn: The function.
         tables: Tables, or their shapes and types.
     """
     avals = [jax.ShapeDtypeStruct((max(len(x.shape) and x.shape[0], 2), *x.shape[1:]), x.dtype) for x in tables]

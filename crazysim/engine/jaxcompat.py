@@ -128,7 +128,6 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
     """Return a jaxpr that takes only some of its inputs; the other inputs must be unused.
 
     Args:
-        jaxpr: The jaxpr.
         inputs: Positions of the inputs to keep.
     """
     inner = jaxpr.jaxpr
@@ -222,7 +221,6 @@ def batched_primitive(
     """Return a primitive that ``vmap`` replaces by other operations.
 
     Args:
-        name: Its name.
         result_types: Function from operands and parameters to the shapes and types of the results.
         batching_rule: Function of the axis of ``vmap`` (with ``name`` and ``size``), the operands, their batched
             dimensions, and the parameters. It returns the results and their batched dimensions.
@@ -241,7 +239,6 @@ def simple_primitive(name: str, fn: Callable[..., list[Any]], batching_rule: Cal
     """Return a primitive for a function without a derivative, with a custom rule for ``vmap``.
 
     Args:
-        name: Its name.
         fn: The function, from operands to a list of results.
         batching_rule: Function from operands and their batched dimensions to results and their batched dimensions.
     """
@@ -268,7 +265,6 @@ def primitive_by_platform(
     All functions take operands as positional arguments, and parameters, which are hashable, as keywords.
 
     Args:
-        name: Its name.
         result_types: Function that returns the shapes and types of the results.
         functions: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all
             other platforms.
@@ -390,7 +386,6 @@ def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
     """Return the results of an equation's primitive for other operands, as a list.
 
     Args:
-        eqn: The equation.
         args: The operands.
         params: Parameters that replace parameters of the equation.
     """
@@ -471,7 +466,6 @@ def add_vmap_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[
     """Return a function with a custom rule for ``vmap``.
 
     Args:
-        fn: The function.
         rule: ``rule(axis_size, in_batched, *args) -> (results, out_batched)``.
     """
     batched_fn = custom_vmap(fn)

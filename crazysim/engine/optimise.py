@@ -28,7 +28,7 @@ def optimise(
         program: The program, from ``lower_stages``.
         select_rows: Function from the indices of the written leaves to the indices of the leaves to store as rows. A
             row holds one number of all drones. None to store no leaf as rows.
-        pack: True to pack shared numbers in one leaf.
+        pack: Whether to pack shared numbers in one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
     if select_rows is not None:

@@ -52,7 +52,6 @@ def leaf(
         scratch: True for an array that only carries numbers from one stage of a step to another. Its values are not
             kept after the step.
         airframe: Dotted path or function of the airframe that gives the value, in ``AirframeParams``.
-        default: Default value of the field.
     """
     expect(scope in get_args(Scope), f"a scope, one of {', '.join(get_args(Scope))}", scope)
     metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}

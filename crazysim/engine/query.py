@@ -40,7 +40,6 @@ def query(queries: Sequence[Query], data: Record, platform: str) -> list[Any]:
 
     Args:
         queries: The functions. They receive data of one drone or one world, as stages do.
-        data: The data, such as ``sim.data``.
         platform: ``"cpu"`` or ``"gpu"``.
 
     Raises:

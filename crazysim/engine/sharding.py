@@ -124,8 +124,6 @@ def map_devices(fn: Callable[[T], R], data: T, mesh: Mesh) -> R:
 
     Args:
         fn: Function of data; its results have a leading axis over worlds.
-        data: Data of all worlds.
-        mesh: The devices.
     """
     split_spec, replicated_spec = PartitionSpec(WORLD_AXIS), PartitionSpec()
     specs = jax.tree.map(lambda scope: split_spec if n_batch_axes(scope) else replicated_spec, scopes(data))

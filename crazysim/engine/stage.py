@@ -102,7 +102,6 @@ class Stage:
         """Return the data after the stage, with changes only in some worlds.
 
         Args:
-            data: Data of the simulation.
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         data_after = self(data)
@@ -208,9 +207,7 @@ class Axes:
         """Return the indices of the leaves that a stage wrote, and check that it may write them.
 
         Args:
-            before: Leaves before the stage.
             after: Data after the stage. A leaf that is the same object as before has not been written.
-            stage: The stage.
         """
         name = stage.__name__
         expect(

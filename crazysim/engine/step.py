@@ -80,7 +80,6 @@ def scan(
 
     Args:
         fn: Function of the data, the carry and an element of ``xs``.
-        flat: The data at the start.
         carry: Any tree of arrays.
         xs: As for ``jax.lax.scan``.
         length: As for ``jax.lax.scan``.
@@ -218,7 +217,6 @@ class Step:
         """Return the data flattened for ``advance``.
 
         Args:
-            data: The record, such as ``sim.data``.
             n_steps: Number of steps of the type that will be passed to ``advance``, of any value; None means an array.
             separate: Leaves that stay separate arrays. If one kernel runs the whole step, the other leaves that it
                 writes, except random keys, are stored as rows of a few arrays, one for each scope and type. This makes

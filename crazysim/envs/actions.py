@@ -80,7 +80,6 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
     Args:
         airframe: Airframe of all drones, or one for each drone; its rotors limit the commands.
         params: Parameters, for the hover command. If all drones have one airframe, the first drone's are used.
-        control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
     airframes = as_airframes(airframe)

@@ -101,7 +101,6 @@ class BraxEnv:
         """Return the state of all worlds one environment step later.
 
         Args:
-            state: State of all worlds.
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)
         """
         check_array("action", action)

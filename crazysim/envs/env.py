@@ -154,7 +154,6 @@ class Env(ABC):
         """Return the state with new episodes in some worlds.
 
         Args:
-            state: The state of all worlds.
             mask: True where a new episode begins; None for all worlds. (n_worlds,)
         """
         steps = state.full_data.core.steps
@@ -170,7 +169,6 @@ class Env(ABC):
         The observations in the returned state are unchanged; the next step observes the new goals.
 
         Args:
-            state: The state of all worlds.
             pos: Goals, world frame, m: one for all drones (3,), one per world (n_worlds, 3), or one per drone
                 (n_worlds, n_drones, 3); an axis of worlds or drones may have length 1.
         """
@@ -186,7 +184,6 @@ class Env(ABC):
         and is observed as zeros.
 
         Args:
-            state: The state of all worlds.
             action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
         """
         self._check_state(state)

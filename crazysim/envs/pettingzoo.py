@@ -168,7 +168,6 @@ def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> 
 
     Args:
         task: One of ``crazysim.envs.TASKS``.
-        render_mode: Mode of ``render``.
         options: Options of ``crazysim.envs.make``, such as ``n_drones``.
     """
     return DroneParallelEnv(make(task, options.pop("n_worlds", 1), **options), render_mode)

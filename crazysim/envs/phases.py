@@ -186,7 +186,6 @@ class Phases:
         """Return the state with the action's command staged, and the action as changed by the wrappers.
 
         Args:
-            state: The state before the step.
             action: Action. (n_drones, k)
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
@@ -233,7 +232,6 @@ class Phases:
         """Return the state at the start of an episode. Only data, info and memory of the earlier state are read.
 
         Args:
-            state: The earlier state.
             default: Data that the world is reset to.
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
@@ -311,7 +309,6 @@ def select_states(mask: Array | None, new_state: EnvState, old_state: EnvState) 
     Args:
         mask: True where the new state is taken; None for all worlds. (n_worlds,)
         new_state: The new state of all worlds.
-        old_state: The old state of all worlds.
     """
     return map_batched(functools.partial(select_worlds, mask), new_state, old_state)
 

@@ -79,13 +79,8 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
     Unlike with ``jax.random``, a longer draw with the same key begins with the numbers of a shorter draw.
 
     Args:
-        key: Random key. ()
-        shape: Shape of the numbers.
         low: Lower limits; anything that broadcasts to the shape.
         high: Upper limits, not included.
-
-    Returns:
-        (*shape)
     """
     words = jax.random.key_data(key).astype(jnp.uint32)
     indices = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
@@ -100,7 +95,6 @@ def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, A
     does.
 
     Args:
-        key: Random key. ()
         batch: Leading axes, usually the number of drones; none for numbers per world.
         sizes: Size of the last axis by name, or the shape of several last axes.
 

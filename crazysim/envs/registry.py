@@ -109,7 +109,6 @@ def make(
 
     Args:
         task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
-        n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the default of the command level, ``actions_of``.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states that they measure. Without sensors,
@@ -183,7 +182,6 @@ def register(name: str, task: type[Task], control: str | None = None, n_drones: 
 
     Args:
         name: Name, such as ``"two_hoops"``: lower case letters, digits and underscores.
-        task: Class of the task.
         control: Default command level; None for that of the class.
         n_drones: Default number of drones; None for that of the class.
 

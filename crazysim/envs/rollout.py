@@ -86,10 +86,8 @@ def rollout(
 
     Args:
         env: The environment, usually inside ``AutoReset``.
-        state: The state at the start.
         policy: The policy, for all worlds at once.
         key: Random key, or several. Each step receives the same number of new keys. () or (n_keys,)
-        n_steps: Number of steps, a positive integer.
         keep: ``keep(transition)``: the part of each transition to return; reward and ``done`` by default.
         initial_memory: Memory of the policy at the start of an episode; ``()`` for none. (n_worlds, ...) each
         memory: Memory of the policy before the first step, as another rollout returned it; None for ``initial_memory``.

@@ -84,7 +84,6 @@ def make_single(task: str, render_mode: str | None = None, **options: Any) -> Dr
 
     Args:
         task: One of ``crazysim.envs.TASKS``.
-        render_mode: Mode of ``render``.
         options: Options of ``crazysim.envs.make``.
     """
     return DroneSingleEnv(make(task, options.pop("n_worlds", 1), **options), render_mode)

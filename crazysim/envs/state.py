@@ -225,7 +225,6 @@ def validate_action(action: ArrayLike, expected: jax.ShapeDtypeStruct, actions: 
     """Return an action of the expected dtype, after checking its shape and its type. (n_worlds, n_drones, k)
 
     Args:
-        action: Action of every drone.
         expected: Shape and dtype of actions of all worlds.
         actions: Meaning of an action, for messages.
     """
@@ -239,8 +238,6 @@ def read_action(action: Any, shape: tuple[int, ...], actions: Actions | None = N
     """Return an action as an array after checking shape and type, and on the host that its numbers are finite.
 
     Args:
-        action: The action.
-        shape: Shape that it must have.
         actions: Meaning of an action, for messages; None if the shape says enough.
     """
     try:
@@ -271,7 +268,6 @@ def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
     Args:
         pos: One goal for all drones (3,), one per world (n_worlds, 3), or one per drone (n_worlds, n_drones, 3); an
             axis of worlds or drones may have length 1.
-        state: The state of all worlds.
     """
     template = state.full_data.states.pos
     goals = pos if isinstance(pos, Array) else read_numbers("pos", pos)

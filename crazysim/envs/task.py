@@ -87,7 +87,6 @@ class Task:
         """Add the states and stages of the task to a simulation; for use in ``install``.
 
         Args:
-            sim: The simulation.
             placements: Stages with their positions, such as ``StagePlacement(stage, before="increment_steps")``.
             initial: First values of states, and values of ``static`` fields; other states are zero at first.
         """
@@ -126,7 +125,6 @@ class Task:
         """Return the data with new goals, for ``env.set_goal``. Tasks whose goals are positions define this method.
 
         Args:
-            data: The world.
             pos: Goal of every drone, or of its load, world frame, m. (n_drones, 3)
         """
         raise ConfigError(

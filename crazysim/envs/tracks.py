@@ -70,10 +70,8 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
     """Return a track after checking its numbers, its limits and the clearance of its starts.
 
     Args:
-        track: The track.
-        n_drones: Drones in a world.
         jitter: Largest sum of the horizontal displacements of a drone and of a gate or obstacle, m.
-        is_random: True if gates and obstacles are placed at random.
+        is_random: Whether gates and obstacles are placed at random.
     """
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():

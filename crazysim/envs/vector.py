@@ -207,10 +207,8 @@ def make_vector(
     Args:
         task: One of ``crazysim.envs.TASKS``.
         num_envs: Number of worlds.
-        autoreset_mode: Mode of automatic resets.
-        render_mode: Mode of ``render``.
         max_episode_steps: Length of an episode, environment steps; None for the length that ``seconds`` sets.
-        numpy: True to return NumPy arrays, copies that may be written to.
+        numpy: Whether to return NumPy arrays, copies that may be written to.
         render_worlds: Worlds to render; None for all.
         render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.

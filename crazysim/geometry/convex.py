@@ -88,7 +88,6 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
     with two of the corners.
 
     Args:
-        pair: The two shapes.
         n: Initial direction.
         steps: Number of support points to add.
     """

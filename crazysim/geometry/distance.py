@@ -27,7 +27,6 @@ def point_distance(shape: Shape, point: Array) -> Array:
     by Newton's method; for a height field see ``field_distance``.
 
     Args:
-        shape: The shape.
         point: Points in the frame of the shape, m. (..., 3)
     """
     if shape.kind == "hfield":

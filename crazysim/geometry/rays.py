@@ -35,7 +35,6 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     below its surface ends.
 
     Args:
-        shape: Shape.
         origin: Origin of each ray, in the frame of the shape, m. (..., 3)
         direction: Unit direction of each ray, in the frame of the shape. (..., 3)
 

@@ -43,12 +43,7 @@ class Access:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}"
 
     def refusal_reason(self, path: str, headers: Mapping[str, str]) -> str:
-        """Return the reason why a request is refused; empty if it is accepted.
-
-        Args:
-            path: Path that is requested.
-            headers: Headers of the request.
-        """
+        """Return the reason why a request is refused; empty if it is accepted."""
         host, origin = headers.get("Host", ""), headers.get("Origin")
         if not is_own_name(host, self.host):
             return wrong_name_message(host)
@@ -109,8 +104,6 @@ def start_guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
     is replaced by a function that adds the check.
 
     Args:
-        viser: The module.
-        access: Address and check.
         **settings: Further arguments of ``viser.ViserServer``.
 
     Raises:

@@ -35,7 +35,6 @@ def render_worlds(
     as the last call needs no preparation.
 
     Args:
-        sim: Simulation.
         worlds: Indices of worlds, in the order of the images; None for all.
         camera: Name or id of a camera; -1 is the free camera.
         cam_config: Settings of the free camera.

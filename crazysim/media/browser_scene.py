@@ -53,7 +53,6 @@ class BrowserScene:
         """Show a picture. Bodies whose poses are not finite stay where they were.
 
         Args:
-            picture: Picture.
             follow: Whether to keep the followed body in the middle: the worlds move, and the camera stays.
         """
         pos, quat = self._to_grid(picture.pos), np.roll(picture.quat, 1, axis=-1)

@@ -102,7 +102,6 @@ class Film:
 
         Args:
             sim: Simulation like the recorded one; its data is restored afterwards.
-            flight: Flight.
 
         Raises:
             RenderError: If this machine cannot draw, or the file cannot be written.
@@ -126,7 +125,6 @@ class Film:
 
         Args:
             image: Image of the view's size, uint8. (height, width, 3)
-            n_frames: Number of frames.
 
         Raises:
             RenderError: If the file cannot be written.

@@ -153,7 +153,6 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
 
     Args:
         sim: Simulation with the drones, worlds and bodies of the recorded simulation.
-        flight: Flight.
         time: Time of the flight, s.
     """
     worlds = flight.worlds

@@ -55,7 +55,6 @@ class Journal(Closeable):
 
         Args:
             kind: Kind of the chunk, 4 bytes.
-            content: Content.
 
         Raises:
             OSError: If the chunk cannot be written, for example because the disk is full.

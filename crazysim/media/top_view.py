@@ -33,8 +33,6 @@ def draw_map(
     """Return a map of the world that was drawn last, uint8, (height, width, 3); None without obstacles or space.
 
     Args:
-        sim: Simulation.
-        world: Index of the world.
         path: Positions of the drones since the last reset, m. (n, n_drones, 3)
         width: Width of the map, pixels.
         height: Height of the map, pixels.

@@ -32,7 +32,6 @@ def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = No
     The page contains the viewer and the flight, so that it can be opened as a file, without server or network.
 
     Args:
-        flight: Flight.
         world: Index of the world in the simulation; None for the first recorded world.
         lights: Colour of the light on each drone at each of the flight's times, 0 to 1; None for no lights.
             (n, n_drones, 3)
@@ -57,7 +56,6 @@ def create_server(html: str, port: int, host: str = "127.0.0.1") -> http.server.
     """Return a server of one page; ``serve_forever`` starts it.
 
     Args:
-        html: Page.
         port: Port; 0 for any free port.
         host: Address to listen at; ``0.0.0.0`` for every network.
 
@@ -171,8 +169,6 @@ def require_free_port(host: str, port: int, prefix: str = "") -> int:
     """Return ``port`` if it is free, and any free port for 0; viser itself would silently use another port.
 
     Args:
-        host: Host of the address.
-        port: Port of the address.
         prefix: Text before the name of the setting, for the message.
 
     Raises:

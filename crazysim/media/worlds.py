@@ -15,7 +15,6 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
     """Return indices of worlds, after a check that they exist. (n,)
 
     Args:
-        sim: Simulation.
         worlds: Indices; None for all worlds.
     """
     expect(worlds is None or np.ndim(worlds) == 1, "worlds as a list of indices", worlds, "Use [0] for the first.")

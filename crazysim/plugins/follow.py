@@ -132,8 +132,6 @@ class Follow(Plugin, replaces=("state commands",)):
         """Return data with another trajectory in a slot; all arrays keep their shapes, so that nothing recompiles.
 
         Args:
-            data: The data of the simulation.
-            slot: The slot.
             trajectory: The trajectory, for one drone.
         """
         record = self.read(data)
@@ -177,7 +175,6 @@ class Follow(Plugin, replaces=("state commands",)):
         Nothing is compiled again, unless one number for all drones becomes one per drone.
 
         Args:
-            sim: The simulation.
             index: Slots. (), (n_drones,) or (n_worlds, n_drones)
             start: Times since the reset of the worlds at which the drones start, s; may be negative. (), (n_drones,) or
                 (n_worlds, n_drones)

@@ -161,7 +161,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Return data with records for the present scene, where they are for an earlier one.
 
         Args:
-            data: The data.
             reference: Data of the present scene.
         """
         for name in self._record_readers if not self._is_changing else ():

@@ -160,8 +160,6 @@ def replay_edit(before: Pipeline, after: Pipeline, pipeline: Pipeline, renewed: 
     """Return a pipeline with the edit that has made ``after`` out of ``before``, and with the user's order of stages.
 
     Args:
-        before: The pipeline that was edited.
-        after: The pipeline after the edit.
         pipeline: A pipeline like ``before``, with more, fewer or other stages.
         renewed: Names of stages that the pipeline may have in another version.
     """

@@ -112,7 +112,6 @@ def collision_model(
     """Return the geoms that drones can touch.
 
     Args:
-        model: Compiled scene.
         handles: Names of bodies with handles, in the order of ``data.objects``.
         drone_groups: Drones of each airframe.
     """
@@ -130,7 +129,6 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: Dr
     """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
 
     Args:
-        model: Compiled scene.
         handles: Names of bodies with handles, in the order of ``data.objects``.
         drone_groups: Drones of each airframe.
     """

@@ -102,10 +102,8 @@ def build_contact_fn(
     """Return ``contacts(data, mocap=None) -> ContactReport``, pure: for all worlds, one world, or one drone.
 
     Args:
-        model: Collision model of the scene.
         objects: Handles or names of the objects to report; None for all, () for none.
-        floor: True to report the floor.
-        drones: True to report other drones. With data of one drone this works only in a stage, and ``nearest_drone``
+        drones: Whether to report other drones. With data of one drone this works only in a stage, and ``nearest_drone``
             is None.
         plugins: Function that returns the plugins of the simulation. Their objects are moved before distances are
             computed.
@@ -175,9 +173,8 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
     """Return the selected objects of a model.
 
     Args:
-        model: Collision model of the scene.
         objects: Handles or names; None for all, () for none.
-        require_data: True to refuse bodies whose poses are not part of the data, for use in a step.
+        require_data: Whether to refuse bodies whose poses are not part of the data, for use in a step.
     """
     by_name = {body.name: body for body in model.objects}
     selection = list_objects(objects)

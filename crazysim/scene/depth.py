@@ -98,7 +98,6 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
     """Return the camera with a name or id, or the cameras of all drones for a name without index, such as ``fpv_cam``.
 
     Args:
-        model: Compiled scene.
         name: Name or id.
         objects: Names of bodies with poses in ``data.objects``, then of bodies that are moved through ``mjx_data``.
     """
@@ -191,7 +190,6 @@ def build_depth_fn(
 
     Args:
         model: Geoms of the scene that cameras see.
-        cameras: The cameras.
         rays: Unit directions of the pixels of each camera, as from ``pixel_directions``. (height, width, 3) each
         drones: True for drones to be visible.
         hide_own: True for a drone to be invisible to its own camera.

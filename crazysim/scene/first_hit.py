@@ -393,8 +393,6 @@ def first_fixed_hit(
     Args:
         surfaces: ``Targets.surfaces``.
         tables: The fixed geoms.
-        ray: The ray.
-        best: Best hit so far.
         n_nodes: Number of nodes in one order of the hierarchy; None to take it from the tables.
     """
     n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes

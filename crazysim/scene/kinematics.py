@@ -22,7 +22,6 @@ def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     in the model. ``xanchor`` and ``xaxis`` of the dummy joint are left as they are.
 
     Args:
-        model: Compiled scene.
         data: MJX data of every world. (n_worlds, ...)
     """
     batch_shape = data.mocap_pos.shape[:1]

@@ -17,7 +17,6 @@ def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str,
     """Return a dict from the name of each object that a plugin moves to that plugin.
 
     Args:
-        plugins: Plugins of the simulation.
         names: Names of objects, ``KIND:NUMBER``.
     """
     owners = {}

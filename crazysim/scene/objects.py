@@ -283,10 +283,8 @@ def add_bodies(
     """Add bodies to a spec.
 
     Args:
-        spec: Scene.
         source: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list with one of
             these for each body, except primitives.
-        names: Names of the bodies.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)
         mocap: True for bodies that can be moved.

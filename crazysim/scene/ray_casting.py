@@ -294,7 +294,6 @@ def cast_rays_in_worlds(
         pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
         drones: True for rays to meet drones.
-        kernels: Kernels that may be used.
     """
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
@@ -354,7 +353,7 @@ class RayKernels:
             engine: Engine of the simulation, one of ``crazysim.engine.ENGINES``.
             device: Device of its data.
             mesh: Devices over which its worlds are distributed; None for one device.
-            strict: True to raise an error where XLA would be used with an ``EngineWarning``.
+            strict: Whether to raise an error where XLA would be used with an ``EngineWarning``.
         """
         has_kernels = str(engine) in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict, mesh)
@@ -379,7 +378,6 @@ class RayKernels:
         ``Targets.movable_nodes`` defines nodes and links.
 
         Args:
-            targets: The geoms.
             leaf_boxes: Boxes of the movable geoms, from ``Targets.movable_rows``. (n_worlds, n_movable, 6)
         """
         ranges, leaves, links = targets.movable_nodes()

@@ -117,7 +117,6 @@ class Scene:
             source: ``"gate"``, ``"box"``, ``"pole"``, ``"cylinder"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or
                 the path of an MJCF file, MJCF text, an ``MjSpec``, or a body of an ``MjSpec``.
             name: Prefix of the bodies' names ``name:0``, ``name:1``, ...; None for the name of the primitive or file.
-            count: Number of objects.
             pos: Initial positions in every world, world frame, m. (3,), (count, 3) or (n_worlds, count, 3)
             quat: Initial attitudes, body to world, xyzw. (4,), (count, 4) or (n_worlds, count, 4)
             mocap: True for objects that can be moved, independently in each world; False for objects that stay at
@@ -139,7 +138,6 @@ class Scene:
         """Return a scene with the same bodies and with each world ``n`` times, for a second simulation.
 
         Args:
-            n: Number of times.
             plugins: Function that returns the plugins of the second simulation.
         """
         scene = copy.copy(self)
@@ -174,7 +172,6 @@ class Scene:
             quat: Attitude of the file's frame, file to world, xyzw. (4,)
             scale: Metres per unit of the file; None for 1, which requires an extent of the map of 1 cm to 10 km.
             min_points: Smallest number of points in an occupied voxel; more than 1 removes the noise of a scan.
-            rgba: Colour.
 
         Raises:
             DamagedFileError: If the file is damaged, cut off, or of another kind.
@@ -319,8 +316,8 @@ class Scene:
 
         Args:
             objects: Handles, or names of bodies; None for all, () for none.
-            floor: True to report the floor: planes and height fields of the world body.
-            drones: True to report the other drones of a world.
+            floor: Whether to report the floor: planes and height fields of the world body.
+            drones: Whether to report the other drones of a world.
         """
         return contact_report.build_contact_fn(self.collision_model, objects, floor, drones, self.plugins)
 
@@ -479,7 +476,6 @@ class Scene:
         """Return True for every contact slot of MJX that touches, after a sync if anything has moved.
 
         Args:
-            data: The simulation.
             body: Name of the body whose slots are returned; None for all bodies.
 
         Returns:

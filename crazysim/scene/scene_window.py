@@ -81,7 +81,6 @@ class SceneWindow:
         """Show several states in a grid, all from one camera.
 
         Args:
-            n: Number of tiles.
             tile: Function from k to the k-th tile. It is called right before the tile is drawn, so that all tiles may
                 share one ``MjData``.
             camera: Camera. If it differs from the last call, it replaces the view set by the mouse.
@@ -128,11 +127,7 @@ class SceneWindow:
         return glfw.get_mouse_button(self._window, number) == glfw.PRESS
 
     def cursor_ray(self, n: int) -> tuple[int, NDArray, NDArray] | None:
-        """Return the tile below the cursor, and origin, m, and direction of the ray through the cursor, world frame.
-
-        Args:
-            n: Number of tiles.
-        """
+        """Return the tile below the cursor, and origin, m, and direction of the ray through the cursor, world frame."""
         size = self._glfw.get_framebuffer_size(self._window)
         x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]
         for k, r in enumerate(self._tile_rectangles(n)):

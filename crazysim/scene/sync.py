@@ -25,13 +25,7 @@ all drones, and of all objects with handles, whose poses have a further axis of 
 
 
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
-    """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data.
-
-    Args:
-        data: Simulation.
-        mjx_data: State of the scene in every world.
-        mjx_model: Compiled scene, shared by all worlds.
-    """
+    """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data."""
     mjx_data = sync_poses(poses_of(data), mjx_data, mjx_model)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 
@@ -91,7 +85,6 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
     """Return poses of bodies and joints in selected worlds, with the poses of drones and handles from the data.
 
     Args:
-        data: Simulation.
         worlds: Indices of worlds. (n,)
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
@@ -128,11 +121,8 @@ def sync_one_world(
     """Write the poses of one world into ``mj_data``, ready to be drawn.
 
     Args:
-        data: Simulation.
-        world: Index of the world.
         poses: Mocap positions, m (1, n_mocap, 3), attitudes, wxyz (1, n_mocap, 4), joint positions (1, n_qpos). The
             poses of drones and of objects with handles are replaced by their poses in the data.
-        mj_model: Compiled scene.
         mj_data: State to write.
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:] = (x[0] for x in host_poses(data, np.array([world]), poses))

@@ -51,7 +51,6 @@ def read_vehicles(
     """Return three parts of an MJCF file: the spec without vehicles, the drones, and the members of each population.
 
     Args:
-        xml_path: MJCF file.
         kinds: Airframes or populations by prefix, in addition to ``known_kinds``.
 
     Raises:
@@ -76,7 +75,6 @@ def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Arra
     """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4), of vehicles in all worlds.
 
     Args:
-        vehicles: The vehicles.
         template: An array with the type of the results and a first axis over worlds.
     """
     poses = [v.pos for v in vehicles], [v.quat for v in vehicles]

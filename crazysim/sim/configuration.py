@@ -86,7 +86,6 @@ class Configuration:
         leaves.
 
         Args:
-            data: Data to check.
             reference: Data of the simulation.
         """
         try:

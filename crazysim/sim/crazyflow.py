@@ -130,10 +130,9 @@ def render_depth(
     ``sim.depth`` returns the images of all drones' cameras at once, and hides each drone from its own camera only.
 
     Args:
-        sim: Simulation.
         camera: Id or name; 0 is ``track_cam:0``.
         resolution: Width and height, pixels.
-        include_drone: True to show drones, including the one that carries the camera.
+        include_drone: Whether to show drones, including the one that carries the camera.
     """
     try:
         width, height = resolution

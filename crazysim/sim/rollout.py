@@ -34,7 +34,6 @@ def stage_flat(flat: FlatData, reference: SimData, command: Any, feedforward: An
     """Return flat data with a checked command, as ``crazysim.core.functional.stage_command`` does.
 
     Args:
-        flat: The data.
         reference: The data, or its shapes and devices.
         command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
         feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
@@ -70,7 +69,7 @@ def rollout(
         n_substeps: Physics steps of a control step.
         keep: ``keep(data)`` returns the arrays to record after a control step.
         every: Number of control steps from one recording to the next.
-        wait: True to step to the next multiple of ``n_substeps`` first, if it is equally far in all worlds.
+        wait: Whether to step to the next multiple of ``n_substeps`` first, if it is equally far in all worlds.
 
     Returns:
         The data, and the recorded arrays with a leading time axis. (n_control_steps // every, ...)

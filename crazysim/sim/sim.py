@@ -182,8 +182,6 @@ class Sim:
         of the airframes.
 
         Args:
-            xml_path: MJCF file.
-            n_worlds: Number of worlds.
             kinds: Airframes, or subclasses of ``Population``, for prefixes other than those in
                 ``crazysim.sim.adopt.known_kinds()``.
             plugins: Plugins, which are added when all vehicles are at their poses.
@@ -342,7 +340,6 @@ class Sim:
         pipeline, and its influences and states to the integration. The step is compiled again.
 
         Args:
-            plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
             name: Name of the added plugin; None for ``plugin.name``.
         """
         return self.plugins.add(plugin, name)
@@ -511,7 +508,7 @@ class Sim:
             n_control_steps: Number of control steps; a multiple of ``every``.
             keep: ``keep(data)`` returns what to record after a control step, any tree of arrays.
             every: Control steps from one record to the next.
-            progress: True to show a bar, which needs tqdm, where stderr is a terminal.
+            progress: Whether to show a bar, which needs tqdm, where stderr is a terminal.
 
         Returns:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)
@@ -533,7 +530,7 @@ class Sim:
         If rays were cast, for images or for many movable objects, a last line says how.
 
         Args:
-            measure: True to measure the cost of stages that are not fused, which compiles a second step.
+            measure: Whether to measure the cost of stages that are not fused, which compiles a second step.
         """
         step, rays = explain(self.step_fn, self.data, check_flag("measure", measure)), self._scene.ray_kernels.last_used
         return f"{step}\nrays: {rays}" if rays else step
@@ -667,8 +664,7 @@ class Sim:
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
-            floor: True to report the floor.
-            drones: True to report the other drones of a world.
+            drones: Whether to report the other drones of a world.
         """
         return self._queries.contact_report(self._data_with_moved_objects(), objects, floor, drones)
 
@@ -705,7 +701,6 @@ class Sim:
             mode: ``"human"`` draws into a window until the user closes it; ``"rgb_array"`` returns an image
                 (height, width, 3) of type uint8, ``"depth_array"`` the distance along the camera's axis, m
                 (height, width), ``"rgbd_tuple"`` both.
-            world: Index of the world.
             camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
             cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
             width: Pixels. A window is resized when it changes; the user may resize it too.

@@ -163,7 +163,6 @@ class Stepper:
         """Count steps that are about to be taken.
 
         Args:
-            n_steps: Number of steps.
             times: Number of times that they will be taken.
         """
         n_steps *= times

@@ -22,7 +22,6 @@ def draw_line(
     """Draw a line through points in the next image.
 
     Args:
-        sim: Simulation.
         points: World frame, m. (n, 3)
         rgba: Colour, 0 to 1, of all segments or of each; None for red. (4,) or (n - 1, 4)
         start_size: Width at the first point, pixels.
@@ -36,7 +35,6 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
     """Draw points in the next image, as spheres.
 
     Args:
-        sim: Simulation.
         points: World frame, m. (n, 3)
         rgba: Colour, 0 to 1; None for red. (4,)
         size: Radius, m.
@@ -56,7 +54,6 @@ def draw_capsule(
     """Draw a capsule, or a cylinder, between two points in the next image.
 
     Args:
-        sim: Simulation.
         p1: One end, world frame, m. (3,)
         p2: The other end, world frame, m. (3,)
         radius: Radius, m.
@@ -77,7 +74,6 @@ def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
     """Write one line of text at a point in the next image, in front of everything.
 
     Args:
-        sim: Simulation.
         point: Left end of the text, world frame, m. (3,)
         text: ASCII text of at most 99 characters.
     """
@@ -91,7 +87,6 @@ def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
     """Write text into a corner of the next image, below earlier text.
 
     Args:
-        sim: Simulation.
         text: ASCII text of one or several lines.
         corner: ``"top left"``, ``"top right"``, ``"bottom left"`` or ``"bottom right"``.
     """
@@ -104,7 +99,6 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
 
     Args:
         sim: Simulation with command level ``state``.
-        world: Index of the world.
         rgba: Colour, 0 to 1, of all drones or of each; None for red. (4,) or (n_drones, 4)
         size: Radius, m.
     """
@@ -131,7 +125,6 @@ def change_material(
     """Change the colour or emission of the material ``led_top`` or ``led_bot`` of some drones.
 
     Args:
-        sim: Simulation.
         mat_name: Name of the material without the index of the drone.
         drone_ids: Indices of the drones. (n,)
         rgba: Colour, 0 to 1, of all these drones or of each; None for no change. (4,) or (n, 4)

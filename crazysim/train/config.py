@@ -249,7 +249,6 @@ class TrainConfig:
             task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task``.
             algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
             seed: Random seed; None for 0.
-            n_worlds: Number of parallel worlds.
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
             resumed: Configuration of the run to continue, from which omitted values are taken; None for a new run.

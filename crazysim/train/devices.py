@@ -51,7 +51,6 @@ def find_devices(device: str, devices: Devices) -> list[jax.Device]:
 
     Args:
         device: Platform of the devices; if ``devices`` is a number, it may also be the name of the first device.
-        devices: The devices.
     """
     selection, first_device = _read_devices(devices), find_device(device)
     platform, available = first_device.platform, jax.devices(first_device.platform)
@@ -78,7 +77,6 @@ def device_options(device: str, devices: Devices, n_worlds: int) -> dict[str, An
 
     Args:
         device: Platform of the devices, or one of them.
-        devices: The devices.
         n_worlds: Number of worlds of all seeds.
     """
     training_devices = find_devices(device, devices)
@@ -104,9 +102,7 @@ def learner_shardings(shapes: Learner, sim: Sim, n_seeds: int) -> Learner:
     a multiple of the number of devices: each device then trains its own seeds. Otherwise they are replicated.
 
     Args:
-        shapes: Shapes of the learner.
         sim: Simulation of the training environment.
-        n_seeds: Number of seeds.
     """
     mesh = sim.mesh
     if mesh is None:

@@ -157,7 +157,6 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
         env: Environment without automatic resets; each world flies from one initial state.
         policy: Policy of all worlds, such as ``Policies``.
         key: Random key of the initial states; None for the held-out ones.
-        n_blocks: Number of blocks.
     """
     key = held_out_key() if key is None else key
     # Computing the metrics on the host takes less time than compiling them would.

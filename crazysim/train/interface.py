@@ -67,7 +67,6 @@ class Interface:
         """Check that another interface is the same, and warn of what may have changed under the same names.
 
         Args:
-            other: The other interface.
             source: Whose interface it is, for the message.
         """
         differences = _size_differences(self.sizes, other.sizes)
@@ -110,7 +109,6 @@ def describe_env(env: Env, sizes: Mapping[str, int] | None = None) -> dict[str, 
     """Return the description of the interface of an environment, which JSON can represent.
 
     Args:
-        env: The environment.
         sizes: Sizes of the observations; None for those of the environment.
     """
     return {

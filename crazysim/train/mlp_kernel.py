@@ -330,7 +330,6 @@ def apply_mlp(layers: Layers, x: Array) -> Array:
     Networks that are larger than the kernels allow, or of another dtype, are computed by ``mlp``.
 
     Args:
-        layers: Weights and biases.
         x: Inputs. (..., n_in)
 
     Returns:

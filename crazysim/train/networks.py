@@ -40,7 +40,6 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
     matrices themselves would take longer to trace and compile than this one draw of all weights.
 
     Args:
-        key: Random key.
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
         last_scale: Scale of the weights of the last layer; small for a policy, so that it starts near the zero action.
             The scale of the other layers is the square root of 2.
@@ -59,7 +58,6 @@ def mlp(layers: Layers, x: Array) -> Array:
     """Return the outputs of a perceptron with tanh between layers, computed in the dtype of the weights.
 
     Args:
-        layers: Weights and biases.
         x: Inputs. (..., n_in)
 
     Returns:
@@ -240,8 +238,6 @@ def init_weights(network: Network, key: Array, n_obs: int, sizes: Sequence[int],
     """Return initial weights.
 
     Args:
-        network: The network.
-        key: Random key.
         n_obs: Number of inputs.
         sizes: Sizes of the hidden layers after the network, and number of outputs.
         last_scale: Scale of the weights of the last layer, see ``init_mlp``.
@@ -272,7 +268,6 @@ def forward(
     """Return the outputs of one step, (..., n_outputs), and the memory after it.
 
     Args:
-        network: The network.
         weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (..., n_obs)
         memory: Memory before the step: arrays of ``initial_memory`` with the leading axes of ``obs``.
@@ -288,7 +283,6 @@ def unroll(
     """Return the outputs of consecutive steps, (n_steps, ..., n_outputs); gradients flow back through the steps.
 
     Args:
-        network: The network.
         weights: Weights of the network and of the layers after it.
         obs: Normalised observations. (n_steps, ..., n_obs)
         memory: Memory before the first step: arrays of ``initial_memory`` with the leading axes of ``obs[0]``.

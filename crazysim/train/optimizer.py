@@ -52,11 +52,9 @@ def run_epochs(
 
     Args:
         loss: ``loss(parameters, samples) -> (loss, metrics)`` of a minibatch. (n_steps, n_groups, k, ...) each
-        parameters: Parameters before the first update.
         optimizer: State of ``build_optimizer``.
         samples: Samples of the rollout. (n_steps, n_worlds, ...) each
         config: Hyperparameters ``epochs``, ``minibatches`` and those of the optimiser.
-        key: Random key.
 
     Returns:
         Parameters and state of the optimiser after the last update, and the means of the metrics.

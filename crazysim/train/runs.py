@@ -67,11 +67,10 @@ def run(
         task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task`` such as
             ``TwoHoops(radius=0.4)``.
         folder: Folder of the run; None for ``out/NAME``.
-        resume: True to continue from the checkpoint in the folder; omitted settings come from the checkpoint.
-        film: True to write a film.
+        resume: Whether to continue from the checkpoint in the folder; omitted settings come from the checkpoint.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
-        progress: True to show progress bars if tqdm is installed, or lines where stderr is no terminal.
+        progress: Whether to show progress bars if tqdm is installed, or lines where stderr is no terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
             name. After an evaluation it also gets the metrics of the evaluation, with names that begin with
@@ -139,13 +138,12 @@ def run_many(
     Args:
         task: As in ``run``.
         folder: Folder of the run; None for ``out/NAME``.
-        seeds: Seeds.
         sweep: Values of hyperparameters by name, which is one of ``SWEEPABLE``. Every combination of values is trained
             with every seed.
-        resume: True to continue from the checkpoint in the folder, with the same seeds and values.
+        resume: Whether to continue from the checkpoint in the folder, with the same seeds and values.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
-        progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
+        progress: Whether to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: As in ``run``, but each metric is an array with a number for each training.
         settings: ``algorithm``, ``n_worlds`` of each training, ``options``, ``config``, ``network`` and ``devices`` of
@@ -194,7 +192,6 @@ def make_variants(
     """Return the seed and the changed hyperparameters of each training, by the name of its folder.
 
     Args:
-        seeds: Seeds.
         sweep: Values of hyperparameters by name.
         config: Hyperparameters of all trainings, which a sweep must not change.
     """

@@ -143,12 +143,10 @@ def rollout_seeds(
 
     Args:
         env: Environment with a block of worlds for each seed.
-        state: State of all worlds.
         act: ``act(*seed, obs, memory, key) -> (action, memory, extras)``.
         record: ``record(*seed, step, extras)``: what to store of a ``Step``.
         seeds: First arguments of both, pytrees of all seeds. (n_seeds, ...) each
         keys: Random keys. (n_seeds,)
-        n_steps: Number of steps.
         initial_memory: Memory of the policies at the start of an episode. (n_worlds, ...) each
         memory: Memory before the first step; None for ``initial_memory``. (n_worlds, ...) each
 

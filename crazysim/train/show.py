@@ -255,12 +255,9 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     show a map from above.
 
     Args:
-        env: Environment to fly in.
-        policy: Policy to fly.
         path: Film to write, ``.mp4`` or ``.gif``.
         worlds: Number of worlds in the film.
         seed: Seed of the initial states.
-        progress: True to show a progress bar.
 
     Raises:
         ImportError: If imageio-ffmpeg is not installed.

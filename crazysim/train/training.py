@@ -122,10 +122,10 @@ def train_many(
         configs: Configuration of each training, by the name of its folder. Only the seed and the ``SWEEPABLE``
             hyperparameters may differ. A single training may have an empty name.
         folder: Folder of the run.
-        resume: True to continue from the checkpoint in the folder, also with another number of devices.
+        resume: Whether to continue from the checkpoint in the folder, also with another number of devices.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
-        progress: True to show a progress bar if tqdm is installed, or lines where stderr is no terminal.
+        progress: Whether to show a progress bar if tqdm is installed, or lines where stderr is no terminal.
         checkpoint_every: Time after which a checkpoint is also written between evaluations, s; None to write none.
         on_iteration: Function, or None, that is called after each iteration with its number, from 1, and its metrics by
             name. After an evaluation it also gets the metrics of the evaluation, with names that begin with
@@ -443,16 +443,7 @@ class _Training:
     def add_evaluation(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], is_planned: bool
     ) -> None:
-        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both.
-
-        Args:
-            point: Counters and metrics of the evaluation.
-            policy: The evaluated policy.
-            n_starts: Number of starts of the check set.
-            description: Description of the policy's inputs and outputs.
-            is_planned: True if an uninterrupted run makes this evaluation too. Unplanned evaluations do not influence a
-                resumed run.
-        """
+        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both."""
         # A run that is resumed at its end repeats its last evaluation, which was planned.
         is_planned |= any(
             earlier_point["iteration"] == point["iteration"] and earlier_point["kept"] for earlier_point in self.curve

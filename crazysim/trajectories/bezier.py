@@ -55,8 +55,6 @@ def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArra
 
     Args:
         coefficients: Constant term first. (k, n)
-        start: Start of the interval.
-        end: End of the interval.
 
     Returns:
         (k, n)

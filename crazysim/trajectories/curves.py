@@ -96,7 +96,7 @@ def circle(
         period: Period, s; None for 5 s, or for the period that ``speed`` requires.
         speed: Speed, m/s, instead of the period.
         height: Height, m.
-        along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
+        along: Whether to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
     return helix(radius, 0.0, 1.0, period, speed, height, along).replace(repeats=np.bool_(True))
 
@@ -119,7 +119,7 @@ def helix(
         period: Time of one turn, s; None for 5 s, or for the time that ``speed`` requires.
         speed: Speed, m/s, instead of the period.
         height: Height of the start, m.
-        along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
+        along: Whether to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
     require_positive("turns", turns)
     check_flag("along", along)
@@ -181,7 +181,7 @@ def fit_curve(curve: Curve, duration: float, max_eighth_derivative: float, repea
         curve: The curve; derivatives up to the third are used.
         duration: Length of the curve, s.
         max_eighth_derivative: Upper bound of the eighth derivative of the curve, m/s^8.
-        repeats: True to start again after the end.
+        repeats: Whether to start again after the end.
     """
     max_piece_duration = (
         2 * (FIT_TOLERANCE * math.factorial(8) / max_eighth_derivative) ** (1 / 8)

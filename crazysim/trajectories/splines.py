@@ -69,7 +69,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         ends: End of each curve, s since the start of the trajectory, ascending. (n_pieces,)
         control_points: Control points of each curve, including its ends: x, y, z, m, and optionally yaw, rad. Yaw is in
             all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
-        repeats: True to start again after the end.
+        repeats: Whether to start again after the end.
     """
     end_times = read_floats("ends", ends)
     expect(
@@ -106,7 +106,7 @@ def trajectory_from_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, r
     Args:
         durations: Length of each piece, s. (n_pieces,)
         coefficients: Constant term first. (n_pieces, 3 or 4, degree + 1)
-        repeats: True to start again after the end.
+        repeats: Whether to start again after the end.
     """
     c, lengths = np.asarray(coefficients, float), np.asarray(durations, float)
     return Trajectory.of_pieces(lengths, c / lengths[:, None, None] ** np.arange(c.shape[-1]), repeats)
@@ -117,7 +117,6 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
 
     Args:
         yaw: One yaw for all points, or one per point, rad. () or (n_points,)
-        n_points: Number of points.
     """
     angles = require_finite(read_floats("yaw", yaw), "yaw")
     require(
@@ -133,7 +132,6 @@ def require_finite(values: NDArray[np.float64], name: str, limit: float = MAX_SI
 
     Args:
         values: Numbers. (...)
-        name: Name of the values for the message.
         limit: Largest absolute value.
     """
     is_wrong = ~(np.abs(values) <= limit)

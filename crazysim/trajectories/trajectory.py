@@ -55,7 +55,7 @@ class Trajectory(PyTree):
             coefficients: Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials
                 in the time since its start, s. An omitted yaw is zero. (n_pieces, 4, degree + 1) or (n_pieces, 3,
                 degree + 1)
-            repeats: True to start again after the end.
+            repeats: Whether to start again after the end.
         """
         lengths, c = read_floats("durations", durations), read_floats("coefficients", coefficients)
         require(
@@ -257,7 +257,6 @@ class Trajectory(PyTree):
         position, or of the velocity, for example from rest into a curve.
 
         Args:
-            other: The trajectory that follows.
             transition: Duration of an additional piece of degree 7 that connects the two trajectories, s; 0 for none.
                 Velocity, acceleration and jerk are continuous, and the yaw turns the shorter way.
         """

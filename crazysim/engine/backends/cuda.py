@@ -77,7 +77,6 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
     """Compile a kernel for some GPUs, and return the function that launches it.
 
     Args:
-        kernel: The kernel.
         devices: GPUs that will run it; None for the GPUs of this machine.
 
     Raises:
@@ -252,8 +251,6 @@ def compile_source(source: str, arch: str, kind: str) -> bytes:
     """Return the compiled image of a source, from the cache of kernels or from NVRTC.
 
     Args:
-        source: The source.
-        arch: Architecture.
         kind: ``"PTX"`` or ``"CUBIN"``.
     """
     library = nvrtc()

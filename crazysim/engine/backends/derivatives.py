@@ -29,7 +29,6 @@ def make_differentiable(run: CountedRun, run_on_lanes: Run, kernels: DerivativeK
     """Return a differentiable function that runs a program.
 
     Args:
-        run: Function that runs the program.
         run_on_lanes: The program on lanes, which JAX can differentiate. Used without ``kernels``, and if the number of
             steps is an array.
         kernels: Kernels of the derivatives; None to differentiate ``run_on_lanes``.

@@ -70,8 +70,6 @@ class Exchange(Protocol):
         """Write the code that passes numbers to the other drones of a world, and return functions that read them.
 
         Args:
-            writer: Writer that the lines are added to.
-            values: The numbers.
             live: Values that are defined here and used later, with their types.
             depth: Indentation of the lines.
         """

@@ -106,7 +106,6 @@ def register(name: str, platform: str, run: Callable[[Call], None]) -> None:
     An exception of the function becomes an error of the program that calls it.
 
     Args:
-        name: Name of the target.
         platform: Platform in the spelling of ``jax.ffi``, ``"cpu"`` or ``"CUDA"``.
         run: Function that is called with the ``Call`` of each execution.
     """

@@ -64,7 +64,6 @@ def steps_per_interval(n_steps: int, state_bytes: int, memory_bytes: int) -> int
     state before each interval is stored too.
 
     Args:
-        n_steps: Number of steps.
         state_bytes: Memory of the state before a step, bytes.
         memory_bytes: Available memory, bytes.
     """
@@ -111,7 +110,7 @@ def make_kernel(
         outputs: Indices of the leaves that it writes.
         in_place: Indices of the leaves that it updates in place.
         group_size: Drones of a world that read each other's numbers.
-        in_memory: True if the numbers of a world are in memory, which is possible only on the host.
+        in_memory: Whether the numbers of a world are in memory, which is possible only on the host.
         n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.
     """
     threads, lanes = lanes_of_block(group_size)

@@ -103,7 +103,6 @@ def build(program: Program, location: Location, unpacked_program: Program | None
     """Compile a program to kernels, and return the function that runs them.
 
     Args:
-        program: The program.
         location: Devices to compile it for.
         unpacked_program: The same program before ``pack_rows``, from which derivatives are computed, since kernels
             cannot differentiate rows; None for a program without rows.

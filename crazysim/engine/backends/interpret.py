@@ -44,7 +44,6 @@ def run_block(
     """Return the outputs of a block.
 
     Args:
-        block: The block.
         inputs: Its inputs: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
         shape: Shape of the lanes.
         observe: Function that is called with every operation and its results, or None.
@@ -94,15 +93,7 @@ class _PreparedBlock(NamedTuple):
     """Indices of the outputs."""
 
     def run(self, values: list[Any], inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
-        """Return the outputs for some inputs.
-
-        Args:
-            values: Constants and values of the enclosing blocks, by their indices. The values of this block are added:
-                arrays of the lanes' shape, scalars or tables.
-            inputs: Its inputs.
-            shape: Shape of the lanes.
-            observe: Function that is called with every operation and its results, or None.
-        """
+        """Return the outputs for some inputs."""
         for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
         for op, fn, args, results, dtype, blocks in self.calls:
@@ -245,10 +236,8 @@ def run_steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu:
     If the program has unfused stages, its blocks are interpreted, and the unfused stages run in XLA.
 
     Args:
-        program: The program.
         leaves: Leaves of all worlds.
-        n_steps: Number of steps.
-        on_cpu: True to treat subnormal numbers as zero, as XLA does on a CPU but not on a GPU.
+        on_cpu: Whether to treat subnormal numbers as zero, as XLA does on a CPU but not on a GPU.
     """
     if not program.fused:
         return lanes.run_steps(program, leaves, n_steps, run_block_in_callback)

@@ -26,7 +26,6 @@ def write_kernel(program: Program, target: str) -> Kernel:
     A kernel takes the number of steps as an array of one number.
 
     Args:
-        program: The program.
         target: ``"cuda"`` or ``"host"``.
     """
     require_source(program)
@@ -241,9 +240,6 @@ def write_segment(
     """Write the operations of a segment, and assign the results to the variables of the numbers that it writes.
 
     Args:
-        writer: Writer that the lines are added to.
-        program: The program.
-        segment: The segment.
         names: Expression of each number.
         constants: Expressions of the hoisted numbers.
         depth: Depth of the lines.
@@ -318,7 +314,6 @@ def write_results(writer: Writer, pointer: str, ctype: str, n_sharing: int, valu
     """Write the stores of all numbers of an output.
 
     Args:
-        writer: Writer that the lines are added to.
         pointer: The output.
         ctype: Type of its numbers.
         n_sharing: Number of lanes that share the same numbers.

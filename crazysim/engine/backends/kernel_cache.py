@@ -117,9 +117,6 @@ def store_file(cache_folder: Path, key: str, content: bytes, suffix: str) -> Pat
     """Write a file into a folder, under the name of its key and contents, and return it.
 
     Args:
-        cache_folder: The folder.
-        key: The key.
-        content: Contents.
         suffix: Suffix of the name, such as ``".so"``.
 
     Raises:

@@ -207,10 +207,7 @@ def run_steps(
     The loop can be differentiated in reverse mode if the number of steps is a Python integer.
 
     Args:
-        program: The program.
         leaves: Leaves of all worlds.
-        n_steps: Number of steps.
-        execute: Function that runs blocks.
     """
     initial_values = LeafValues(program, leaves, execute)
     hoisted_results = prepare_steps(program, initial_values)

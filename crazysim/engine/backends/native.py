@@ -135,7 +135,7 @@ def compiler_command(with_options: bool = True) -> list[str]:
     """Return the compiler's command without the names of files.
 
     Args:
-        with_options: True to include CXXFLAGS.
+        with_options: Whether to include CXXFLAGS.
     """
     program = compiler()
     if program is None:

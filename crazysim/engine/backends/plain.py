@@ -22,7 +22,6 @@ def build(stages: Sequence[Stage], data: Record) -> tuple[Run, list[int]]:
     constants.
 
     Args:
-        stages: The stages.
         data: Data with the structure, shapes and types of the data to step.
 
     Returns:

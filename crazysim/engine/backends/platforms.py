@@ -24,7 +24,6 @@ def compile_kernel(kernel: Kernel, location: Location) -> Launch:
 
     Args:
         kernel: The kernel, written for the target of the platform.
-        location: The devices.
     """
     return cuda.compile_kernel(kernel, location.devices) if location.platform == "gpu" else native.HostLaunch(kernel)
 

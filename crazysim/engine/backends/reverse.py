@@ -63,7 +63,6 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     """Return the transposed derivatives of a program that one kernel can run.
 
     Args:
-        program: The program.
         perturbed: Leaves whose cotangents are computed; only floats have cotangents.
 
     Raises:
@@ -215,7 +214,6 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
     the cotangents of the perturbed leaves, for every drone.
 
     Args:
-        reverse: The transposed derivatives.
         target: ``"cuda"`` or ``"host"``.
     """
     program, n = reverse.program, reverse.n_leaves

@@ -191,12 +191,7 @@ def is_constant(x: Element) -> bool:
 
 
 def prune(block: Block, keep_inputs: bool = True) -> Block:
-    """Return a block without the operations that no output needs.
-
-    Args:
-        block: The block.
-        keep_inputs: True to keep unused inputs.
-    """
+    """Return a block without the operations that no output needs."""
     block = _prune(block, set())
     if keep_inputs:
         return block
@@ -251,8 +246,6 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
     """Add a block's operations to a builder, simplified by the constants known there, and return its outputs.
 
     Args:
-        builder: Builder that the operations are added to.
-        block: The block.
         values: Elements for the block's inputs and for values of enclosing blocks. The block's own values are added.
     """
 

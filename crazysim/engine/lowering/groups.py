@@ -48,7 +48,6 @@ def independent_groups(stages: Sequence[Stage], data: Record, tracer: Tracer) ->
     Args:
         stages: Stages of a step, in order.
         data: Data of the simulation, or its shapes and types.
-        tracer: Cache of traced stages.
     """
     axes, leaves, drones = Axes(data), jax.tree.leaves(data), data.roles().population
     if all(scope == drones or not has_members(scope) for scope in axes.scopes):

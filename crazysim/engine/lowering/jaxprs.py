@@ -188,7 +188,6 @@ def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> 
     """Add inputs for an array to a block, and return them as an array of elements.
 
     Args:
-        builder: Builder that the inputs are added to.
         aval: Shape and type of the array.
         zeros: Flat indices of elements that are known to be zero; they become constants instead of inputs.
     """

@@ -44,7 +44,7 @@ def lower_stages(
         data: Data of the simulation, or its shapes and types.
         zeros: Leaves with the elements that are known to be zero. Terms with them are left out, unless a stage writes
             the leaf.
-        check: True to check the watched leaves after the last step, unless a stage writes the flag of worlds itself.
+        check: Whether to check the watched leaves after the last step, unless a stage writes the flag of worlds itself.
         population: Population whose members are the lanes; None for that of the record. They are called drones below.
         tracer: Cache of traced stages; None for a new one.
     """

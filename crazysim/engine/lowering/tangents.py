@@ -36,7 +36,6 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     on them. The leaves themselves are scratch: their values after the steps are not kept.
 
     Args:
-        program: The program.
         perturbed: Leaves whose tangents are given; leaves that are not floats are ignored.
 
     Raises:
@@ -113,7 +112,6 @@ def add_block_tangents(block: Block, perturbed: Sequence[Value]) -> Block:
     """Return the block that computes tangents of a block's outputs as well.
 
     Args:
-        block: The block.
         perturbed: Inputs whose tangents are given, floats.
 
     Returns:

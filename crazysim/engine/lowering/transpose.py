@@ -36,7 +36,6 @@ def transpose_block(block: Block, perturbed: Sequence[Value]) -> Block:
     """Return the block that computes cotangents of a block's inputs.
 
     Args:
-        block: The block.
         perturbed: Inputs whose cotangents are computed, floats.
 
     Returns:

@@ -46,7 +46,6 @@ def pack_rows(program: Program, select_rows: Callable[[list[int]], list[int]]) -
     A row holds one number of all drones, in the order of a kernel's lanes.
 
     Args:
-        program: The program.
         select_rows: Function from the written leaves to the leaves that become rows; random keys are never moved.
     """
     leaves = list(program.leaves)

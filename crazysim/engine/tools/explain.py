@@ -17,10 +17,9 @@ def explain(step: Step, data: Record, measure: bool = False) -> str:
     """Return a few lines about a step: its engine, the stages that are fused, and why other stages are not.
 
     Args:
-        step: The step.
         data: Data to step, or its shapes and types.
-        measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
-            and takes 256 steps.
+        measure: Whether to measure the cost of stages that are not fused, which compiles the step once more without
+            them and takes 256 steps.
     """
     plan = step.plan(data)
     lines = [f"engine: {plan.engine}" + (f" ({plan.engine_reason})" if plan.engine_reason else "")]

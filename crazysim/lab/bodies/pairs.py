@@ -53,7 +53,6 @@ def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
     """Return the contact points of pairs of solids, one record for each kind of pair, such as ball and box.
 
     Args:
-        solids: The solids.
         pairs: Indices of the two solids of each pair. (n_pairs, 2)
     """
     contacts = []
@@ -86,9 +85,6 @@ def contacts_on_surface(
     A ball has one point; a box has its corners and, unless the geom is a plane, its point nearest to the geom.
 
     Args:
-        solids: The solids.
-        solid_index: Index of the solid.
-        geom: The geom.
         carrier: Index of the body that carries the geom.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
     """

@@ -180,7 +180,6 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
 
     Args:
         states: Record with ``pos``, ``quat``, ``vel`` and ``ang_vel``. (n, ...)
-        solved: Bodies after contact.
         rows: Rows of these states among the solved bodies.
     """
     ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.rotvec))

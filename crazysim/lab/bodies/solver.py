@@ -104,13 +104,11 @@ def solve_contacts(
     changing their velocities, because added velocities would set a stack in motion.
 
     Args:
-        bodies: The bodies.
         contacts: The contacts, each with at least one body that can be pushed.
         initial_impulses: Initial impulses. With the impulses of the last step, bodies at rest stay at rest from the
             first iteration on.
         dt: Duration of the step, s.
         softness: Time constant with which an overlap is pushed out, s.
-        iterations: Iterations of the solver.
     """
     n, k = bodies.pos.shape[0], len(contacts.gap)
     dtype = bodies.pos.dtype

@@ -100,7 +100,6 @@ def load_reference(
 
     Args:
         setpoint: Setpoint of the load.
-        params: Masses, length, inertia.
         rod_jerk: Third derivative q_ttt of the direction, 1/s^3; None for zero. (..., 3)
 
     Returns:
@@ -125,7 +124,6 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
 
     Args:
         setpoint: Setpoint of the drone.
-        params: Masses, length, inertia.
 
     Returns:
         The results of ``load_reference``.

@@ -54,7 +54,6 @@ def lqr_weights(
     acceptable rate of this angle is w times that.
 
     Args:
-        airframe: The airframe.
         freq: Rate of the controller, Hz.
         Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for Bryson's rule.
         R: Weights of the inputs: a diagonal or a matrix; None for Bryson's rule.
@@ -141,7 +140,6 @@ def flat_reference(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
     """Return the reference of a setpoint by differential flatness, with the drag of a level drone compensated.
 
     Args:
-        setpoint: The setpoint.
         params: A record with ``mass``, ``gravity_vec``, ``J`` and ``drag_matrix``.
     """
     p, sp = params, setpoint
@@ -168,7 +166,6 @@ def state_error(
         quat: Attitude, body to world, unit, xyzw. (..., 4)
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-        reference: Reference.
         yaw: Yaw of the frame in which errors of position and velocity are returned, rad; None for the world frame.
             (..., 1)
     """

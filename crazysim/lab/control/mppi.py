@@ -76,7 +76,6 @@ def setpoint_after(setpoint: Setpoint, t: Array) -> Setpoint:
     """Return a setpoint some time later, by the Taylor polynomials of its position and yaw.
 
     Args:
-        setpoint: The setpoint.
         t: Time, s. ()
     """
     pos, vel, acc, jerk, snap = setpoint.pos, setpoint.vel, setpoint.acc, setpoint.jerk, setpoint.snap
@@ -202,7 +201,6 @@ class MPPI:
 
         Args:
             memory: Result of ``init``, or of the last call.
-            data: The data of the simulation.
             setpoint: As for ``command``.
 
         Returns:

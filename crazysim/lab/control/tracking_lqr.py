@@ -56,7 +56,6 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
     Args:
         error: Errors. (12,)
         wrench: Error of collective thrust, N, and torque, N m. (4,)
-        reference: Reference.
         ang_acc: Angular acceleration of the reference, body frame, rad/s^2. (3,)
         mass: Mass, kg. (1,)
         J: Inertia, body frame, kg m^2. (3, 3)
@@ -160,7 +159,6 @@ def tracking_lqr_control(
         ang_vel: Angular velocity, body frame, rad/s. (3,)
         setpoint: Setpoint of one drone at this time.
         time: Time since the reset, s. ()
-        params: Gains.
 
     Returns:
         Collective thrust, N, and body torque, N m, within the limits of the rotors. (4,)

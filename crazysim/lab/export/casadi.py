@@ -89,11 +89,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     the constants have that precision.
 
     Args:
-        sim: Simulation to export.
         parameters: Fields of the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
             ``"states.force"``.
-        world: Index of the world.
-        drone: Index of the drone in its world.
 
     Raises:
         ValueError: If the step cannot be exported; the message names the stage and the reason.

@@ -47,14 +47,10 @@ def to_out_of_tree(
     speeds to its mixer. The motors are off without a position setpoint, and while an observation is NaN or infinite.
 
     Args:
-        policy: The policy.
         folder: Existing folder for ``policy.h`` and ``controller.c``.
         meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
         airframe: The drone, which provides the thrust curve and the largest thrust of the rotors.
         freq: Rate of the policy, a divisor of 1000 Hz.
-
-    Returns:
-        Paths of both files.
     """
     require_type(policy, Policy, POLICY_REMEDY)
     require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")

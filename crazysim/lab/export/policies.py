@@ -105,12 +105,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     each image; pixels are row by row), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
 
     Args:
-        policy: The policy.
-        path: File to write.
         meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
-
-    Returns:
-        The path.
 
     Raises:
         ImportError: If onnx is not installed.
@@ -225,13 +220,8 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     that they stay in flash memory. The functions allocate nothing and call only ``tanhf``, and ``expf`` with memory.
 
     Args:
-        policy: The policy.
-        path: File to write.
         meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
         name: Name of the function, and prefix of the names of the constants.
-
-    Returns:
-        The path.
     """
     require(
         isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name),

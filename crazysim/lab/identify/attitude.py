@@ -42,7 +42,6 @@ class FittedModel(PyTree):
         """Return the model of an airframe.
 
         Args:
-            airframe: Airframe.
             dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
             mass: Mass, kg; None for the mass of the airframe.
         """

@@ -44,7 +44,6 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     as in Betaflight's src/main/flight/imu.c, where a positive rotation about body z gives a negative yaw.
 
     Args:
-        path: File.
         repairs: List that descriptions of repairs are appended to.
     """
     header = find_header(path)

@@ -93,7 +93,6 @@ def check_motion(
     where a gyroscope failed, are left out.
 
     Args:
-        name: Name of the log, for messages.
         t: Time, s. (n,)
         data: Columns by field of ``Columns``, in the units of a log.
         derived_keys: Fields that were differentiated, not measured; also ``quat`` if the attitude was given as angles.

@@ -23,7 +23,6 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """Return the columns of a file whose first line names them; a column without numbers stays text.
 
     Args:
-        path: File.
         repairs: List that descriptions of repairs are appended to.
     """
     with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -59,7 +58,6 @@ def split_rows(
     """Return the cells of the rows with as many cells as the header; drop up to ``MAX_REPAIRED_SHARE`` other rows.
 
     Args:
-        name: Name of the file, for messages.
         lines: Lines after the header.
         width: Number of cells in the header.
         first_line: Line number of the first of these lines in the file, from 1.

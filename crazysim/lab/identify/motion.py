@@ -32,8 +32,6 @@ def join_motion_capture(
     The clocks may differ by any offset, which is found by correlating the magnitudes of the angular velocities.
 
     Args:
-        name: Name of the log, for messages.
-        table: Columns of the log.
         motion: Columns of the motion capture.
         columns: Names of the columns in both.
         repairs: List that descriptions of repairs are appended to.

@@ -87,7 +87,6 @@ class Model(PyTree):
         """Return the model of an airframe, with its table ``[residual]`` if it has one.
 
         Args:
-            airframe: Airframe.
             mass: Mass, kg; None for the mass of the airframe.
         """
         params = first_principles.Params.create(airframe)
@@ -131,7 +130,6 @@ def cut_windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
     """Return the windows of logs of equal sample times that do not cross a gap.
 
     Args:
-        logs: Logs.
         duration: Duration of a window, s.
         stride: Time between the starts of two windows, s.
 
@@ -166,10 +164,8 @@ def predict(
     Each sample is one Runge-Kutta step of order 4.
 
     Args:
-        model: Model.
-        window: Window.
         dt: Time between two samples, s.
-        constant_rates: True to keep the angular velocity of the first sample, so that only forces are modelled.
+        constant_rates: Whether to keep the angular velocity of the first sample, so that only forces are modelled.
     """
 
     def derivative(state: State, inputs: Array) -> State:
@@ -222,7 +218,6 @@ def prediction_errors(
 
     Args:
         logs: Logs of the same sample time.
-        model: Model.
         horizons: Horizons, s.
 
     Returns:
@@ -277,7 +272,6 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
 
     Args:
         logs: Logs of the same sample time, whose delays were removed with ``aligned``.
-        models: Models by name.
         path: File to write, such as ``errors.png``.
 
     Raises:

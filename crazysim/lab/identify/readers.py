@@ -44,8 +44,6 @@ def resample(
     longer intervals than ``PERIOD_RANGE`` allows are left out too, except the voltage.
 
     Args:
-        name: Name of the file, for messages.
-        streams: Streams by name.
         repairs: List that descriptions of repairs are appended to.
         columns: Names of the columns; None for the default names. Attitudes are made continuous before they are
             interpolated.
@@ -123,7 +121,6 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
     ``qw`` (src/modules/interface/quatcompress.h). Variables that several events share are prefixed with the event.
 
     Args:
-        path: File.
         repairs: List that descriptions of repairs are appended to.
         columns: Names of the columns. Events without these columns are left out, unless no event has any of them.
 

@@ -36,7 +36,6 @@ def check_period(name: str, t: NDArray) -> None:
     """Check that the interval between samples is plausible for a log of a flight.
 
     Args:
-        name: Name of the log, for messages.
         t: Time, s. (n,)
     """
     steps = np.diff(t[np.isfinite(t)])
@@ -183,7 +182,6 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
     """Return True for the samples in the air, by the size of the thrust. (n,)
 
     Args:
-        name: Name of the log, for messages.
         t: Time, s. (n,)
         thrust: Sum of the squares of the rotor speeds, or the commanded thrust, in any unit. (n,)
         repairs: List that descriptions of repairs are appended to.

@@ -202,15 +202,7 @@ class _LogTerms(NamedTuple):
     def create(
         log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray, delay: float
     ) -> _LogTerms:
-        """Return the terms of a log.
-
-        Args:
-            log: Log.
-            params: Parameters of the airframe.
-            thrust_factor: Factor of the airframe's thrust curve.
-            values: Factors of moments of inertia, torque curve and rotor inertia, for gyroscopic torques. (5,)
-            delay: Delay of the state behind the rotor speeds, for gyroscopic torques, s.
-        """
+        """Return the terms of a log."""
         mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
         root = np.sqrt(values[:3])
         inertia = np.asarray(params.J, np.float64) * np.outer(root, root)

@@ -56,7 +56,6 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
 
     Args:
-        path: File.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:

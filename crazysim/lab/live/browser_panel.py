@@ -71,7 +71,6 @@ class BrowserPanel:
         """Update the text and the plot, each at its own rate.
 
         Args:
-            picture: Picture that is shown.
             now: Present time (``time.perf_counter``), s.
         """
         if now - self._text_time >= TEXT_PERIOD:

@@ -96,7 +96,6 @@ def parse_command(message: Message | ShowFile, drone: int | None = None) -> Comm
     """Return the command in a message.
 
     Args:
-        message: Message.
         drone: ID of the drone if the message has none; None for all.
     """
     if isinstance(message, ShowFile):

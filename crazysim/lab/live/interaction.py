@@ -133,7 +133,6 @@ class Interaction:
         """Make viewers mark and follow a body, as a click on it does. A drone becomes the selected drone as well.
 
         Args:
-            world: Index of the world.
             kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or a handle's name.
             index: Index of the body among the bodies of its kind.
         """
@@ -149,7 +148,6 @@ class Interaction:
         """Call ``on_click``, if it is set, as viewers do for a click on the ground.
 
         Args:
-            world: Index of the world.
             point: Point, world frame, m. (3,)
         """
         if self.on_click is not None:
@@ -159,7 +157,6 @@ class Interaction:
         """Follow the body, or click on the ground, that a ray from a viewer's camera hits; from any thread.
 
         Args:
-            bodies: Bodies of the scene.
             picture: Picture that the user has seen.
             origins: Origin of the ray in the frame of each world, m; NaN for worlds elsewhere. (n, 3)
             direction: Direction of the ray. (3,)

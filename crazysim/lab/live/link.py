@@ -81,9 +81,7 @@ def fly_policy(
     Args:
         link: Link to a simulated or a real drone.
         policy: Function of the state that returns a command of the level. (k,)
-        seconds: Duration, s.
         freq: Commands per second, Hz.
-        level: Command level.
     """
     if isinstance(policy, TrainedPolicy):
         policy.require_commands(Control(level).value, freq)

@@ -208,7 +208,6 @@ class Live(Interaction, Closeable):
         ``crazysim.media.Flight.load``.
 
         Args:
-            path: Path of the file.
             freq: Rate of samples in simulated time, Hz; a divisor of the rate of control steps.
 
         Raises:

@@ -167,10 +167,8 @@ class Pace:
         """Return the figures of a run.
 
         Args:
-            processes: Processes of the loop.
             simulated_s: Simulated time, s.
             wall_s: Wall-clock time without pauses, s.
-            n_pictures: Number of pictures.
             failures: Number of logged errors of requests, viewers and recordings; errors of the processes are added.
         """
         slowest = sorted(processes, key=lambda process: -process.longest_call)[:MAX_LISTED_PROCESSES]

@@ -64,7 +64,6 @@ class PictureSource:
         """Return a picture of the simulation as it is now.
 
         Args:
-            live: Loop of the simulation.
             plot: Quantity to plot, one of ``live.quantities`` or of the paths of ``list_quantities``; empty for none.
         """
         sim, worlds = self._sim, self._worlds
@@ -188,9 +187,7 @@ def read_quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
     """Return the current values of a quantity in one world. (k,)
 
     Args:
-        data: Data of a simulation.
         path: One of ``list_quantities``.
-        world: Index of the world.
         drone: Index of the drone; used only for quantities of drones.
     """
     wanted_path, _, member = path.rstrip("]").partition("[")

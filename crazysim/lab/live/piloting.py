@@ -87,8 +87,6 @@ class Pilot:
         controllers limit the position error that they correct, so the drone does not overturn on the way.
 
         Args:
-            live: Loop.
-            world: Index of the world.
             point: Point, world frame, m. (3,)
         """
         require_state_control(live)

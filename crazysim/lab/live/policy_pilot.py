@@ -111,7 +111,6 @@ class PolicyPilot:
         """Set the goal of the selected drone, which then no longer follows the listed points.
 
         Args:
-            live: Loop.
             pos: Goal, world frame, m. (3,)
         """
         require(live.selected is not None, "expected a selected drone, got none. Click on one, or press tab.")

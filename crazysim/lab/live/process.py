@@ -79,7 +79,6 @@ def steps_per_call(freq: float | None, control_freq: int, name: str) -> int:
     Args:
         freq: Rate of the calls, Hz; None for the rate of the control steps.
         control_freq: Rate of the control steps, Hz.
-        name: Name of the process, for the message.
     """
     if freq is None:
         return 1

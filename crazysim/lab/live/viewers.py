@@ -51,7 +51,6 @@ class Viewers(Generic[L]):
         """Send a picture to every viewer if ``due_time`` has come; return True if a picture was sent.
 
         Args:
-            live: Live loop.
             due_time: Earliest time of this picture, s, by ``time.perf_counter``.
         """
         now = time.perf_counter()

@@ -44,7 +44,6 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     middle of the cell and the largest snaps, so that drones in formation need no short cells.
 
     Args:
-        pieces: Trajectories.
         tolerance: Largest error of a distance, m. Distances are never too small: they are evaluated at ``time``.
     """
     n = pieces.n_drones

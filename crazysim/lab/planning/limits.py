@@ -184,7 +184,6 @@ def check(
     Args:
         trajectories: One trajectory, or one for each drone: a sequence, or a ``Trajectory`` with one leading axis.
             One trajectory with several ``starts`` is flown by as many drones.
-        limits: Limits.
         airframe: Airframe that provides the thrust limits that ``limits`` leaves None; None for no such limits.
         starts: Start of each drone, s, as in ``Follow``; negative if it began before time zero. () or (n_drones,)
         duration: Duration, s; None to end with the last trajectory. A repeating trajectory then ends after one round.

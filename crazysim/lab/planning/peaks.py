@@ -103,7 +103,6 @@ def find_peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
     narrower than a sampling interval may be missed.
 
     Args:
-        table: Trajectories.
         names: Names of quantities, keys of ``QUANTITIES``.
     """
     return {name: _find_peak(table, QUANTITIES[name]) for name in names}

@@ -103,7 +103,6 @@ def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, lim
     Args:
         solve: Function from durations, s (n_pieces,), to coefficients (n_pieces, 4, degree + 1).
         durations: First guess, s. (n_pieces,)
-        limits: Limits.
     """
 
     def exceeded_limits(factor: float) -> list[str]:

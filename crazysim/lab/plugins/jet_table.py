@@ -87,7 +87,6 @@ def load_jet_table(
     y, then x, with one number for a pressure, Pa, or three for a velocity, m/s. A folder may have files of both kinds.
 
     Args:
-        folder: The folder.
         shape: Nodes along x, y and z; None for a cube if the number of rows is a cube number, and otherwise 81 x 81 x
             n.
         spacing: Distance between nodes, m.

@@ -122,7 +122,6 @@ def residual_wrench(inputs: Array, residual: Residual) -> tuple[Array, Array]:
 
     Args:
         inputs: Inputs, see ``residual_inputs``. (..., 14)
-        residual: Coefficients.
 
     Returns:
         Force and torque. (..., 3) each

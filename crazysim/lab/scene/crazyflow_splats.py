@@ -26,7 +26,6 @@ def attach_splats(sim: Sim, scene: str | Path | None = None, drone: str | Path |
     For other poses and scales, use ``SplatScene`` and ``sim.scene.splat_fn``.
 
     Args:
-        sim: Simulation.
         scene: A ``.ply`` file.
         drone: Not supported.
     """
@@ -159,8 +158,6 @@ def camera_intrinsics(
     """Return focal lengths and principal point of a camera, pixels.
 
     Args:
-        mj_model: Compiled scene.
-        camera_id: Id of the camera.
         resolution: Width and height, pixels.
     """
     width, height = resolution

@@ -70,9 +70,6 @@ def read_ply(content: bytes) -> dict[str, Columns]:
 
     A list property is an array (n, n_entries), or a list of arrays if its entries differ in number.
 
-    Args:
-        content: Contents of the file.
-
     Raises:
         ValueError: If the file is damaged, cut off, or of another kind.
     """

@@ -126,7 +126,7 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", with
     Args:
         trajectory: Trajectory of one vehicle.
         encoding: ``COMPRESSED`` or ``POLY4D``.
-        with_yaw: True to write the yaw as the fourth coordinate, degrees.
+        with_yaw: Whether to write the yaw as the fourth coordinate, degrees.
     """
     require(encoding in ENCODINGS, f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
     ends, c = trajectory_pieces(trajectory)

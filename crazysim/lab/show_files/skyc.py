@@ -52,7 +52,6 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     """Return the show in the contents of a ``.skyc`` file; see ``load_show``.
 
     Args:
-        content: Contents of the file.
         location: Name of the file, for messages.
 
     Raises:
@@ -244,7 +243,6 @@ def save_show(show: Show, path: str | Path) -> None:
     written as ``colors`` as well.
 
     Args:
-        show: Show.
         path: File to write; its name ends with ``.skyc``.
 
     Raises:

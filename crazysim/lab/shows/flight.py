@@ -63,7 +63,6 @@ def fly_show(show: Show, seconds: float | None = None, progress: Progress | None
     """Return the flight of a show: its drones start hovering at the first points of their trajectories.
 
     Args:
-        show: Show.
         seconds: Duration, s; None for the duration of the show.
         progress: Function ``progress(items, label)`` that yields the items and shows a progress bar; None for no bar.
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.

@@ -114,7 +114,6 @@ def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
     """Return the figures of a flight as text.
 
     Args:
-        flight: Flight.
         figures: Result of ``report``.
     """
     rms = figures["flown"]["tracking_rms"]

@@ -45,11 +45,10 @@ def film(
     """Film a flown show, and return the number of frames.
 
     Args:
-        flight: Flight.
         path: ``.mp4`` or ``.gif`` file to write.
         fps: Frames per second.
-        progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
-        night: True to darken the scene, which makes the lights stand out.
+        progress: Whether to show a progress bar, which needs tqdm, where stderr is a terminal.
+        night: Whether to darken the scene, which makes the lights stand out.
         view: Settings of ``crazysim.media.View`` that replace the defaults of ``create_view``.
 
     Raises:
@@ -81,7 +80,6 @@ def create_view(flight: ShowFlight, **settings: Any) -> View:
     """Return a view of the whole show with lights, time, and marks of collisions.
 
     Args:
-        flight: Flight.
         settings: Settings of ``crazysim.media.View`` that replace the defaults.
     """
     camera = camera_around(flight.planned)

@@ -97,7 +97,6 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
     """Write positions with time stamps, for example of a flight, as a file that ``load_csv`` reads.
 
     Args:
-        path: File to write.
         times: Times, s. (n,)
         pos: Positions, world frame, m. (n, 3)
         yaw: Yaw, rad; None to omit its column. (n,)

@@ -50,7 +50,6 @@ def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Traj
     """Return the trajectory of uncompressed polynomials.
 
     Args:
-        content: Contents of the memory.
         location: File, for messages.
     """
     return Trajectory.of_pieces(*read_poly4d(content, location))
@@ -200,7 +199,6 @@ def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = Fal
 
     Args:
         trajectory: Trajectory of one vehicle.
-        path: File to write.
         compressed: True for the compressed format.
 
     Raises:
@@ -213,7 +211,6 @@ def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
     """Return the trajectory in a file from ``save_memory``, or in a copy of a Crazyflie's trajectory memory.
 
     Args:
-        path: File.
         compressed: True for the compressed format, which the contents do not identify.
 
     Raises:

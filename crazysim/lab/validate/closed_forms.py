@@ -36,12 +36,9 @@ def free_body(
     """Return a simulation of a drone without thrust and drag, thrown from a height of 100 m.
 
     Args:
-        integrator: Integrator.
         freq: Steps per second, Hz.
         ang_vel: Initial angular velocity, body frame, rad/s. (3,)
         inertia: Inertia matrix, kg m^2; None for a diagonal matrix of ``INERTIA``. (3, 3)
-        gravity: True to apply gravity.
-        n_worlds: Number of worlds.
     """
     sim = Sim(n_worlds, control="rotor_vel", integrator=integrator, freq=freq)
     inertia = np.diag(INERTIA) if inertia is None else np.asarray(inertia)

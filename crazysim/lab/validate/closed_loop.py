@@ -115,7 +115,6 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
     """Return the indices of samples with a setpoint above the floor.
 
     Args:
-        name: Name of the log, for messages.
         height: Height of the setpoint, m. (n,)
     """
     commanded = np.flatnonzero(height > 0)
@@ -143,8 +142,6 @@ def simulate_flights(
     real drone started. Shorter flights continue with their last setpoint until the longest flight ends.
 
     Args:
-        flights: Flights.
-        drone: Airframe.
         estimator: Filter whose estimates the controllers use; None for the true state.
     """
     sim = Sim(len(flights), drone=drone, control="state", controller="pid", estimator=estimator)

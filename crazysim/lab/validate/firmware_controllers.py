@@ -59,8 +59,7 @@ def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
     """Return the absolute differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
 
     Args:
-        name: Name of the recording.
-        whole_numbers: True to compute in integers where the firmware does.
+        whole_numbers: Whether to compute in integers where the firmware does.
     """
     controller, mode, drone = CASES[name]
     states, commands = (x.astype(np.float32) for x in sample_flights(mode, 8, 240, seed=11))

@@ -19,7 +19,6 @@ def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
 
     Args:
         section: Section with labels of the axes.
-        rows: Rows of that section.
         path: File to write, ``.png``.
 
     Raises:

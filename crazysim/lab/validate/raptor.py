@@ -81,7 +81,6 @@ def hold_goal(
     """Return True for drones that stay within 0.3 m of their goal in the last second of a flight. (n,)
 
     Args:
-        policy: Policy.
         period: Time between two calls, ms.
         observe: Function that returns the state in the layout of ``RaptorPolicy.action``.
         apply_action: Function that applies an action for the period.

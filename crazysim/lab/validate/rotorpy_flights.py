@@ -45,7 +45,6 @@ def create_simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = Tr
 
     Args:
         params: RotorPy's parameters of a multirotor without parasitic drag and translational lift.
-        n_worlds: Number of worlds.
         drag: True for a linear drag as large as the drag of the rotors in hover, False for none.
     """
     hub_positions, lag_rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
@@ -79,7 +78,6 @@ def fly_crazysim(
     """Return the states of a flight in crazysim after each command.
 
     Args:
-        params: Parameters.
         commands: Speeds of the rotors, rad/s. (n, 4)
         effects: Effects of the air.
         drag: See ``create_simulation``.
@@ -100,7 +98,6 @@ def fly_rotorpy(params: dict[str, Any], commands: NDArray, aero: bool = False) -
     """Return the states of a flight in RotorPy after each command, with crazysim's names and units.
 
     Args:
-        params: Parameters.
         commands: Speeds of the rotors, rad/s. (n, 4)
         aero: True to fly in ``WIND`` with RotorPy's aerodynamic forces, False for neither.
     """
@@ -132,9 +129,7 @@ def compute_air_wrenches(params: dict[str, Any], speed: float, n: int = 100) -> 
     """Return the additional forces and torques of the air in ``n`` states, in crazysim and in RotorPy.
 
     Args:
-        params: Parameters.
         speed: Largest velocity along each axis, m/s. Body rates reach 3 rad/s, rotor speeds 10% from hover.
-        n: Number of states.
 
     Returns:
         Force, N, and torque, N m, body frame, of crazysim, and of RotorPy. (n, 6) each

@@ -108,7 +108,6 @@ def export_policy(name: str, folder: Path | None = None) -> ExportedPolicy:
     """Return a policy of ``POLICIES``, trained with seed 0 on its recipe, and exported.
 
     Args:
-        name: Name of the policy.
         folder: Folder that contains or receives the folders of the trainings; None to keep none.
     """
     from crazysim.lab.export.policies import to_c, to_onnx
@@ -166,10 +165,7 @@ def fly_task(
     simulator, which replace the states in our data.
 
     Args:
-        task: Name of the task.
         command: Policy, a function that returns attitude commands, (n, 4), for observations, (n, n_obs).
-        simulator: The simulator.
-        n_starts: Number of starts.
     """
     from crazysim.train.evaluation import EVALUATION_SEED
 

@@ -114,7 +114,6 @@ class AttitudeController:
         """Advance the controller by a step, and return the commanded thrusts, N. (n, 4)
 
         Args:
-            states: Present states.
             thrusts: Present thrusts of the rotors, N. (n, 4)
         """
         rows = {name: x.astype(np.float32) for name, x in _world_rows(states).items()}

@@ -59,9 +59,8 @@ class CarParams(PyTree):
         The grip of an axle is its static load times the friction coefficient; load transfer is neglected.
 
         Args:
-            vehicle: The vehicle model.
             freq: Rate of the physics, Hz: if it is too low for tyres at ``SLIP_SPEED``, ``slip_speed`` is larger.
-            trailer: True if the vehicle tows its trailer.
+            trailer: Whether the vehicle tows its trailer.
         """
         number = vehicle.number
         n, wheel_mass, radius = number("wheels.number"), number("wheels.mass"), number("wheels.radius")

@@ -84,9 +84,7 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     speed. When the vehicle drives backwards, its slip forces increase the slip; the forces of ``single_track`` do not.
 
     Args:
-        state: State.
         command: Rate of the steering angle, rad/s, and acceleration, m/s^2. (..., 2)
-        params: Parameters.
     """
     p, v, d, g = params, state.speed, state.steer, -GRAVITY[2]
     steer_rate = limited_steer_rate(d, command[..., :1], p)

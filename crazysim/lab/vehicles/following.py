@@ -59,8 +59,6 @@ def path_state(
     """Return the state of a vehicle relative to its path.
 
     Args:
-        state: State of the vehicle.
-        path: Paths.
         index: Index of the vehicle's path. ()
         guess: Arc length near the projection of the vehicle, m. (1,)
         reference_offset: Distance from the centre of mass forwards to the point of the vehicle that is projected, m.
@@ -99,7 +97,6 @@ def motor_reference(speed: Array, acc: Array, car: CarParams) -> Array:
     Args:
         speed: Speed, m/s. (..., 1)
         acc: Acceleration, m/s^2. (..., 1)
-        car: Parameters of the vehicle.
     """
     sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
     damping, friction = car.drive[..., 1:2] + car.rolling[..., :1], car.drive[..., 2:] + car.rolling[..., 1:]
@@ -148,8 +145,6 @@ class PathController:
         """Return gains in a record of leaves of scope ``shared`` or ``parameter``, or None.
 
         Args:
-            vehicle: The vehicle.
-            car: Parameters of the vehicle.
             freq: Rate of the controller, Hz.
         """
         return None
@@ -168,11 +163,7 @@ class PathController:
         """Return the steering angle, rad (1,), and the memory.
 
         Args:
-            state: State of the vehicle.
             tracking: The vehicle relative to its path.
-            memory: Memory.
-            gains: Gains.
-            car: Parameters of the vehicle.
         """
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 

@@ -21,9 +21,7 @@ def kinematic(state: CarState, command: Array, params: CarParams, wrench: Array 
     accelerate the vehicle along its axis. The wheels balance all forces across the axis.
 
     Args:
-        state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
-        params: Parameters.
         wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
             for no external wrench. (..., 3)
     """

@@ -87,7 +87,7 @@ class Path(PyTree):
 
         Args:
             trajectory: Trajectory of one vehicle.
-            backwards: True to drive along the path in reverse gear.
+            backwards: Whether to drive along the path in reverse gear.
         """
         pieces, curve = _horizontal_curve(trajectory)
 
@@ -249,7 +249,6 @@ class Path(PyTree):
         """Return the arc length, m, of the sample of a whole path that is nearest to a position, on the host.
 
         Args:
-            index: Index of the path.
             pos: Position, world frame, m. (2,)
         """
         n_pieces = round(float(self.length[index]) / float(self.spacing[index]))
@@ -263,7 +262,6 @@ class Path(PyTree):
         """Return position, m (2,), heading of the vehicle, rad, and arc length, m, at time zero, on the host.
 
         Args:
-            index: Index of the path.
             start: Time at which the vehicle is at the start of the path, s.
         """
         point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, float_dtype())))

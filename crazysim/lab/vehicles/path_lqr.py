@@ -78,8 +78,6 @@ def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) 
     The state x is offset, sideways velocity, heading and yaw rate.
 
     Args:
-        model: Dynamics of the vehicle.
-        car: Parameters of the vehicle.
         speed: Speed about which the dynamics are linearised, m/s. ()
     """
     reference = motor_reference(speed[None], jnp.zeros(1, speed.dtype), car)

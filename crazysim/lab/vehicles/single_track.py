@@ -21,7 +21,6 @@ def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
     Args:
         reference: Motor reference d, 1. (..., 1)
         speed: Forward velocity v, m/s. (..., 1)
-        params: Parameters.
     """
     p = params
     sign = speed * lax.rsqrt(speed * speed + p.slip_speed * p.slip_speed)
@@ -72,9 +71,7 @@ def single_track(state: CarState, command: Array, params: CarParams, wrench: Arr
     Control", 2012, section 2.3; the forces of the drive act on both axles as in the simulator of AIMotionLab's cars.
 
     Args:
-        state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
-        params: Parameters.
         wrench: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None
             for no external wrench. (..., 3)
     """

@@ -24,7 +24,6 @@ def path_poses(
     """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
 
     Args:
-        paths: Paths.
         index: Index of each car's path. (n_worlds, n_members, 1)
         start: Time at which each car is at the start of its path, s. (n_worlds, n_members, 1)
         counts: Numbers of worlds and of cars.
@@ -46,7 +45,6 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     """Return the arc lengths of the points of paths that are nearest to cars, m. (n_worlds, n_members, 1)
 
     Args:
-        paths: Paths.
         index: Index of each car's path. (n_worlds, n_members, 1)
         pos: Positions of the cars, m. (n_worlds, n_members, 2)
         arc: Reference arc lengths, m; on closed paths the result is in the lap nearest to them.

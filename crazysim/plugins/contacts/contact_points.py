@@ -63,7 +63,6 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, excluded: Collectio
     Objects that other plugins move, such as loads, are left out.
 
     Args:
-        sim: Simulation.
         objects: Handles, or names of objects; None for all.
         excluded: Names of populations that are left out.
     """
@@ -86,7 +85,6 @@ def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
     """Return the surfaces that drones and loads touch, without populations that handle contacts with drones themselves.
 
     Args:
-        sim: Simulation.
         objects: Handles, or names of objects; None for all.
     """
     pushing_plugins = [plugin.name for plugin in sim.scene.plugins() if getattr(plugin, "pushes_drones", False)]
@@ -118,7 +116,6 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
 
     Args:
         data: Data of all drones or of one drone.
-        surfaces: Surfaces of floor and objects.
         box: Centre and half extents of the drone's collision box, body frame, m. (6,)
     """
     pos, quat = data.states.pos, data.states.quat
@@ -165,8 +162,6 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
 
     Args:
         data: Data of one drone or one world.
-        body: The loads.
-        shape: Shape of the loads.
         surfaces: At least one surface.
     """
     pos, quat = body.pos[..., None, :], body.quat[..., None, :]

@@ -51,8 +51,6 @@ def velocity_after_contact(
         initial_vel: Velocity, m/s, followed by the angular velocity, rad/s, for a drone. (..., 6) or (..., 3)
         mass: Mass, kg. (..., 1)
         inertia: Mass and moment of inertia, as ``inertia_matrix`` returns them. (..., 6, 6) or (..., 3, 3)
-        material: Parameters of the contact.
-        iterations: Iterations of the solver.
     """
     n, p, s = points.normal, points.point, points.vel
     is_active = points.gap < 0

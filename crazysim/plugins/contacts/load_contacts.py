@@ -72,7 +72,6 @@ def resolve_drone_contacts(
     Args:
         data: Data of one world.
         collider: The loads, or the hooks.
-        material: Parameters of the contacts.
         boxes: Collision boxes of the drones.
     """
     body, s, p = collider.body(data), data.states, data.params
@@ -120,7 +119,6 @@ def velocity_change(
         gap: Distance of the bodies, negative where they overlap, m. (...)
         normal: Outward normal of the other body. (..., 3)
         vel: Velocity relative to the other body, m/s. (..., 3)
-        material: Parameters of the contact.
         response: Function from a change of the body's velocity to the change of the relative velocity, both m/s.
     """
     separation_speed = rotation.dot(vel, normal)
@@ -161,7 +159,6 @@ def resolve_load_contacts(data: SimData, colliders: Sequence[Collider], material
     Args:
         data: Data of one world.
         colliders: Loads, and hooks.
-        material: Parameters of the contacts.
     """
     index_pairs = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))

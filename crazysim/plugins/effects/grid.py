@@ -42,7 +42,6 @@ class Grid(NamedTuple):
         """Return the grid as checked NumPy arrays, with one spacing per axis.
 
         Args:
-            name: Name in messages.
             k: Length of the vector at each node; None for a grid of scalars.
         """
         values, origin, spacing = (
@@ -115,9 +114,6 @@ def load_wind_grid(path: str | Path) -> Grid:
 
     The columns ``Points:0``, ``Points:1``, ``Points:2`` are positions, m, and ``U:0``, ``U:1``, ``U:2`` velocities,
     m/s, with one row for each node, in any order. Other columns are ignored.
-
-    Args:
-        path: The file.
 
     Raises:
         ConfigError: If the file cannot be read, a column is missing, or the points are not the nodes of a regular grid.

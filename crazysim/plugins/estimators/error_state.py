@@ -103,7 +103,6 @@ def predict(
     """Return the estimate after an interval, without process noise; ``add_noise`` also bounds the variances.
 
     Args:
-        estimate: The estimate.
         accel: Specific force, body frame, m/s^2. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
@@ -142,7 +141,6 @@ def propagate(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, 
     """Return the estimate with biases after an interval, which may be negative, with an unchanged covariance.
 
     Args:
-        estimate: The estimate.
         accel: Mean specific force as measured, body frame, m/s^2. (3,)
         gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
         dt: Length of the interval, s.
@@ -177,7 +175,6 @@ def predict_biased(
         d_att' = E d_att - dt w
 
     Args:
-        estimate: The estimate.
         accel: Mean specific force as measured, body frame, m/s^2. (3,)
         gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
         dt: Length of the interval, s.
@@ -222,7 +219,6 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     """Return the estimate after the measurement of one number.
 
     Args:
-        estimate: The estimate.
         rows: Indices of the errors that the measurement depends on, such as ``POS``.
         h: Derivatives of the measurement with respect to these errors. (len(rows),)
         error: The measurement minus its prediction by the estimate, in the unit of the measurement. ()
@@ -261,7 +257,6 @@ def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
     """Return the estimate with its attitude error moved into the attitude.
 
     Args:
-        estimate: The estimate.
         min_angle: Angle that a component of the error must exceed, rad, else the error is dropped; by default as in the
             firmware.
     """

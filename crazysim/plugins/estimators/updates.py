@@ -27,7 +27,6 @@ def update_pos(estimate: Estimate, pos: Array, deviation: Array | float, point: 
     """Return the estimate after a measured position, world frame, m (3,), with its standard deviation, m. () or (3,)
 
     Args:
-        estimate: The estimate.
         pos: The position, world frame, m. (3,)
         deviation: Its standard deviation, m. () or (3,)
         point: Point of the drone whose position is measured, body frame, m; None for the centre of mass. (3,)
@@ -49,7 +48,6 @@ def update_vel(
     """Return the estimate after a measured velocity.
 
     Args:
-        estimate: The estimate.
         vel: The velocity, world frame, m/s. (3,)
         deviation: Its standard deviation along each axis, m/s. () or (3,)
         point: Point of the drone whose velocity is measured, body frame, m; None for the centre of mass. (3,)
@@ -74,7 +72,6 @@ def update_direction(
     """Return the estimate after a measured direction, such as the direction of a magnetic field.
 
     Args:
-        estimate: The estimate.
         direction: Measured direction, body frame, of about unit length. (3,)
         world_direction: The direction, world frame, unit. (3,)
         deviation: Standard deviation along each axis, rad. () or (3,)
@@ -108,7 +105,6 @@ def update_flow(
     prediction is then correlated with the first. With biases, the second component is predicted after the first update.
 
     Args:
-        estimate: The estimate.
         rot: Attitude at the end of the previous step, as a matrix. (3, 3)
         flow: Motion of the image along x and y of the body, pixels. (2,)
         gyro: Angular velocity as measured, body frame, rad/s. (3,)
@@ -134,7 +130,6 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
     """Return the estimate after a measured distance to the floor, m; unchanged if the tilt exceeds 84 degrees.
 
     Args:
-        estimate: The estimate.
         rot: Attitude at the end of the previous step, as a matrix. (3, 3)
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
@@ -151,7 +146,6 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
     """Return the estimate after a measured distance to level ground at z = 0 along the negative z axis of the body.
 
     Args:
-        estimate: The estimate.
         distance: The distance, m; the estimate is unchanged if the tilt exceeds 84 degrees. ()
         deviation: Standard deviation of the distance, m.
     """
@@ -182,7 +176,6 @@ def update_difference(
     """Return the estimate after a measured difference of distances to two anchors, m.
 
     Args:
-        estimate: The estimate.
         first_anchor: Position of the first anchor, world frame, m. (3,)
         second_anchor: Position of the second anchor. (3,)
         difference: Distance to the second minus distance to the first. ()
@@ -204,7 +197,6 @@ def update_differences(estimate: Estimate, anchors: Array, differences: Array, d
     errors, with ``1 + 1 / k`` times the variance of one distance.
 
     Args:
-        estimate: The estimate.
         anchors: Positions of the anchors, world frame, m. (n, 3)
         differences: Distances to all anchors but the first minus the distance to the first, m. (n - 1,)
         deviation: Standard deviation of a distance, m.
@@ -232,7 +224,6 @@ def update_sweep(
     """Return the estimate after a measured angle of a light plane that sweeps over the drone.
 
     Args:
-        estimate: The estimate.
         rot: Attitude at the end of the previous step, as a matrix. (3, 3)
         sensor: Position of the photodiode, body frame, m. (3,)
         station: Position of the station, world frame, m, (3,) and its attitude, station to world, as a matrix. (3, 3)

@@ -92,7 +92,6 @@ class Hook(HangingLoad):
         Args:
             mass: Mass of the load, kg.
             dof: Degrees of freedom of the rod, 1 or 2.
-            **settings: Other settings.
         """
         return Hook(mass, dof, **settings)
 

@@ -143,7 +143,6 @@ def couple_bodies(
         deriv: Derivative of the free body.
         mass: Mass of the body, kg. (1,)
         J_inv: Inverse of the body's inertia, 1/(kg m^2). (3, 3)
-        link: Parameters.
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)
         free_acc: Acceleration of the tip without the link, world frame, m/s^2. (3,)
@@ -332,7 +331,6 @@ def end_relative_motion(
         state: State of the body. Leaves (k,)
         mass: Mass of the body, kg. (1,)
         J_inv: Inverse of the body's inertia, 1/(kg m^2). (3, 3)
-        link: Parameters.
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)
     """

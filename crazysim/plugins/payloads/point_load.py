@@ -199,10 +199,8 @@ def add_to_scene(
     """Add the loads and links of a plugin to the scene, if they are not there yet.
 
     Args:
-        sim: Simulation.
         name: Name of the plugin, and of the loads: ``name:0``, ...
         size: Radius of a ball, or full lengths of a box, m.
-        rgba: Colour of the loads.
         length: Length of a link, m.
         n_loads: Number of loads in a world; there is a link for each drone.
         n_pieces: Number of straight pieces of each link.

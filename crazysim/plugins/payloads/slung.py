@@ -142,7 +142,6 @@ def bind_load(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ri
 
     Args:
         plugin: The plugin, a ``HangingLoad``.
-        sim: Simulation.
         is_cable: True for cables.
         clearance: Height of a load's position above the floor when it rests there, m.
         ring: Height above the middle of the load of the ring that a hook holds, m; None without a hook.
@@ -184,7 +183,7 @@ def move_loads(
         is_held: True for links with a load or hook at their end; other links point down the body's z axis. (n_drones,)
         n_pieces: Number of straight pieces of a link.
         ring: Height above the middle of the load of the point from which the load hangs, m.
-        show_free_links: True to show links of loads that do not exist.
+        show_free_links: Whether to show links of loads that do not exist.
     """
     hidden_offset = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
     link = link_geometry(data.states, tip, load.vel, load.attach)

@@ -80,7 +80,6 @@ class StandingObstacles(Scenery):
         """Return the distance to obstacles, m. (...)
 
         Args:
-            obstacles: The obstacles.
             offset: Components of the vectors from the middles of the obstacles to a point, world frame, m. (...) each
         """
         raise NotImplementedError

@@ -128,7 +128,6 @@ class Scenery(Plugin):
 
         Args:
             data: Data of one world.
-            key: Random key. ()
             difficulty: Difficulty, 0 to 1; None to draw it from the range of the setting. ()
         """
         layout = self.read(data).replace(words=jax.random.key_data(key)[:2].astype(jnp.uint32))

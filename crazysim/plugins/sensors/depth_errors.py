@@ -62,7 +62,6 @@ class StereoNoise:
         Args:
             depth: True depths, m, finite. (height, width)
             is_hidden: True where the second imager does not see the point; None for nowhere. (height, width)
-            key: Random key.
         """
         deviation = depth**2 * (self.disparity_noise / (self.focal * self.baseline))
         measured_depth = depth + deviation * normal(key, depth.shape, depth.dtype)

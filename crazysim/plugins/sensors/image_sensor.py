@@ -155,7 +155,6 @@ class ImageSensor(Plugin):
         """Check the settings that depend on the simulation, before anything is allocated.
 
         Args:
-            sim: The simulation.
             period: Steps between images; None for images without a record.
         """
         if sim.scene.mesh is not None:
@@ -223,7 +222,6 @@ class ImageSensor(Plugin):
         Args:
             take_images: Function that ``image_fn`` returned.
             data: Data of all worlds.
-            record: The record before the step.
             period: Steps between images.
         """
         steps, latency = data.core.steps, self._latency_steps(data)

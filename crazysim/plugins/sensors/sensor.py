@@ -292,7 +292,6 @@ def rate_in(plugin: Any, freq: int) -> int:
     The default of its class becomes the largest divisor up to it; any other rate has to divide the number of steps.
 
     Args:
-        plugin: The plugin.
         freq: Steps of the simulation per second, Hz.
     """
     if plugin.freq is None:
@@ -306,7 +305,6 @@ def mounting_quat(sim: Simulation, rpy: ArrayLike) -> Array:
     """Return the attitude of a sensor, sensor to body, xyzw. (4,) or (n_worlds, n_drones, 4)
 
     Args:
-        sim: The simulation.
         rpy: Roll, pitch and yaw of the sensor's frame in the body frame, rad. (3,) or (n_worlds, n_drones, 3)
     """
     return jax.jit(rotation.from_rpy)(check_parameter(sim, "rpy", rpy, (3,)))

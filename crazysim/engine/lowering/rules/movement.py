@@ -51,7 +51,6 @@ def move_by_indices(eqn: JaxprEqn, args: list[ElementArray], known_operands: Seq
     """Return the results of a primitive that only moves elements, by running it on their indices.
 
     Args:
-        eqn: Equation of the primitive.
         args: The arrays whose elements are moved.
         known_operands: Values of further operands, such as indices, which are not moved.
     """

@@ -60,8 +60,6 @@ def find_table(ctx: Lowering, x: ElementArray, axes: Sequence[int], n_indices: i
     Return None if it is not such a view, or if it has so few elements that selecting among them is faster.
 
     Args:
-        ctx: The lowering.
-        x: The array.
         axes: The axes along which it is indexed.
         n_indices: Number of positions that an index may take.
     """

@@ -190,7 +190,6 @@ class Twins(Closeable):
             seconds: Duration to sample, s.
             freq: Samples per second, Hz; poses between them are interpolated.
             start: Time of the recording at the reset of a world, s. () or (n_worlds,)
-            name: Name of the plugin.
         """
         require(2 <= seconds * freq <= 1e7, f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
         saved_state = self.tracker, self._poses

@@ -72,7 +72,6 @@ def check_address(host: str, port: int, min_port: int = 0) -> None:
 
     Args:
         host: Name or address of a host.
-        port: Port.
         min_port: Smallest valid port; 0 also allows port 0, which means any free port.
     """
     expect(isinstance(host, str), "host as text", host, "Use '127.0.0.1'.")

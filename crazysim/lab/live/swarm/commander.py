@@ -122,9 +122,7 @@ class Commander:
         """Receive a trajectory.
 
         Args:
-            trajectory_id: ID of the trajectory.
-            trajectory: Trajectory.
-            compressed: True if the firmware stores it compressed; it can then be neither stretched nor reversed.
+            compressed: Whether the firmware stores it compressed; it can then be neither stretched nor reversed.
         """
         require(
             0 <= trajectory_id < N_TRAJECTORIES,
@@ -144,11 +142,10 @@ class Commander:
         """Follow a trajectory that was uploaded.
 
         Args:
-            trajectory_id: ID of the trajectory.
             timescale: Factor of its duration.
-            relative: True to begin at the present setpoint.
-            reversed: True to follow it from its end to its start.
-            relative_yaw: True to begin at the present yaw as well.
+            relative: Whether to begin at the present setpoint.
+            reversed: Whether to follow it from its end to its start.
+            relative_yaw: Whether to begin at the present yaw as well.
         """
         if trajectory_id not in self.trajectories:
             raise ConfigError(
