@@ -103,7 +103,6 @@ def expect(ok: object, what: str, got: object, remedy: str = "") -> None:
 
 
 def require_type(value: object, kind: type, remedy: str) -> None:
-    """Check that a value is an instance of a class."""
     expect(isinstance(value, kind), kind.__name__, value, remedy)
 
 

@@ -19,7 +19,6 @@ SPIN_SIGNS = {"ccw": 1, "cw": -1}
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the commands that make and check airframes."""
     airframe = commands.add_parser("airframe", help="make an airframe from a few numbers, or check one")
     actions = airframe.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
     parser = actions.add_parser(

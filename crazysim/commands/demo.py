@@ -9,7 +9,6 @@ from crazysim.commands.options import MAX_DRONES, DefaultsFormatter, number, siz
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that runs the demonstration."""
     parser = commands.add_parser(
         "demo",
         help="fly figure eights around poles in many worlds; print figures, write a plot and a film",

@@ -33,7 +33,6 @@ END_SECONDS = 24 * 3600
 
 
 def add_options(add: Callable[..., Any]) -> None:
-    """Add the options of a command that can run on several hosts."""
     coordinator_help = "address of host 0, with which the other hosts connect; auto to read it from SLURM or Open MPI"
     add("--coordinator", metavar="HOST:PORT|auto", help=coordinator_help)
     add("--host-id", type=number(0, example=0), metavar="I", help="number of this host, from 0")
@@ -45,7 +44,6 @@ def add_options(add: Callable[..., Any]) -> None:
 
 
 def has_several_hosts(options: argparse.Namespace) -> bool:
-    """Return True if a command runs on several hosts."""
     require(
         options.coordinator is not None or (options.host_id is None and options.hosts is None),
         "expected --coordinator with --host-id and --hosts, got none. Use the address of host 0, such as "

@@ -29,7 +29,6 @@ VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XL
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that describes the installation."""
     parser = commands.add_parser("info", help="print versions, devices, compiler and cache, for reports of bugs")
     parser.set_defaults(run=run)
 

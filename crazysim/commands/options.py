@@ -70,7 +70,6 @@ seed = number(-(2**63), 2**63 - 1, 1)
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a command that serves a page."""
     parser.add_argument(
         "--port", type=number(0, 2**16 - 1, 8080), default=8080, help="port of the page; 0 for any free port"
     )
@@ -82,7 +81,6 @@ SIMULATION_OPTIONS = ("drone", "dynamics", "controller", "device")
 
 
 def add_simulation_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a command that are settings of ``Sim``."""
     add = parser.add_argument
     add("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
     add("--dynamics", choices=[x.value for x in Dynamics], help="dynamics model; by default first_principles")

@@ -9,7 +9,6 @@ from crazysim.commands.options import DefaultsFormatter, add_page_options, numbe
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that plays recorded flights."""
     text = "play a recorded flight in a browser"
     parser = commands.add_parser("replay", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)

@@ -20,7 +20,6 @@ from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the commands that train, evaluate, export and film policies."""
     text = "train a policy; write checkpoint, learning curve, policy and film"
     parser = commands.add_parser("train", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=train)
@@ -236,7 +235,6 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    """Write a policy in other formats."""
     from crazysim.train.export import to_c, to_onnx, to_out_of_tree
     from crazysim.train.training import load_policy
 
@@ -260,7 +258,6 @@ def export(options: argparse.Namespace) -> None:
 
 
 def render(options: argparse.Namespace) -> None:
-    """Film a policy."""
     from crazysim.train.show import film
 
     policy, _, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)

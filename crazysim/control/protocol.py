@@ -55,9 +55,7 @@ class DroneData(Protocol):
     """The parts of ``crazysim.core.data.SimData`` that controllers read, of one drone."""
 
     @property
-    def states(self) -> FlightState:
-        """State of the drone."""
-        ...
+    def states(self) -> FlightState: ...
 
     @property
     def controls(self) -> Any:
@@ -70,9 +68,7 @@ class DroneData(Protocol):
         ...
 
     @property
-    def plugins(self) -> Mapping[str, Any]:
-        """Records of plugins."""
-        ...
+    def plugins(self) -> Mapping[str, Any]: ...
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))

@@ -113,7 +113,6 @@ class Switch(Controller):
 
 
 def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
-    """Return a ``Switch`` between several controllers."""
     require(controllers, "expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
     require(
         switch is not None,

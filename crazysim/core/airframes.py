@@ -68,7 +68,6 @@ def find_common_airframe(airframes: Airframes) -> Airframe:
 
 
 def max_n_rotors(airframes: Airframes) -> int:
-    """Return the largest number of rotors of any of the airframes."""
     # Thousands of drones share a few airframes.
     distinct_airframes = {id(airframe): airframe for airframe in as_airframes(airframes)}
     return max(airframe.n_rotors for airframe in distinct_airframes.values())

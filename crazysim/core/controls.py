@@ -283,7 +283,6 @@ class SimControls(PyTree):
 
 
 def check_command_level(dynamics: Dynamics, control: Control) -> None:
-    """Check that a dynamics model supports a command level."""
     if dynamics != Dynamics.first_principles and control not in (Control.state, Control.attitude):
         raise ConfigError(
             f"control {control.value!r} needs rotors, which dynamics {dynamics.value!r} does not have. Use "

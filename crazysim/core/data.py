@@ -305,12 +305,10 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
 
 
 def object_names(data: SimData) -> tuple[str, ...]:
-    """Return the names of the movable objects in data."""
     return () if data.objects is None else data.objects.names
 
 
 def require_data(data: object) -> None:
-    """Check that an argument is the data of a simulation."""
     if not isinstance(data, SimData):
         raise ConfigError(f"expected the data of a simulation, got {short_repr(data)}. Use sim.data.")
 

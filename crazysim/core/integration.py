@@ -156,7 +156,6 @@ class Integration:
         return self.method(data, self.derivative)
 
     def on_ground(self, ground: Callable[[SimData], Array | float] | None) -> Integration:
-        """Return the integration of drones that stand on a ground."""
         return self if ground is self.ground else replace(self, ground=ground)
 
     @property

@@ -73,7 +73,6 @@ class BuiltPipeline(Generic[F]):
 
     @property
     def stages(self) -> Pipeline:
-        """Functions by name, in order."""
         return self._stages
 
     @stages.setter

@@ -57,9 +57,7 @@ class Simulation(Protocol):
         ...
 
     @property
-    def scene(self) -> Any:
-        """The MuJoCo scene, a ``crazysim.scene.scene.Scene``."""
-        ...
+    def scene(self) -> Any: ...
 
     @property
     def airframe(self) -> Airframe:
@@ -70,9 +68,7 @@ class Simulation(Protocol):
         """Add a plugin and return it."""
         ...
 
-    def build_step_fn(self) -> object:
-        """Compile the step pipeline as it is now."""
-        ...
+    def build_step_fn(self) -> object: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -676,7 +672,6 @@ def drawn_data(data: SimData) -> SimData:
 
 
 def check_plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
-    """Return a list of plugins, after checking its type."""
     example = {"sensors": "IMU()", "camera": "Camera(16, 12)"}.get(name, "Wind()")
     is_list = isinstance(plugins, (list, tuple)) and all(isinstance(plugin, Plugin) for plugin in plugins)
     expect(is_list, f"{name} as a list of plugins", plugins, f"Use {name}=[{example}], say.")

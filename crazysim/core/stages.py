@@ -93,7 +93,6 @@ def clip_thrust_cmd(data: SimData) -> SimData:
 
 
 def first_principles_derivative(data: SimData) -> SimStateDeriv:
-    """Return the derivative of every drone from first principles."""
     return _derivative(data, first_principles.dynamics, controls_of(data).rotor_vel)
 
 
@@ -104,7 +103,6 @@ def first_principles_euler_derivative(data: SimData) -> SimStateDeriv:
 
 
 def fitted_derivative(data: SimData) -> SimStateDeriv:
-    """Return the derivative of every drone under a fitted model."""
     return _derivative(data, fitted.dynamics, data.controls.attitude.cmd)
 
 

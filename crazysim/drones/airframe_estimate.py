@@ -189,18 +189,15 @@ class _AirframeFile:
         self.sources: dict[str, str] = {}
 
     def add(self, table: str, key: str, value: ArrayLike, unit: str, source: str, **numbers: Any) -> None:
-        """Add a number with its unit and a source of ``SOURCES``; ``numbers`` fill the template of the source."""
         if source not in self.sources:
             self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
         line = f'{key} = {{ value = {_toml_value(value)}, unit = "{unit}", source = "{source}" }}'
         self.tables.setdefault(table, []).append(line)
 
     def describe(self, source: str, text: str) -> None:
-        """Set the description of a source."""
         self.sources[source] = text
 
     def text(self) -> str:
-        """Return the text of the file."""
         lines = [
             f"# {self.name}, written by crazysim airframe new. Every number is {{ value, unit, source }}; [sources]",
             "# has the formula and the origin of each. Replace estimates by what you measure.",

@@ -72,7 +72,6 @@ def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[f
 
 
 def convert_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dict[str, Any]:
-    """Return a dict, or a dict of dicts, with its values as arrays of a module."""
     as_array = (np if xp is None else xp).asarray
     options = {} if device is None else {"device": device}
     return {

@@ -33,7 +33,6 @@ class MapKernels:
         self._launches: dict[str, Launch] = {}
 
     def get_launch(self, platform: str) -> Launch:
-        """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             self._launches[platform] = compile_kernel(write_map(self._block, TARGETS[platform]), Location(platform))
         return self._launches[platform]

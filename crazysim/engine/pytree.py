@@ -195,7 +195,6 @@ def leaf_indices(tree: Any) -> Any:
 
 
 def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence[T]) -> list[T]:
-    """Return a list of leaves with other values at some indices."""
     new_leaves = list(leaves)
     for i, value in zip(indices, values, strict=True):
         new_leaves[i] = value

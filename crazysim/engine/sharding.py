@@ -173,5 +173,4 @@ def _is_readable(x: jax.Array) -> bool:
 
 
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:
-    """Return the MJX data of all worlds distributed over a mesh."""
     return distribute(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

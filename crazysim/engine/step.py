@@ -41,7 +41,6 @@ class FlatData:
         self._record: Any = None
 
     def is_record(self, data: object) -> bool:
-        """Return whether a record is the record that ``data`` returned."""
         return data is self._record
 
     def data(self) -> Any:
@@ -54,7 +53,6 @@ class FlatData:
         return record
 
     def replace(self, indices: Sequence[int], values: Sequence[Any]) -> FlatData:
-        """Return the data with other values of some leaves."""
         if any(i in rows.source_leaves for rows in self.plan.rows for i in indices):
             raise ValueError(
                 "expected leaves that are not in rows, got one that is. Name it in separate= of Step.flatten."

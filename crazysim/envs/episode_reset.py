@@ -69,7 +69,6 @@ class EpisodeReset:
         return copy_seed_and_ids(jax.tree.map(first_world, scopes(self._default), self._default), data)
 
     def broadcast_default(self, n_worlds: int, n_drones: int) -> SimData:
-        """Return the default data broadcast to all worlds and drones."""
         shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
 
         def repeat(scope: str, x: Array) -> Array:

@@ -120,7 +120,6 @@ class Phases:
 
     @property
     def takes_images(self) -> bool:
-        """True if a wrapper takes images."""
         return any(type(wrapper).look is not Hooks.look for wrapper in self.wrappers)
 
     def _look(self, data: SimData) -> SimData:

@@ -45,7 +45,6 @@ def read_options(options: object, *names: str) -> dict[str, Any]:
 
 
 def check_key(key: object) -> None:
-    """Check that an argument is a typed random key, or an array of typed random keys."""
     expect(
         isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.size,
         "a random key",

@@ -44,7 +44,6 @@ class Entry:
 
     @property
     def task(self) -> type[Task]:
-        """Class of the task."""
         if not isinstance(self.source, str):
             return self.source
         module, _, name = self.source.partition(":")
@@ -57,7 +56,6 @@ class Entry:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Names of the task's settings."""
         return tuple(f.name for f in dataclasses.fields(self.task))
 
 

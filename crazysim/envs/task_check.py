@@ -28,7 +28,6 @@ REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 
 
 def require_installed(sim: Sim, task: object) -> None:
-    """Check that a task was installed in a simulation."""
     expect(isinstance(sim, Sim), "a simulation", sim, "Use Sim(), or crazysim.envs.make.")
     require(isinstance(task, Task), f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)

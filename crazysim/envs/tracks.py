@@ -50,12 +50,10 @@ class Track:
 
     @property
     def n_gates(self) -> int:
-        """Number of gates."""
         return len(self.gates_pos)
 
     @property
     def n_obstacles(self) -> int:
-        """Number of obstacles."""
         return len(self.obstacles_pos)
 
     @property
@@ -122,7 +120,6 @@ def start_offsets(n_drones: int) -> np.ndarray:
 
 
 def count_random_numbers(track: Track) -> int:
-    """Return the number of random numbers that ``random_course`` takes."""
     n_x, n_y = track.grid
     return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
 

@@ -99,7 +99,6 @@ def slab_interval(origin: Array, direction: Array, half: Array | float) -> Inter
 
 
 def intersection(p: Interval, q: Interval) -> Interval:
-    """Return the interval of a line in the intersection of two convex shapes."""
     near, far = jnp.where(p[0] > q[0], p[0], q[0]), jnp.where(p[1] < q[1], p[1], q[1])
     return near, far, p[2] & q[2] & (near <= far)
 

@@ -16,7 +16,6 @@ Barycentric = tuple[Array, Array, Array]
 
 
 def from_barycentric(weights: Barycentric, a: Vector, b: Vector, c: Vector) -> Vector:
-    """Return the point of a triangle with given barycentric coordinates."""
     u, v, w = weights
     return a * u + b * v + c * w
 

@@ -51,12 +51,10 @@ class Vector(PyTree):
 
 
 def to_vector(x: Array) -> Vector:
-    """Return an array of vectors, (..., 3), as a ``Vector``."""
     return Vector(x[..., 0], x[..., 1], x[..., 2])
 
 
 def stack_vectors(vectors: list[Vector]) -> Vector:
-    """Return vectors stacked along a new first axis."""
     return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
@@ -67,7 +65,6 @@ def axis_vector(axis: int, array: Array) -> Vector:
 
 
 def select_vector(condition: Array, a: Vector, b: Vector) -> Vector:
-    """Return ``a`` where the condition holds, and ``b`` elsewhere."""
     return Vector(*(jnp.where(condition, p, q) for p, q in ((a.x, b.x), (a.y, b.y), (a.z, b.z))))
 
 

@@ -93,7 +93,6 @@ def is_own_name(host: str, listen_address: str) -> bool:
 
 
 def wrong_name_message(host: str) -> str:
-    """Return the message for a ``Host`` header that is refused."""
     return f"expected an address of this machine, got {host!r}. Use its IP address, its name or localhost."
 
 

@@ -47,7 +47,6 @@ class Journal(Closeable):
 
     @property
     def is_open(self) -> bool:
-        """True until the journal is closed."""
         return self._file >= 0
 
     def append(self, kind: bytes, content: bytes) -> None:

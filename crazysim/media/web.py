@@ -187,7 +187,6 @@ def require_free_port(host: str, port: int, prefix: str = "") -> int:
 
 
 def free_port() -> int:
-    """Return the number of a free port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

@@ -266,7 +266,6 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @property
     def members(self) -> tuple[str, ...]:
-        """Names of the members of all populations."""
         return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
 
     def _require_unused_names(self, plugin: Plugin, used_names: Collection[str]) -> None:

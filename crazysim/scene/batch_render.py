@@ -18,7 +18,6 @@ INSTALL_MESSAGE = not_installed("images of many worlds at once need", "warp-lang
 
 
 def is_installed() -> bool:
-    """Return True if MuJoCo Warp is installed."""
     return importlib.util.find_spec("warp") is not None
 
 

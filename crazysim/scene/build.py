@@ -151,7 +151,6 @@ def _set_collision_bits(geom: mujoco.MjsGeom, collides: bool) -> None:
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Return the compiled model."""
     try:
         with warnings.catch_warnings():
             # Users attach bodies without a prefix, as the scene's documentation shows; nothing is saved here.
@@ -213,7 +212,6 @@ def spec_mocap_ids(spec: mujoco.MjSpec) -> dict[str, int]:
 
 
 def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
-    """Return the mocap ids of bodies."""
     ids = []
     for name in names:
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)

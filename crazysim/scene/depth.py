@@ -88,7 +88,6 @@ class CarriedCamera:
 
     @classmethod
     def on_drone(cls, camera: DroneCamera, drone: int) -> CarriedCamera:
-        """Return the camera that one drone carries."""
         forward, left, up = camera.rot.T
         rot_rows = tuple(tuple(map(float, row)) for row in np.stack([-left, up, -forward], axis=-1))
         return cls("drone", f"drone:{drone}", drone, tuple(map(float, camera.pos[drone])), rot_rows, True, 0.0)

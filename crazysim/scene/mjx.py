@@ -23,7 +23,6 @@ __all__ = ["Data", "Model", "camlight", "collision", "com_pos", "kinematics", "p
 
 
 def load_module() -> ModuleType:
-    """Return the module ``mujoco.mjx``."""
     # MJX prints two lines when Warp cannot be imported.
     with _defer_imports(), contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")

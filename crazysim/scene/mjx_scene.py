@@ -117,7 +117,6 @@ class MjxScene:
         return contact_flags(data) if body is None else body_contact_flags(data, self._mj_model, body)
 
     def shard(self, mesh: Mesh) -> None:
-        """Distribute the worlds over devices."""
         self._mesh, self._model, self._has_synced, self._synced = mesh, None, False, None
         if self._data is not None:
             self._data = self._to_device(self._data)
@@ -146,7 +145,6 @@ def _slot_flags(dist: Array, geom1: Array, geom2: Array, belongs_to_body: Array)
 
 
 def body_id(mj_model: mujoco.MjModel, body: str) -> int:
-    """Return the id of a body."""
     index = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
     if index < 0:
         names = [name for name in (mj_model.body(i).name for i in range(mj_model.nbody)) if not name.startswith("_")]

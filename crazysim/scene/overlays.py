@@ -104,7 +104,6 @@ class Overlays:
 
     @property
     def has_text(self) -> bool:
-        """True if a corner has text."""
         return bool(self._texts)
 
     def write_text(self, rectangle: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
@@ -113,7 +112,6 @@ class Overlays:
             mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, IMAGE_CORNERS[corner], rectangle, text, "", context)
 
     def clear(self) -> None:
-        """Remove all geoms and text."""
         self._geoms.clear()
         self._texts.clear()
 

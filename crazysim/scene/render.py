@@ -92,7 +92,6 @@ class ModelRenderer:
         return depth if color is None else (color, depth)
 
     def close(self) -> None:
-        """Close the window and free the contexts."""
         _close_all(self._renderers, self._windows)
 
     def _camera(self, camera: int | str, cam_config: Mapping[str, ArrayLike] | None) -> mujoco.MjvCamera:

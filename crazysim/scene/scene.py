@@ -447,7 +447,6 @@ class Scene:
         return pos, np.roll(quat, -1, axis=-1)
 
     def shard(self, mesh: Mesh) -> None:
-        """Distribute the scene of all worlds over devices."""
         self.mesh, self.ray_kernels = mesh, dataclasses.replace(self.ray_kernels, mesh=mesh)
         self._mjx.shard(mesh)
 

@@ -149,7 +149,6 @@ class SceneWindow:
         return [mujoco.MjrRect(k % columns * w, height - (k // columns + 1) * h, w, h) for k in range(n)]
 
     def close(self) -> None:
-        """Close the window and free its context."""
         if self._window is None:
             return
         self._glfw.make_context_current(self._window)

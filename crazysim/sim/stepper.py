@@ -56,7 +56,6 @@ class Stepper:
 
     @property
     def data(self) -> SimData:
-        """The data as a record."""
         data: Any = self._data
         return data.data() if isinstance(data, FlatData) else data
 

@@ -85,7 +85,6 @@ class Config:
 
     @property
     def n_updates(self) -> int:
-        """Number of updates of the whole training."""
         return self.iterations * self.epochs * self.minibatches
 
 

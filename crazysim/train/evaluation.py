@@ -27,7 +27,6 @@ seed."""
 
 
 def held_out_key() -> Array:
-    """Return the random key of the held-out initial states."""
     return jax.random.key(EVALUATION_SEED)
 
 

@@ -60,7 +60,6 @@ class Interface:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Sizes of the observations by name."""
         return dict(self.observations)
 
     def require(self, other: Interface, source: str) -> None:
@@ -97,7 +96,6 @@ class Interface:
         return len(self.ranges) == len(other.ranges) and np.allclose(self.ranges, other.ranges)
 
     def require_observations(self, sizes: Mapping[str, int]) -> None:
-        """Check the names and sizes of observations."""
         if differences := _size_differences(self.sizes, sizes):
             raise ConfigError(
                 f"expected the observations of the policy, {sizes_text(self.sizes)}, got {', '.join(differences)}. "
@@ -141,7 +139,6 @@ def check_policy(policy: Any, env: Env) -> None:
 
 
 def check_callable(policy: Any, env: Env) -> None:
-    """Check the types of a policy and an environment."""
     require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
     expect(
         callable(policy),
@@ -163,7 +160,6 @@ def sizes_of(obs: Any) -> dict[str, int]:
 
 
 def sizes_text(sizes: Mapping[str, int]) -> str:
-    """Return the sizes of observations as text."""
     n = sum(sizes.values())
     return f"{n} number{'s' * (n != 1)} ({', '.join(f'{name} {n}' for name, n in sizes.items())})"
 

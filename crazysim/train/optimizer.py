@@ -32,7 +32,6 @@ def build_optimizer(learning_rate: Any, max_grad_norm: Any, n_updates: int) -> o
 
 
 def check_minibatches(minibatches: int, n_worlds: int) -> None:
-    """Check that minibatches have the same number of worlds."""
     require(
         n_worlds % minibatches == 0,
         f"expected a number of worlds that {minibatches} minibatches divide, got {n_worlds}. Use for example "
@@ -82,5 +81,4 @@ def run_epochs(
 
 
 def all_finite(tree: Any) -> Array:
-    """Return True if every number of a pytree is finite. ()"""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))

@@ -84,7 +84,6 @@ class Config:
 
     @property
     def n_updates(self) -> int:
-        """Number of updates of the whole training."""
         return self.iterations * self.epochs * self.minibatches
 
 
@@ -123,7 +122,6 @@ class Agent(PyTree):
         return output[..., 0] * return_std(self.returns) + self.returns.mean, memory
 
     def as_policy(self) -> Policy:
-        """Return the deterministic policy."""
         stats = self.stats.replace(mean=self.stats.mean[..., : self.n_obs], var=self.stats.var[..., : self.n_obs])
         return Policy(stats, self.policy.layers, self.policy.body, self.network)
 

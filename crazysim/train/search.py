@@ -189,8 +189,6 @@ class _Trial:
         self.init, self.advance = init, advance
 
     def draw(self, random: np.random.Generator, near: dict[str, Any] | None = None) -> Candidate:
-        """Draw a candidate from the whole ranges, or near another one."""
-
         def number(low: float, high: float, middle: float) -> float:
             if near is None:
                 return float(np.exp(random.uniform(np.log(low), np.log(high))))
@@ -208,7 +206,7 @@ class _Trial:
 
     @keep_programs()
     def fly(self, candidates: list[Candidate], seeds: list[int], deadline: float) -> None:
-        """Train each candidate with some seeds, and add the results to it; only the first round may be cut short."""
+        # Only the first round may be cut short.
         places = [(candidate, seed) for candidate in candidates for seed in seeds]
         base = self.config.config
         configs = [ppo.Config(**base | candidate.settings) for candidate, _ in places]

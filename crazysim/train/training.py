@@ -223,7 +223,6 @@ class _Run:
         self.steps_per_iteration = self.config.n_worlds * self.env.sim.n_drones * n_steps
 
     def compile(self) -> None:
-        """Compile iteration and evaluation, and make or load the learner and the kept policies."""
         n_trainings, sim = len(self.trainings), self.env.sim
         algorithm, network = ALGORITHMS[self.config.algorithm], self.config.network
         arguments = wrap_env(self.env, self.hyperparameters[0]), self.hyperparameters
@@ -286,13 +285,11 @@ class _Run:
         return evaluate_blocks(self.eval_env, jax.device_put(policy, device), key, n_trainings)
 
     def iterate(self, iteration: int) -> None:
-        """Begin an iteration, and wait for the previous one while it runs."""
         metrics_before = self.metrics
         self.learner, self.metrics = self._iterate(self.learner)  # no signal is handled between the two
         self._mark_diverged(metrics_before, iteration - 1)
 
     def evaluate(self) -> dict[str, np.ndarray]:
-        """Evaluate and keep policies, write all files, and return the latest metrics of each training, by name."""
         iteration, policies = int(self.learner.iteration), fetch_arrays(self._policies_of(self.learner))
         self._mark_diverged(self.metrics, iteration)
         is_planned = iteration % self.evaluation_period == 0 or iteration == self.n_iterations
@@ -312,14 +309,12 @@ class _Run:
         return {name: np.array([float(point[name]) for point in points]) for name in points[0]}
 
     def save_if_due(self) -> None:
-        """Write the checkpoint if the time between two checkpoints has passed."""
         every = self.checkpoint_every
         if every is not None and broadcast_decision(time.perf_counter() - self.save_time > every):
             self._mark_diverged(self.metrics, int(self.learner.iteration))
             self.save()
 
     def save(self) -> None:
-        """Write the checkpoint."""
         runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.divergence_iteration} for x in self.trainings}
         meta = {"crazysim": crazysim.__version__, "code": self.code_hash, "runs": runs, "seconds": self.seconds}
         files = fetch_arrays({"learner": self.learner, "kept": [training.kept_policy for training in self.trainings]})
@@ -351,7 +346,6 @@ class _Run:
             )
 
     def log_start(self) -> None:
-        """Log the settings of the run, and what has changed since its checkpoint."""
         config, sim, n_done = self.config, self.env.sim, int(self.learner.iteration)
         names = [training.name or f"seed {config.seed}" for training in self.trainings]
         devices = ""
@@ -378,7 +372,6 @@ class _Run:
             )
 
     def results(self) -> dict[str, TrainResult]:
-        """Log and return the results of the trainings by name."""
         task, results = self.env.task, {}
         criterion = f"error below {task.tolerance:g} {task.unit} for the last {task.hold:g} s"
         if type(task).succeeded is not Task.succeeded:
@@ -443,7 +436,6 @@ class _Training:
     def add_evaluation(
         self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], is_planned: bool
     ) -> None:
-        """Add an evaluation to the curve, keep the policy if no earlier one was clearly better, and write both."""
         # A run that is resumed at its end repeats its last evaluation, which was planned.
         is_planned |= any(
             earlier_point["iteration"] == point["iteration"] and earlier_point["kept"] for earlier_point in self.curve
@@ -460,7 +452,6 @@ class _Training:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Row in the table of all trainings: the settings that may differ, and the evaluation of the kept policy."""
         best, latest = kept_point(self.curve), self.curve[-1]
         swept = {name: self.config.config[name] for name in SWEEPABLE if name in self.config.config}
         names = ("success", "crashed", "error", "reward", "check", "iteration")

@@ -191,7 +191,6 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
 @functools.cache
 def ptx(kernel: Kernel, arch: str) -> str:
-    """Return a kernel's PTX."""
     if dump.is_enabled():
         dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(NVRTC_OPTIONS)}\n{kernel.text}")
     return compile_source(kernel.text, arch, "PTX").decode()

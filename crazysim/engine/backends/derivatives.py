@@ -104,7 +104,6 @@ class DerivativeSpec(NamedTuple):
         return replace_leaves([None] * self.n_leaves, self.array_leaves, args[: len(self.array_leaves)])
 
     def linear_operands(self, args: Sequence[Any]) -> list[Any]:
-        """Return the operands in which the derivative is linear."""
         return list(args[len(self.array_leaves) :])
 
     def world_axis_flags(self, leaves: Sequence[int]) -> list[bool]:

@@ -47,13 +47,9 @@ class LineWriter(Protocol):
     names: dict[Value, str]
     """Expression of each value."""
 
-    def write_line(self, text: str, depth: int) -> None:
-        """Write a line."""
-        ...
+    def write_line(self, text: str, depth: int) -> None: ...
 
-    def new_name(self, prefix: str = ...) -> str:
-        """Return an unused name."""
-        ...
+    def new_name(self, prefix: str = ...) -> str: ...
 
     def forget_intermediate_results(self) -> None:
         """Forget intermediate results, after the loop in which their variables were defined was closed."""
@@ -83,13 +79,9 @@ class Exchange(Protocol):
         """Define a number of a lane that does not change, and return the expression for it in all later code."""
         ...
 
-    def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write the beginning of the loop over lanes."""
-        ...
+    def open_loop(self, writer: LineWriter, depth: int) -> None: ...
 
-    def close_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write the end of the loop over lanes."""
-        ...
+    def close_loop(self, writer: LineWriter, depth: int) -> None: ...
 
     @property
     def declarations(self) -> list[str]:

@@ -171,6 +171,5 @@ def launch_kernel(call: Call) -> None:
 
 
 def check_driver(result: int) -> None:
-    """Raise an error if a function of the CUDA driver returned one."""
     if result:
         raise KernelError(f"the CUDA driver answered error {result}")

@@ -44,7 +44,6 @@ class Kernels:
         self._launches = {location.platform: self._compile(location)}
 
     def get_launch(self, platform: str) -> Launch:
-        """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             try:
                 self._launches[platform] = self._compile(Location(platform))

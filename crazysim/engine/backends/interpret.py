@@ -93,7 +93,6 @@ class _PreparedBlock(NamedTuple):
     """Indices of the outputs."""
 
     def run(self, values: list[Any], inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
-        """Return the outputs for some inputs."""
         for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
         for op, fn, args, results, dtype, blocks in self.calls:
@@ -226,7 +225,6 @@ def run_block_in_callback(block: Block, inputs: Sequence[Any], shape: tuple[int,
 
 
 def build(program: Program, location: Location) -> Run:
-    """Return the function that runs a program in NumPy."""
     return functools.partial(run_steps, program, on_cpu=location.platform == "cpu")
 
 

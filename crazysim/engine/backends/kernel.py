@@ -111,7 +111,6 @@ class KernelBody:
         return hoisted
 
     def write_loop(self, hoisted: list[list[str]]) -> None:
-        """Write the steps."""
         self.writer.write_line("for (int step = 0; step < n_steps; ++step) {", 1)
         self.exchange.open_loop(self.writer, 2)
         for segment, constants in zip(self.step_segments, hoisted, strict=True):
@@ -199,7 +198,6 @@ def require_source(program: Program) -> None:
 
 
 def needed_leaves(program: Program) -> tuple[int, ...]:
-    """Return the indices of the leaves that a kernel reads."""
     return tuple(sorted({leaf for leaf, _ in _loaded_slots(program)}))
 
 

@@ -86,7 +86,6 @@ class LeafValues:
         return array[:, :1] if description.scope == "world" else array
 
     def set_array(self, leaf: int, value: Any) -> None:
-        """Write a leaf as an array."""
         self.arrays[leaf] = value
         for k in range(self.program.leaves[leaf].size):
             self.vectors.pop((leaf, k), None)
@@ -143,7 +142,6 @@ def prepare_steps(program: Program, values: LeafValues) -> HoistedResults:
 
 
 def run_phase(program: Program, values: LeafValues, phase: Phase, hoisted_results: HoistedResults) -> None:
-    """Run the segments of a phase."""
     for k, segment in enumerate(program.phase_segments(phase)):
         if isinstance(segment, UnfusedStage):
             _run_unfused(segment, values)
@@ -195,7 +193,6 @@ def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
 
 
 def build(program: Program, location: Location) -> Run:
-    """Return the function that runs a program in XLA."""
     return functools.partial(run_steps, add_barriers(program) if location.platform == "cpu" else program)
 
 

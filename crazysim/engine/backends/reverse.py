@@ -50,7 +50,6 @@ class ReverseProgram:
         return tuple(i for i in self.program.written_leaves if self.program.leaves[i].number_type.kind == "f")
 
     def slots(self) -> list[Slot]:
-        """Return the slots of all cotangents."""
         numbers = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
         ct_slots = {(self.n_leaves + i, k) for i, k in numbers}
         for s in (*self.backward_segments.values(), *self.backward_hoisted_segments.values()):

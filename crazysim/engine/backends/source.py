@@ -73,7 +73,6 @@ class Writer(LineWriter):
         self.lines.append(INDENT * depth + text)
 
     def write_block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
-        """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
         outer_state = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
         self.entry_groups = dict.fromkeys(_entry_groups(block), "")
@@ -91,7 +90,6 @@ class Writer(LineWriter):
         self.sin_cos_names, self.entry_groups = {}, dict.fromkeys(self.entry_groups, "")
 
     def element(self, x: Element) -> str:
-        """Return an element as an expression."""
         return self.names[x] if isinstance(x, Value) else literal(x)
 
     def _write_operation(self, op: Operation, depth: int) -> None:
@@ -272,7 +270,6 @@ def _entry_groups(block: Block) -> list[EntryGroup]:
 
 
 def expression(op: Operation, args: Sequence[str]) -> str:
-    """Return the result of an operation as an expression of its operands."""
     source = ops.TABLE[op.name].source
     if not isinstance(source, str):
         source = next(text for kinds, text in source.items() if op.dtype.kind in kinds)
@@ -294,7 +291,6 @@ def _are_equal(a: Element, b: Element) -> bool:
 
 
 def type_name(dtype: DTypeLike) -> str:
-    """Return the name of a type in the source."""
     dtype = np.dtype(dtype)
     if dtype not in TYPE_NAMES:
         raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")

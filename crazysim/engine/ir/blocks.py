@@ -65,7 +65,6 @@ class Operation(NamedTuple):
     """Stage of the pipeline that the operation was lowered from."""
 
     def param(self, name: str) -> Any:
-        """Return a static parameter."""
         return dict(self.params)[name]
 
     @property
@@ -154,7 +153,6 @@ class Builder:
             self._append_operation("barrier", (), (), (), ())
 
     def finish(self, outputs: Sequence[Element]) -> Block:
-        """Return the block with these outputs."""
         return Block(tuple(self.inputs), tuple(self.operations), tuple(outputs))
 
     def _add(self, name: str, args: tuple, dtypes: tuple[np.dtype, ...], params: tuple) -> tuple[Value, ...]:
@@ -181,7 +179,6 @@ class Builder:
 
 
 def constant(value: Any, dtype: DTypeLike) -> np.generic:
-    """Return a constant element."""
     return np.dtype(dtype).type(value)
 
 

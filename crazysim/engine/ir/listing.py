@@ -31,7 +31,6 @@ def list_program(program: Program) -> str:
 
 
 def list_operation(program: Program, operation: Operation) -> str:
-    """Return the line of an operation in the listing of a program."""
     for segment in program.fused_segments:
         names = _Names()
         list(_list_segment(program, segment, names))

@@ -92,7 +92,6 @@ def convert(x: Any, dtype: DTypeLike) -> Any:
 
 
 def bitcast(x: Any, dtype: DTypeLike) -> Any:
-    """Reinterpret the bits as another type."""
     return np.asarray(x).view(dtype)
 
 

@@ -57,7 +57,6 @@ class OperationForm:
     """True where each target implements the operation separately, because it is not one expression of its operands."""
 
     def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
-        """Return True if the operation is defined for operands of these types."""
         if "..." in self.operands:
             return True
         shared_types = {x for x, letter in zip(dtypes, self.operands, strict=False) if letter == "T"}

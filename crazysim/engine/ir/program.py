@@ -86,12 +86,10 @@ class Segment:
 
     @property
     def written_leaves(self) -> list[int]:
-        """Leaves that it writes."""
         return sorted({leaf for leaf, _ in self.writes})
 
     @property
     def read_leaves(self) -> set[int]:
-        """Leaves that it reads."""
         return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
 
     @functools.cached_property
@@ -101,7 +99,6 @@ class Segment:
 
     @property
     def n_operations(self) -> int:
-        """Number of operations of a step."""
         return sum(op.name != "barrier" for op in self.block.walk())
 
 
@@ -129,7 +126,6 @@ class UnfusedStage:
 
     @property
     def read_leaves(self) -> set[int]:
-        """Leaves that it reads."""
         return set(self.input_leaves)
 
     @property
@@ -166,12 +162,10 @@ class Program:
 
     @functools.cached_property
     def unfused_stages(self) -> tuple[UnfusedStage, ...]:
-        """Stages that run as they are written."""
         return tuple([s for s in self.segments if isinstance(s, UnfusedStage)])
 
     @functools.cached_property
     def fused_segments(self) -> tuple[Segment, ...]:
-        """Segments that have a block."""
         return tuple([s for s in self.segments if isinstance(s, Segment)])
 
     @functools.cached_property
@@ -181,7 +175,6 @@ class Program:
 
     @functools.cached_property
     def read_leaves(self) -> list[int]:
-        """Indices of the leaves that are read."""
         return sorted({i for s in self.segments for i in s.read_leaves})
 
     @functools.cached_property
@@ -211,7 +204,6 @@ class Program:
         return self.n_drones if any(s.couples_drones for s in self.fused_segments) else 1
 
     def phase_segments(self, phase: Phase) -> list[Any]:
-        """Return the segments that run in a phase."""
         return [segment for segment in self.segments if segment.phase == phase]
 
     def drone_slots(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
@@ -221,7 +213,6 @@ class Program:
         return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]
 
     def changing_slots(self) -> set[Slot]:
-        """Return the slots whose numbers a step may change."""
         slots: set[Slot] = set()
         for segment in self.phase_segments("each"):
             if isinstance(segment, Segment):

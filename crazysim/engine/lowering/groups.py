@@ -33,7 +33,6 @@ class _Access(NamedTuple):
 
     @property
     def used_leaves(self) -> frozenset[int]:
-        """Leaves that it reads or writes."""
         return self.read_leaves | self.written_leaves
 
 

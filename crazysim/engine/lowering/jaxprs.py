@@ -131,7 +131,6 @@ class Lowering:
         return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
     def make_inner(self) -> Lowering:
-        """Return a lowering into a new block inside this one."""
         return Lowering(Builder(self.builder), self.entries, self.n_members)
 
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
@@ -141,7 +140,6 @@ class Lowering:
         return number
 
     def finish(self, outputs: Sequence[ElementArray]) -> Block:
-        """Return the block, with these outputs."""
         return self.builder.finish(scalars(*outputs))
 
 

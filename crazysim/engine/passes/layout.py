@@ -98,7 +98,6 @@ class PackedRows(NamedTuple):
         return jnp.concatenate([rows_of_leaf(leaves[i]) for i in self.source_leaves])
 
     def unpack(self, rows: Array, leaf: int) -> Array:
-        """Return the array of one of ``source_leaves``, from the rows."""
         sizes = {i: self.program.leaves[i].size for i in self.source_leaves}
         source, n_before = self.program.leaves[leaf], self.source_leaves.index(leaf)
         first_row = sum(sizes[i] for i in self.source_leaves[:n_before])
@@ -107,7 +106,6 @@ class PackedRows(NamedTuple):
 
 
 def packed_rows(program: Program) -> list[PackedRows]:
-    """Return the leaves of rows of a program."""
     return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.row_leaves]
 
 

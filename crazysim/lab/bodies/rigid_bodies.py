@@ -188,7 +188,6 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
 
 
 def drones_as_bodies(data: SimData) -> Bodies:
-    """Return the drones of one world as bodies."""
     s, p, n = data.states, data.params, data.states.pos.shape[0]
     rot, inv_inertia = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
     inv_inertia = matmul(matmul(rot, inv_inertia), jnp.swapaxes(rot, -1, -2))

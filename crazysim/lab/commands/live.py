@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that flies live."""
     text = "fly in real time: watch, pilot, command and record; print the real-time factor"
     parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)

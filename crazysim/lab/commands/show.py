@@ -22,7 +22,6 @@ from crazysim.storage import check_writable, write_file
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that flies light shows."""
     text = "fly a light show; print separation and tracking errors, write a film or a report"
     parser = commands.add_parser("show", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)

@@ -26,7 +26,6 @@ PICTURES_FOLDER = "pictures"
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    """Add the command that writes the page of validation."""
     text = "compare with closed forms, other simulators and logs"
     parser = commands.add_parser("validate", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)

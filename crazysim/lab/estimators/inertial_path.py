@@ -58,7 +58,6 @@ class InertialPath(NamedTuple):
         return InertialPath(turn_attitude(self.quat, dt * gyro), self.vel + dt * force, pos, self.duration + dt)
 
     def reverse(self) -> InertialPath:
-        """Return the path from the end to the start."""
         inverse = rotation.conjugate(self.quat)
         pos = rotation.rotate(inverse, self.duration * self.vel - self.pos)
         return InertialPath(inverse, -rotation.rotate(inverse, self.vel), pos, -self.duration)

@@ -41,7 +41,6 @@ class _BagFile(io.BufferedReader):
     """File whose ``read`` allocates at most the remaining bytes, even if a damaged record states a larger size."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return at most ``size`` bytes; by default all remaining bytes."""
         if size is None or size < 0:
             return super().read()
         return super().read(min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0)))
@@ -51,19 +50,17 @@ class _BagPath(type(Path())):
     """Path whose files are opened as ``_BagFile``, and whose text has at most ``MAX_METADATA_BYTES`` bytes."""
 
     def open(self, *args: Any, **kwargs: Any) -> Any:
-        """Open the file for reading."""
         del args, kwargs
         check_file(self)
         return _BagFile(io.FileIO(self))
 
     def read_text(self, *args: Any, **kwargs: Any) -> str:
-        """Return the text of ``metadata.yaml``, in UTF-8 in every locale."""
+        # ``metadata.yaml`` is UTF-8 in every locale.
         del args, kwargs
         return read_text(self, MAX_METADATA_BYTES)
 
 
 def is_bag(path: Path) -> bool:
-    """Return True for a file or folder of a ROS bag."""
     return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 

@@ -121,7 +121,6 @@ OPTIONAL_FIELDS = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command",
 
 
 def unsigned_name(name: str) -> str:
-    """Return the name of a column without its sign."""
     return name.removeprefix("-")
 
 

@@ -202,7 +202,6 @@ class _LogTerms(NamedTuple):
     def create(
         log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray, delay: float
     ) -> _LogTerms:
-        """Return the terms of a log."""
         mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
         root = np.sqrt(values[:3])
         inertia = np.asarray(params.J, np.float64) * np.outer(root, root)

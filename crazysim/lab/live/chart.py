@@ -30,7 +30,6 @@ class Chart:
             figure.linergb[k] = COLORS[k % len(COLORS), :3]
 
     def add(self, picture: Picture) -> None:
-        """Add the values of a picture."""
         self._samples.add(picture, self._name, MAX_LINES)
 
     def draw(self, window: mujoco.MjrRect, context: mujoco.MjrContext) -> None:

@@ -45,6 +45,5 @@ class History:
         return self._first if self._first is not None and self._first.step <= step else None
 
     def clear(self) -> None:
-        """Remove all snapshots."""
         self._first = None
         self._latest.clear()

@@ -99,13 +99,11 @@ class Interaction:
         return [widget for widget in self.widgets if isinstance(widget, Slider)]
 
     def move_slider(self, fraction: float) -> None:
-        """Move the chosen slider by a fraction of its range, as the keys do."""
         if self._sliders:
             slider = self._sliders[self._slider_index]
             self.set_value(slider.name, self.slider_values[slider.name] + fraction * (slider.high - slider.low))
 
     def choose_next_slider(self) -> None:
-        """Choose the next slider for ``move_slider``."""
         self._slider_index = (self._slider_index + 1) % max(len(self._sliders), 1)
 
     def select(self, world: int, drone: int) -> None:
@@ -118,7 +116,6 @@ class Interaction:
         self.selected, self._followed_body = (int(world), int(drone)), None
 
     def select_next(self) -> None:
-        """Select the next drone of the selected world."""
         world, drone = self.selected or (0, -1)
         self.select(world, (drone + 1) % self.sim.n_drones)
 

@@ -32,7 +32,6 @@ MAX_LISTED_PROCESSES = 3
 
 
 def check_speed(speed: Speed) -> Speed:
-    """Check a speed, and return it."""
     if speed == "max":
         return "max"
     require(

@@ -48,7 +48,6 @@ QUEUE_LENGTH = 10
 
 
 def import_message_classes() -> Any:
-    """Return the message classes of the ROS installation."""
     try:
         messages = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGE_MODULES.items()}
     except ImportError as error:

@@ -199,7 +199,6 @@ class StreamListener(CommandQueue):
 
 
 def connect(host: str, port: int, timeout: float) -> socket.socket:
-    """Return a connection."""
     read_number("timeout", timeout, TIMEOUT_RANGE)
     try:
         return socket.create_connection((host, port), timeout)

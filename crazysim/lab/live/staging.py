@@ -37,7 +37,6 @@ class StagedCommands:
         getattr(self._sim, f"{self._sim.control.value}_control")(self._staged_copy)
 
     def copy(self) -> NDArray | None:
-        """Return the commands for ``restore``."""
         return None if self._array is None else self._array.copy()
 
     def restore(self, array: NDArray | None) -> None:

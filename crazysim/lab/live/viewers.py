@@ -77,7 +77,6 @@ class Viewers(Generic[L]):
         self.n_pictures += bool(self._open_viewers)
 
     def close(self) -> None:
-        """Close all viewers."""
         for viewer in self._open_viewers:
             viewer.close()
         self._open_viewers.clear()

@@ -94,7 +94,7 @@ class _Motion:
         self.summed_jumps = np.cumsum(jumps, axis=1)
 
     def tabulate(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
-        """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
+        # (n_drones, n_cells, ...)
         return self.motion_in_cells(np.arange(self.pieces.n_drones)[:, None], np.arange(n_cells), dt, None)
 
     def motion_in_cells(

@@ -140,7 +140,7 @@ class _QuadraticProgram:
         self.rows, self.slack = np.zeros((0, sum(map(np.sum, free_masks)))), np.zeros(0)
 
     def add_half_spaces(self, piece: np.ndarray, u: Floats, normal: Floats, bound: Floats) -> None:
-        """Add half-spaces: ``normal . pos <= bound`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
+        # ``normal . pos <= bound`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)
         n = len(piece)
         weights = u[:, None] ** np.arange(2 * self.order) @ interpolation.hermite_basis(self.order)
         rows = np.zeros((n, self.is_free.shape[0], self.order, 3))
@@ -160,7 +160,7 @@ class _QuadraticProgram:
         self.slack = np.concatenate([self.slack, slack / row_norms])
 
     def solve(self) -> Floats:
-        """Return the derivatives inside all half-spaces that are nearest to the minimum. (n_pieces + 1, k, 3)"""
+        # The derivatives inside all half-spaces that are nearest to the minimum. (n_pieces + 1, k, 3)
         from scipy.optimize import nnls  # a fifth of a second to import
 
         scale = float(np.max(np.abs(self.slack)))

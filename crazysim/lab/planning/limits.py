@@ -156,7 +156,6 @@ class Report:
 
 
 def require_limits(limits: Limits) -> None:
-    """Check that an argument is a ``Limits``."""
     expect(isinstance(limits, Limits), "limits as Limits", limits, "Use Limits(speed=...), or Limits() for none.")
 
 

@@ -72,7 +72,6 @@ class PieceTable:
 
     @property
     def n_drones(self) -> int:
-        """Number of drones."""
         return int(self.drone[-1]) + 1
 
     @functools.cached_property

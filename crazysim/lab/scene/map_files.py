@@ -207,7 +207,6 @@ class _AsciiTable:
         self._words, self._position = body.split(), 0
 
     def read(self, n: int, properties: list[Property]) -> Columns:
-        """Return the properties of the next ``n`` rows."""
         if all(len(p) == 2 for p in properties):
             rows = _parse_numbers(
                 self._words[self._position : self._position + n * len(properties)], n * len(properties)
@@ -234,7 +233,6 @@ class _BinaryTable:
         self._body, self._order, self._position = body, order, 0
 
     def read(self, n: int, properties: list[Property]) -> Columns:
-        """Return the properties of the next ``n`` rows."""
         if n and any(len(p) == 3 for p in properties):
             return self._read_lists(n, properties)
         return self._read_rows(n, [(p[0], self._order + p[1]) for p in properties])

@@ -96,14 +96,13 @@ class _Machine:
                 return value
 
     def run(self, end: int, max_commands: int) -> None:
-        """Run until the program ends, or until the time exceeds ``end``, in units of ``TIME_UNIT``."""
         for _ in range(max_commands):
             if self.address >= len(self.code) or self.now > end or not self.run_command(self.read_byte()):
                 return
         self.raise_error(f"a program that runs at most {max_commands} commands in {end * TIME_UNIT:g} s", "more")
 
     def run_command(self, code: int) -> bool:
-        """Run one command; return False at the end of the program."""
+        # False at the end of the program.
         if code == END:
             return False
         if code in (NOP, SET_PYRO, SET_PYRO_ALL):
@@ -171,7 +170,7 @@ class _Machine:
         self.loops.clear()
 
     def lights(self) -> Lights:
-        """Return the lights so far; of pieces that begin at the same time, only the last is used."""
+        # Of pieces that begin at the same time, only the last is used.
         piece_colors = {start: (a, b) for start, a, b in self.pieces}
         starts, colors = list(piece_colors), np.array(list(piece_colors.values()), float) / 255
         return Lights.of_pieces(TIME_UNIT * np.array(starts), colors[:, 0], colors[:, 1])

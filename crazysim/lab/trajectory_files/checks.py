@@ -36,7 +36,6 @@ def raise_error(expected: str, got: str, location: str) -> NoReturn:
 
 
 def parse_json(content: bytes | str, location: str) -> Any:
-    """Return the value of a JSON document."""
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -44,14 +43,12 @@ def parse_json(content: bytes | str, location: str) -> Any:
 
 
 def require_object(value: object, location: str) -> dict[str, Any]:
-    """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
         raise_error("an object {...}", short_repr(value), location)
     return value
 
 
 def require_array(value: object, n_max: int, location: str) -> list[Any]:
-    """Return a value that must be a JSON array of at most ``n_max`` entries."""
     if not isinstance(value, list):
         raise_error("an array [...]", short_repr(value), location)
     if len(value) > n_max:
@@ -60,7 +57,6 @@ def require_array(value: object, n_max: int, location: str) -> list[Any]:
 
 
 def require_version_one(value: dict[str, Any], location: str) -> None:
-    """Check that an object has version 1."""
     version = value.get("version")
     if version != 1 or isinstance(version, bool):
         raise_error("version 1", short_repr(version), location)
@@ -69,7 +65,6 @@ def require_version_one(value: dict[str, Any], location: str) -> None:
 def require_number(
     value: object, location: str, low: float = -sys.float_info.max, high: float = sys.float_info.max
 ) -> float:
-    """Return a value that must be a finite number from ``low`` to ``high``, as a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         is_bounded = max(-low, high) < sys.float_info.max
         raise_error(
@@ -79,7 +74,6 @@ def require_number(
 
 
 def require_text(value: object, location: str, n_max: int = 200) -> str:
-    """Return a value that must be a string of at most ``n_max`` characters."""
     if not isinstance(value, str) or len(value) > n_max:
         raise_error(f"a text of at most {n_max} characters", short_repr(value), location)
     return value

@@ -37,7 +37,6 @@ def _object_name(cars: Any, part: str) -> str:
 
 
 def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
-    """Add the objects of cars to the scene, if they are not there yet."""
     number, n = vehicle.number, cars.n_members
     wheel = _wheel_geoms(number("wheels.radius"), number("wheels.width"))
     parts = {"body": (_body_geoms(vehicle, as_rgba(BODY_COLOR if cars.rgba is None else cars.rgba)), n)}

@@ -279,7 +279,6 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
 
 
 def collision_boxes(sim: Simulation) -> DroneBoxes:
-    """Return the collision box of each airframe in a simulation, with the drones that have it."""
     drone_groups = [DroneGeoms((), drones) for drones in sim.scene.drone_groups]
     first_drones = [0 if group.drones is None else group.drones[0] for group in drone_groups]
     boxes = [np.asarray(sim.airframes[k].value("shape.collision_box"), np.float64) for k in first_drones]

@@ -84,7 +84,6 @@ def require_drag(sim: Simulation, effect: str) -> None:
 
 
 def require_rotors(sim: Simulation, effect: str) -> None:
-    """Check that the model has rotors."""
     if not isinstance(sim.data.params, first_principles.Params):
         raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
 

@@ -68,7 +68,6 @@ class CollidingPlugin(Plugin, abstract=True):
         return (Collider(self.shape(), self.body, self.with_vel, self.joined_mask),)
 
     def shape(self) -> Shape:
-        """Return the shape of a load."""
         return load_shape(self.size)  # type: ignore[attr-defined]
 
     def body(self, data: SimData) -> LoadBody:

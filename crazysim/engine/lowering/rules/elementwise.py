@@ -142,7 +142,7 @@ class _Bits:
         return self.ctx.elementwise(op, [a, b], self.dtype)
 
     def count(self, x: ElementArray) -> ElementArray:
-        """Count the bits that are set: add them up in pairs, fours and bytes, and sum the bytes by a product."""
+        # Adds the set bits up in pairs, fours and bytes, and sums the bytes by a product.
         pairs, fours, eights, ones = (self.repeat_byte(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
         x = self.apply("sub", x, self.apply("and", self.apply("shift_right_logical", x, 1), pairs))
         x = self.apply(

@@ -268,5 +268,4 @@ def is_known(x: ElementArray) -> bool:
 
 
 def known_values(x: ElementArray) -> np.ndarray:
-    """Return known elements as numbers."""
     return np.array(x.reshape(-1).tolist(), x.reshape(-1)[0].dtype if x.size else np.int32).reshape(x.shape)

@@ -23,7 +23,6 @@ def _move(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 
 
 def move_elements(eqn: JaxprEqn, args: list[ElementArray]) -> ElementArray:
-    """Return the result of a primitive that only moves elements."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "reshape" if p.get("dimensions") is None:

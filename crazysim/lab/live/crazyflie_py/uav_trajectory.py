@@ -27,7 +27,6 @@ class Polynomial:
         return float(polyval(float(t), self.p))
 
     def derivative(self) -> Polynomial:
-        """Return the derivative."""
         return Polynomial(self.p[1:] * np.arange(1, len(self.p)) if len(self.p) > 1 else [0.0])
 
 

@@ -90,7 +90,6 @@ class Origin:
 
 
 def check_origin(origin: object) -> Origin:
-    """Check an origin, and return it."""
     if not isinstance(origin, Origin):
         raise ConfigError(f"expected an Origin, got {short_repr(origin)}. Use Origin(latitude, longitude, altitude).")
     return origin
