@@ -176,6 +176,8 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
     if options.check:
         from crazysim.train.check import check_task
 
+        for name in ("resume", "seeds", "sweep", "tune"):
+            require(not getattr(options, name), f"expected --check or --{name}, got both. Use --check alone at first.")
         create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
         findings = check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
         return int(bool(findings))

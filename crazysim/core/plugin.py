@@ -102,6 +102,7 @@ def param(
     shapes: Shapes | None = None,
     sparse: bool = False,
     keep: bool = True,
+    constant: bool = False,
 ) -> Any:
     """Declare a number of a plugin, which is an array in ``data.plugins``; another value compiles nothing.
 
@@ -118,13 +119,14 @@ def param(
         shapes: Shapes of a shared number, ``"any"`` for an axis of any length.
         sparse: As in ``crazysim.engine.pytree.leaf``.
         keep: False for a number that only ``bind`` reads, to calculate others; it is None in ``data.plugins``.
+        constant: Whether ``sim.replace`` sets a number of each member, as it sets parameters: one that no step changes.
     """
     declaration = Setting(
         range_between(low, high, positive), True, per_axis, np.int32 if whole and dtype is None else dtype, shapes
     )
     metadata: dict[str, Any] = {"setting": declaration}
     if keep:
-        metadata |= _leaf_metadata(scope, core, sparse=sparse, dtype=dtype, airframe=airframe)
+        metadata |= _leaf_metadata(scope, core, sparse=sparse, dtype=dtype, airframe=airframe, constant=constant)
     return dataclasses.field(default=default, metadata=metadata | {"static": not keep, "keep": keep})
 
 
@@ -165,7 +167,8 @@ def derived(
     init: Literal[False] = False,  # noqa: ARG001
 ) -> Any:
     """Declare a parameter that ``bind`` calculates from others, None by default; ``init`` as for ``state``."""
-    return state(core, scope=scope, optional=True, sparse=sparse)
+    metadata = _leaf_metadata(scope, core, sparse=sparse, scratch=False, dtype=None, optional=True, constant=True)
+    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
 
 
 def nested(*, default: PyTree | None) -> Any:

@@ -421,7 +421,8 @@ def _carry_over_states(
         return record
     states = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
-        new, old, scope = getattr(record, f.name), getattr(old_record, f.name), f.metadata.get("scope")
+        new, old = getattr(record, f.name), getattr(old_record, f.name)
+        scope = "parameter" if f.metadata.get("constant") else f.metadata.get("scope")
         is_derived = f.metadata.get("optional") and scope in _SETTING_SCOPES
         if isinstance(new, PyTree):
             states[f.name] = _carry_over_states(new, old, setting_scopes)

@@ -67,7 +67,7 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
     for finding in findings:
         log(f"- {finding}")
     if not findings:
-        log("nothing was found")
+        log("nothing was found" + (", but the return does not rise yet" if after["reward"] <= before["reward"] else ""))
     return findings
 
 

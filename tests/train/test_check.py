@@ -71,3 +71,9 @@ def test_a_demonstration_that_fails_is_named(tmp_path, capsys):
     (tmp_path / "broken.py").write_text(BROKEN)
     assert main(["train", f"{tmp_path / 'broken.py'}:Broken", "--check"]) == 2
     assert "Broken.demonstrate(obs) as a function" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("others", ["--resume", "--seeds 0 1", "--sweep discount=0.9,0.99", "--tune"])
+def test_the_check_refuses_what_it_would_ignore(others, capsys):
+    assert main(["train", "hover", "--check", *others.split()]) == 2
+    assert f"expected --check or {others.split()[0]}, got both" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
-from crazysim.core.plugin import Param, Simulation, StagePlacement, param, state
+from crazysim.core.plugin import Param, Simulation, StagePlacement, derived, param, state
 from crazysim.core.population import Population, RatesFn
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.dynamics.models import GRAVITY
@@ -45,7 +45,7 @@ class FreeBodies(Population):
     """Number of bodies in each world, or their names."""
     size: Any = setting(default=(0.2, 0.2, 0.2), keep=False)
     """Full lengths of a box, m (3,), or radius of a ball, m, for all bodies; or a list with an entry for each body."""
-    mass: Param = param(default=0.1, scope="member", low=MASS.low, high=MASS.high)
+    mass: Param = param(default=0.1, scope="member", low=MASS.low, high=MASS.high, constant=True)
     """Mass, kg. (n_worlds, n_members, 1)"""
     pos: Param = param(default=None, core=(3,), scope="member")
     """Position of the centre of mass, world frame, m; None for a row along x on the floor. (n_worlds, n_members, 3)"""
@@ -53,9 +53,9 @@ class FreeBodies(Population):
     """Attitude, body to world, xyzw, normalised here. (n_worlds, n_members, 4)"""
     vel: Param = param(default=(0.0, 0.0, 0.0), core=(3,), scope="member")
     """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
-    friction: Param = param(default=0.6, scope="member", low=0.0, high=MAX_FRICTION)
+    friction: Param = param(default=0.6, scope="member", low=0.0, high=MAX_FRICTION, constant=True)
     """Coulomb's coefficient; the larger one of two bodies is used. (n_worlds, n_members, 1)"""
-    restitution: Param = param(default=0.0, scope="member", low=0.0, high=1.0)
+    restitution: Param = param(default=0.0, scope="member", low=0.0, high=1.0, constant=True)
     """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (n_worlds,
     n_members, 1)"""
     objects: ObjectSelection = None
@@ -82,7 +82,7 @@ class FreeBodies(Population):
     friction_impulse: Array = state(("n_contacts", 3), scope="world")
     """Impulses across the normals, world frame, N s; the initial impulses of the next step.
     (n_worlds, 1, n_contacts, 3)"""
-    inertia: Array = state((3,), scope="member")
+    inertia: Array = derived((3,), scope="member")
     """Moments of inertia about the axes of the body, kg m^2. (n_worlds, n_members, 3)"""
     name: str = "bodies"
     prefix: ClassVar[str] = "Box"

@@ -354,6 +354,20 @@ def test_law_08_gradients_equal_central_differences(x64):
     assert jax.eval_shape(jax.grad(end), 1.0).shape == ()
 
 
+def test_replacing_the_numbers_of_bodies_keeps_their_motion():
+    sim, _ = build(2)
+    sim.step(5)
+    before = sim.data.plugins["bodies"]
+    sim.replace(FreeBodies(2, mass=0.4, friction=0.2, restitution=0.5, pos=[0.0, 0.0, 9.0]))
+    new, made = sim.data.plugins["bodies"], Sim(plugins=[FreeBodies(2, mass=0.4)]).data.plugins["bodies"]
+    np.testing.assert_allclose(new.mass, 0.4, rtol=1e-6)
+    np.testing.assert_allclose(new.inertia, np.broadcast_to(made.inertia, new.inertia.shape), rtol=1e-6)
+    np.testing.assert_allclose(new.friction, 0.2, rtol=1e-6)
+    np.testing.assert_allclose(new.restitution, 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(new.pos, before.pos)
+    np.testing.assert_array_equal(new.vel, before.vel)
+
+
 def test_law_09_bodies_that_stayed_in_the_scene_are_used_again_only_in_the_same_number():
     sim, _ = build(2)
     with pytest.raises(ConfigError, match="expected 2 objects 'bodies', which are in the scene already, got 3"):
