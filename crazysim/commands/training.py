@@ -176,11 +176,10 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
     if options.check:
         from crazysim.train.check import check_task
 
-        for name in ("resume", "seeds", "sweep", "tune"):
-            require(not getattr(options, name), f"expected --check or --{name}, got both. Use --check alone at first.")
-        create_settings = ("algorithm", "n_worlds", "devices", "options", "config")
-        findings = check_task(options.task, seed=options.seed, **{name: settings[name] for name in create_settings})
-        return int(bool(findings))
+        others = [f"--{name}" for name in ("resume", "seeds", "sweep", "tune") if getattr(options, name)]
+        require(not others, f"expected --check alone, got it with {' and '.join(others)}. Leave them out at first.")
+        kept = {name: settings[name] for name in ("algorithm", "n_worlds", "devices", "options", "config")}
+        return int(bool(check_task(options.task, seed=options.seed, **kept)))
     require(options.tune or not options.tune_seconds, "expected --tune-seconds with --tune, got it alone. Add --tune.")
     if options.tune:
         settings["config"] |= _tune(options, settings)

@@ -167,8 +167,12 @@ def derived(
     init: Literal[False] = False,  # noqa: ARG001
 ) -> Any:
     """Declare a parameter that ``bind`` calculates from others, None by default; ``init`` as for ``state``."""
-    metadata = _leaf_metadata(scope, core, sparse=sparse, scratch=False, dtype=None, optional=True, constant=True)
-    return dataclasses.field(default=None, kw_only=True, repr=False, metadata=metadata)
+    return dataclasses.field(
+        default=None,
+        kw_only=True,
+        repr=False,
+        metadata=_leaf_metadata(scope, core, sparse=sparse, scratch=False, dtype=None, optional=True, constant=True),
+    )
 
 
 def nested(*, default: PyTree | None) -> Any:

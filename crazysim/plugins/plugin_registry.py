@@ -421,12 +421,11 @@ def _carry_over_states(
         return record
     states = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
-        new, old = getattr(record, f.name), getattr(old_record, f.name)
-        scope = "parameter" if f.metadata.get("constant") else f.metadata.get("scope")
-        is_derived = f.metadata.get("optional") and scope in _SETTING_SCOPES
+        new, old, data = getattr(record, f.name), getattr(old_record, f.name), f.metadata
+        scope = "parameter" if data.get("constant") else data.get("scope")
         if isinstance(new, PyTree):
             states[f.name] = _carry_over_states(new, old, setting_scopes)
-        elif not f.metadata.get("static") and scope not in setting_scopes and not is_derived:
+        elif not (data.get("static") or scope in setting_scopes or (data.get("optional") and scope in _SETTING_SCOPES)):
             states[f.name] = old if _signature(old) == _signature(new) else new
     return record.replace(**states)
 
