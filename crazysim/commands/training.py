@@ -187,8 +187,13 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
         run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
         return None
     require(options.seeds is None or options.seed is None, "expected --seed or --seeds, got both. Use --seeds alone.")
-    seeds = options.seeds or [options.seed or 0]
-    run_many(options.task, options.out, seeds=seeds, sweep=_parse_sweep(options.sweep), **settings)
+    run_many(
+        options.task,
+        options.out,
+        seeds=options.seeds or [options.seed or 0],
+        sweep=_parse_sweep(options.sweep),
+        **settings,
+    )
     return None
 
 
