@@ -60,6 +60,7 @@ def run_demo_flight(
     fleet = f"{count_text(n_worlds, 'world')} of {count_text(n_drones, 'drone')}"
     print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
+    # Compile before the clock starts.
     start_time = perf_counter()
     compiled_frame = step_frame.lower(sim.data).compile()
     compile_s = perf_counter() - start_time
@@ -67,6 +68,7 @@ def run_demo_flight(
     find_pole_contacts(sim)
     contacts_compile_s = perf_counter() - start_time
 
+    # Fly, and time steps and contacts separately.
     recorder = Recorder(sim, worlds=[0])
     errors, pole_contacts = [], []
     step_s = contacts_s = 0.0
@@ -81,6 +83,7 @@ def run_demo_flight(
         recorder.add()
         errors.append(np.asarray(error))
 
+    # Report, log, picture and film.
     n_steps = n_frames * (sim.freq // FPS)
     print_report(
         np.concatenate(errors), np.stack(pole_contacts), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames

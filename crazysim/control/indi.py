@@ -135,8 +135,10 @@ def indi_control(
     """
     p, sp, allocation = params.geometric, setpoint, params.geometric.allocation
     matrix = rotation.matrix(quat)
+    # Wrench that the rotors exert now.
     wrench = matvec(params.mixing_matrix, quadratic_curve(rotor_vel, allocation.rpm2thrust))
     rotor_acc = matrix[..., 2] * wrench[..., :1] / p.mass
+    # Rates of momentum and velocity; the first tick has no earlier values and takes the model's.
     is_first_tick = memory.started == 0
     yaw_torque = wrench[..., 3:]
     momentum = matvec(p.J, ang_vel)
@@ -144,20 +146,24 @@ def indi_control(
     modelled_torque = wrench[..., 1:] - cross(ang_vel, momentum)
     momentum_rate = jnp.where(is_first_tick, modelled_torque, (total_momentum - memory.momentum) * freq)
     acc = jnp.where(is_first_tick, rotor_acc + p.gravity_vec, (vel - memory.vel) * freq)
+    # One filter for all signals, so that their delays are equal.
     signals = jnp.concatenate([acc, rotor_acc, momentum_rate, wrench[..., 1:]], axis=-1)
     filter_state = jnp.where(is_first_tick, steady_filter_states(signals, params.filter), memory.filter)
     signals, filter_state = apply_filter(signals, filter_state, params.filter)
     acc, rotor_acc, momentum_rate, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
+    # Position loop: feedback, minus the filtered disturbance.
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
     disturbance = rotation.clip(acc - rotor_acc - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
     specific_thrust = sp.acc - p.gravity_vec + feedback - disturbance
     attitude = attitude_of_thrust(specific_thrust, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    # Attitude loop: feedback, minus the filtered disturbance torque.
     rotation_error, rate_error, ang_acc_des = attitude_errors(matrix, ang_vel, attitude)
     torque_des = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
     limit = TORQUE_MAX * p.kR
     torque = torque_des - rotation.clip(momentum_rate - torque, -limit, limit)
 
+    # Rotor speeds by priority, ahead of the motors' lag.
     thrust = p.mass * dot(specific_thrust, matrix[..., 2])
     yaw_drag_torque = yaw_torque + params.drag_torque_share * (torque[..., 2:] - yaw_torque)
     wrench_cmd = prioritized_wrench(

@@ -109,6 +109,7 @@ class PID(Controller):
         s, p, initial_memory = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
+        # Outer loops continue from the present attitude and thrust.
         if isinstance(command, Setpoint):
             heading = heading_vector(s.quat)
             position_memory = initial_memory.position.with_first_measurement(
@@ -126,6 +127,7 @@ class PID(Controller):
             current_output = jnp.stack([rpy[1], -rpy[0], scaled_thrust[0]])
             velocity_memory = continue_integral(velocity_memory, output, current_output, loop=p.velocity)
             initial_memory = initial_memory.replace(position=position_memory, velocity=velocity_memory)
+        # Inner loops start from measured values.
         initial_memory = initial_memory.replace(
             attitude=initial_memory.attitude.with_first_measurement(rpy, initial_memory.started),
             rate=initial_memory.rate.with_first_measurement(ang_vel, initial_memory.started),
@@ -133,6 +135,7 @@ class PID(Controller):
         started_memory = initial_memory.replace(
             rpy_des=rpy, thrust=thrust, started=jnp.ones_like(initial_memory.started)
         )
+        # The rate loop continues from the present torque.
         _, _, ang_vel_des = self._desired_rates(data, command, started_memory, p, rpy)
         output, _ = desired_torque(ang_vel, ang_vel_des, started_memory.rate, self.freq, loop=p.rate)
         return started_memory.replace(rate=continue_integral(started_memory.rate, output, torque, loop=p.rate))

@@ -82,6 +82,7 @@ def _check_rotors(airframe: Airframe) -> str | None:
     value = airframe.value
     n, mass = airframe.n_rotors, float(value("rigid_body.mass"))
     low, high, signs = value("rotors.thrust_min"), value("rotors.thrust_max"), value("rotors.yaw_torque_sign")
+    # Rotors that can lift the drone.
     if not low < high:
         return f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N"
     if not n * low < mass * GRAVITY_MAGNITUDE < n * high <= MAX_THRUST_TO_WEIGHT * mass * GRAVITY_MAGNITUDE:
@@ -95,6 +96,7 @@ def _check_rotors(airframe: Airframe) -> str | None:
         )
     if not airframe.arm > 0:
         return "expected rotors beside the centre of mass, got all of them at x = y = 0"
+    # Rotors that can turn it about each axis.
     axes = "x and y" if n < 4 else "x, y and z"  # three rotors cannot hold the heading as well
     mixing = np.vstack([np.ones(n), airframe.mixing_matrix])[: 3 if n < 4 else 4]
     if np.linalg.matrix_rank(mixing, tol=MIN_SINGULAR_VALUE) < len(mixing):
@@ -109,6 +111,7 @@ def _check_rotors(airframe: Airframe) -> str | None:
             f"expected rotors that keep the drone level in hover with {low} to {high} N each, got "
             f"{short_repr(hover_thrusts.round(4).tolist())} N, which their positions around the centre of mass need"
         )
+    # Plausible angular acceleration, and inertia of propellers.
     moments = np.linalg.eigvalsh(airframe.inertia)
     if airframe.arm * n * high / moments[0] > MAX_ANG_ACC:
         return (

@@ -151,6 +151,7 @@ def estimate_airframe(
     ):
         if value is not None:
             read_number(key, value, POSITIVE)
+    # Body: mass, inertia, positions of the rotors.
     file = _AirframeFile(name)
     rotor_pos, signs = _rotor_layout(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
@@ -166,6 +167,7 @@ def estimate_airframe(
         "layout" if positions is None else "given",
     )
     file.add("rotors", "yaw_torque_sign", signs, "1", "spins" if positions is not None or spins else "layout")
+    # Rotors: curves, limits, inertia and lag.
     thrust = _add_thrust(file, mass, len(rotor_pos), propeller, thrust_to_weight, motor_table, pitch)
     _check_units(mass, propeller, rotor_pos, thrust)
     file.add("rotors", "thrust_min", IDLE_THRUST_RATIO * thrust, "N", "thrust_min")
@@ -174,6 +176,7 @@ def estimate_airframe(
     tau = ROTOR_TIME_CONSTANT * max(1.0, propeller / 0.254) if time_constant is None else time_constant
     lag_unit = "1/s, 1/(s rpm) on spin-up; 1/s, 1/(s rpm) on spin-down"
     file.add("rotors", "lag", np.array([1 / tau, 0, 1 / tau, 0]), lag_unit, "given" if time_constant else "lag")
+    # Drag, battery and appearance.
     file.add("drag", "coefficients", -DRAG_RATE * mass * np.ones(3), "N s/m", "drag")
     _add_battery(file, mass, cells, capacity, resistance)
     file.add("shape", "propeller_radius", propeller / 2, "m", "propeller")
@@ -237,6 +240,7 @@ def _rotor_layout(
         (arm is None) != (positions is None),
         "expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.",
     )
+    # Rotors on a circle, or at given positions.
     if positions is None:
         expect(layout in ("x", "+"), "layout as 'x' or '+'", layout, "Use positions for any other.")
         require(
@@ -256,6 +260,7 @@ def _rotor_layout(
         )
         rotor_pos = np.pad(rotor_pos, ((0, 0), (0, 3 - rotor_pos.shape[1])))
     rotor_pos = np.where(np.abs(rotor_pos) < 1e-9, 0.0, rotor_pos)
+    # Propellers at about one height must not overlap.
     gaps = rotor_pos[:, None] - rotor_pos[None]
     is_same_height = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(rotor_pos), dtype=bool)
     min_gap = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[is_same_height], initial=np.inf)
@@ -264,6 +269,7 @@ def _rotor_layout(
             f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {min_gap:.3g} m "
             f"apart. Use a longer arm, a smaller propeller (5 inches are 0.127 m), or other heights of the rotors."
         )
+    # Directions of rotation, alternating by default.
     if spins is None:
         require(
             len(rotor_pos) % 2 == 0,
@@ -302,6 +308,7 @@ def _add_thrust(
         "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
         "4 for an agile one.",
     )
+    # Largest thrust, by its ratio or the table.
     motor_data = {} if motor_table is None else _parse_motor_table(motor_table)
     table_name = (
         f"motor table {Path(motor_table).name}"
@@ -315,6 +322,7 @@ def _add_thrust(
         thrust = float(np.max(motor_data["thrust"]))
         file.describe("motor_thrust", f"Largest thrust of the {table_name}")
         file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
+    # Thrust curve, by the pitch ratio or the table.
     pitch_ratio = PITCH_RATIO if pitch is None else pitch / diameter
     ct = 0.0427 + 0.144 * pitch_ratio
     if "rpm" in motor_data:
@@ -328,6 +336,7 @@ def _add_thrust(
         "rotors", "thrust_curve", np.array([0, 0, thrust_factor]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitch_text
     )
 
+    # Torque curve, by momentum theory or the table's torque or power.
     area, rpm_to_rad_s = np.pi * diameter**2 / 4, 2 * np.pi / 60
     merit = float(np.interp(diameter, MERIT_DIAMETERS, FIGURES_OF_MERIT))
     torque_factor, source = thrust_factor**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / rpm_to_rad_s, "torque_curve"
@@ -368,6 +377,7 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     column_names = ", ".join(COLUMNS)
     column_by_quantity: dict[str, NDArray] = {}
+    # Columns in SI units; two columns of one quantity must agree.
     for key, values in columns.items():
         expect(str(key).strip().lower() in COLUMNS, f"columns of a motor table among {column_names}", key)
         quantity, factor = COLUMNS[str(key).strip().lower()]
@@ -395,6 +405,7 @@ def _parse_motor_table(table: MotorTable) -> dict[str, NDArray]:
         len({len(array) for array in column_by_quantity.values()}) == 1,
         "expected columns of equal lengths in the motor table",
     )
+    # Rows in which the rotor turns, by ascending speed.
     if "rpm" in column_by_quantity:
         is_running = column_by_quantity["rpm"] > 0
         require(np.any(is_running), "expected a speed above 0 in column 'rpm' of the motor table, got none")

@@ -70,6 +70,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
     The defaults follow from the rotors' positions, and the battery's size from the mass, in the proportions of the
     built-in airframes. docs/guides/airframe-keys.md describes the keys.
     """
+    # Sizes follow from the rotors' positions and the mass.
     rotors = airframe.value("rotors.position")
     reach = float(np.max(np.linalg.norm(rotors[:, :2], axis=-1)))
     height = float(np.mean(rotors[:, 2]))
@@ -87,6 +88,7 @@ def body_shape(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
         "led_radius": 0.06 * reach,
     } | dict(airframe.tables.get("shape", {}))
 
+    # Keys that depend on others, which the file may have set.
     plate, battery, led_radius = shape["plate"], shape["battery"], shape["led_radius"]
     shape = {"battery_height": (plate[2] + battery[2]) / 2} | shape
     battery_top = shape["battery_height"] + battery[2] / 2

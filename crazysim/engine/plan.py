@@ -158,6 +158,7 @@ class Planner(NamedTuple):
         # ``zeros`` may be older than ``data``: a parameter that was shared may have one value per drone in ``data``.
         zeros = tuple([(i, indices) for i, indices in self.zeros if leaf_scopes[i] == "shared"])
         tracer = Tracer()
+        # One program for each group of populations.
         groups = independent_groups(self.stages, data, tracer)
         lowered_programs = [
             lower_stages(g.stages, data, zeros, check=True, population=g.population, tracer=tracer) for g in groups
@@ -172,6 +173,7 @@ class Planner(NamedTuple):
         if self.location.is_distributed and unfused:
             distribution_limit = f"with a mesh every stage must be fused, and {unfused[0].explanation}"
             return self._plan_plain(data, distribution_limit), problems
+        # Kernels if possible, else lanes or the chosen engine.
         engine, reason, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
             engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
@@ -186,9 +188,11 @@ class Planner(NamedTuple):
             if reason and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {reason}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
+        # One function that runs all programs.
         inputs = {i for program in programs for i in _input_leaves(program)}
         run, written_leaves = _join_runs(groups, programs, runs)
         plan = self._make_plan(engine, reason, data, programs, inputs, written_leaves, run, len(programs[0].leaves))
+        # On a CPU without a mesh, kernels can be called without XLA.
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         is_on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if is_on_host and is_host_call_possible(kernels):

@@ -237,6 +237,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int | None = None) -> None:
             f"expected {name} in a record of a population, got a leaf of drones, which these data lack. Declare it "
             f'with leaf("member") in a subclass of Members.',
         )
+        # Batch axes of drones, or of members of a population.
         n, kind, kinds = n_drones, "drone", "drones"
         if members is not None and scope != "drone":
             n, kind, kinds = members.n_members, "member", members.population

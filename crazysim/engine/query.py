@@ -47,6 +47,7 @@ def query(queries: Sequence[Query], data: Record, platform: str) -> list[Any]:
     """
     leaves, axes = jax.tree.leaves(data), Axes(data)
     n_worlds, n_drones = leaves[axes.scopes.index("drone")].shape[:2]
+    # One stage for each query, which writes arrays of its results.
     arrays: dict[str, Array] = {}
     shapes, treedefs, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
@@ -59,6 +60,7 @@ def query(queries: Sequence[Query], data: Record, platform: str) -> list[Any]:
         shapes.append(dict(zip(names, drone_shapes, strict=True)))
         treedefs.append(treedef)
         stages.append(Stage(_make_writer(fn, scope, n_drones, names), scope, name=f"query {number}", phase="after"))
+    # One program for all queries.
     extended_data = _Queried(data, arrays)
     extended_leaves, treedef = jax.tree.flatten(extended_data)
     program = optimise(lower_stages(stages, extended_data))

@@ -296,6 +296,7 @@ class DroneEnv(Env):
     """Environment of many worlds with one task. Without ``AutoReset``, an episode that is over continues."""
 
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
+        # Rates that divide each other.
         freq = positive_integer("freq", freq)
         require_installed(sim, task)
         require(
@@ -319,6 +320,7 @@ class DroneEnv(Env):
         self.measure_states: Callable[[SimData], SimData] | None = None
         """``measure_states(data)``: the data with measured states, for one world, or for all worlds if the task is
         batched; None if the task observes the true states."""
+        # Measured states in place of the true ones.
         if check_flag("measured", measured):
             require(
                 any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()),
@@ -327,6 +329,7 @@ class DroneEnv(Env):
             )
             measure_world = sim.plugins.measured_states
             self.measure_states = vmap_worlds(measure_world) if task.batched else measure_world
+        # Length of a step and of an episode.
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         require(

@@ -323,6 +323,7 @@ def _check_data(title: str, batched: bool, before: SimData, after: Any) -> SimDa
         f"{title} to return the data that it gets with other values, got a {type(after).__name__}. End it with return "
         f"data.replace(...); {GUIDE} has an example.",
     )
+    # The record must keep its structure.
     if jax.tree.structure(after) != jax.tree.structure(before):
         old_paths, new_paths = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (before, after))
         changes = ", ".join(
@@ -335,6 +336,7 @@ def _check_data(title: str, batched: bool, before: SimData, after: Any) -> SimDa
             f"{GUIDE} has an example."
         )
 
+    # Arrays are broadcast to the shapes that they had.
     def fit(path: Any, x: Array, y: Any) -> Array:
         y = y if y is x else jnp.asarray(y, x.dtype)
         shape = jnp.shape(y)

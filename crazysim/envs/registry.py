@@ -126,6 +126,7 @@ def make(
     """
     entry = entry_of(task)
     name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
+    # Options of the task or of the simulation.
     for option in options:
         if option not in SIM_OPTIONS + entry.options:
             make_options = [name for name in inspect.signature(make).parameters if name not in ("task", "options")]
@@ -138,6 +139,7 @@ def make(
     settings = entry.defaults | {k: v for k, v in options.items() if k in SIM_OPTIONS}
     task_options = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
+    # Plugins, with ready-made ranges if they are requested.
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
     if randomize is not None:
         expect(
@@ -147,6 +149,7 @@ def make(
             "Use effects=[Randomize(...)] for other ranges.",
         )
         plugins.append(RANDOMIZATIONS[randomize]())
+    # Simulation, task, plugins, in this order.
     sim = Sim(n_worlds=n_worlds, freq=sim_freq, **settings)
     repeated_name = next((plugin.name for plugin in plugins if plugin.name in sim.plugins), None)
     require(
@@ -157,6 +160,7 @@ def make(
     task.install(sim)
     for plugin in plugins:
         sim.add(plugin)
+    # Environment, with images of cameras.
     env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
     if camera is not None:
         for image_sensor in [camera] if isinstance(camera, ImageSensor) else check_plugin_list("camera", camera):

@@ -109,6 +109,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         data: Data of all worlds.
         action_size: Length of the action of one drone.
     """
+    # Methods that every task defines.
     title = f"task {task.name or type(task).__name__!r}"
     undefined = [name for name in REQUIRED_METHODS if getattr(type(task), name) is getattr(Task, name)]
     require(
@@ -116,6 +117,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED_METHODS)}, got no "
         f"{', '.join(undefined)}. {GUIDE} describes each method.",
     )
+    # Types and shapes of the results, without computing them.
     n_worlds, n_drones = data.states.pos.shape[:2]
     batch, batch_name = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     world = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)

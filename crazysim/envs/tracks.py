@@ -71,6 +71,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
         jitter: Largest sum of the horizontal displacements of a drone and of a gate or obstacle, m.
         is_random: Whether gates and obstacles are placed at random.
     """
+    # Shapes and finite numbers.
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
         value = np.asarray(getattr(track, name), float)
@@ -80,6 +81,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
             raise ConfigError(f"expected {name} of the track as finite numbers, {expected}, got shape {value.shape}")
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
     require(np.all(high > low), f"expected upper limits of the arena above the lower ones, got {high} and {low}")
+    # A random course needs enough cells.
     if is_random:
         n_x, n_y = track.grid
         require(
@@ -90,6 +92,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
         )
         require(n_drones <= 8, f"expected at most 8 drones on a random course, got {n_drones}. Use level 0, 1 or 2.")
         return track
+    # Starts that are clear of gates, obstacles and limits.
     starts = np.asarray(track.start) + start_offsets(n_drones)
     for kind, points, clearance in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
         distance = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)

@@ -75,6 +75,7 @@ class Follow(Plugin, replaces=("state commands",)):
                 f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
                 f"Use Sim(control='state')."
             )
+        # Slots of equal size, with room for uploads.
         trajectories = trajectory_list(self.trajectories)
         n_slots = (
             len(trajectories) if self.n_slots is None else _check_count("n_slots", self.n_slots, len(trajectories))
@@ -86,6 +87,7 @@ class Follow(Plugin, replaces=("state commands",)):
         slots = Trajectory.stack(
             [first_trajectory, *trajectories[1:], *[first_trajectory] * (n_slots - len(trajectories))]
         )
+        # Drones take the trajectories in turn.
         index = np.int32(0) if self.index is None else self.index
         if self.index is None and len(trajectories) > 1 and sim.n_drones > 1:
             index = np.broadcast_to(np.arange(sim.n_drones) % len(trajectories), (sim.n_worlds, sim.n_drones))

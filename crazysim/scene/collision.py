@@ -150,6 +150,7 @@ def _build_model(
 ) -> CollisionModel:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    # Geoms by their carrier: floor, drones, other bodies.
     floor = []
     drone_geoms: dict[str, list[CollisionGeom]] = {f"drone:{group[0] if group else 0}": [] for group in drone_groups}
     geoms_by_root = dict[int, list[int]]()
@@ -172,12 +173,14 @@ def _build_model(
             floor.append(_read_geom(model, data, geom, None))
         else:
             geoms_by_root.setdefault(root, []).append(geom)
+    # Rows of movable bodies: first those with handles.
     mocap = {
         name: int(mocap_id)
         for body, mocap_id in enumerate(model.body_mocapid)
         if mocap_id >= 0 and not (name := body_name(model, body)).startswith("drone:") and name not in handles
     }
     rows = {name: row for row, name in enumerate((*handles, *mocap))}
+    # Geoms in the frame of their body, or of the world if it stays.
     objects = []
     for root, geoms in geoms_by_root.items():
         row = rows.get(body_name(model, root))

@@ -120,6 +120,7 @@ def build_contact_fn(
         data = with_moved_objects(data, moving_plugins(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
+        # Every geom of every airframe, at its drone.
         all_geoms = [geom for drone_geoms in model.drones for geom in drone_geoms.geoms]
         drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
         parts = [
@@ -132,6 +133,7 @@ def build_contact_fn(
             ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
              "nearest_drone")
         )  # fmt: skip
+        # Distances to floor, objects and other drones.
         if floor:
             gaps = [
                 _mask_absent(is_present, _geom_distance(part, part_pos, drone_rot, geom))

@@ -202,6 +202,7 @@ def build_depth_fn(
         f"expected along='axis' of the camera or along='ray', got {along!r}",
     )
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
+    # Pixels in square tiles: neighbouring rays meet the same geoms.
     height, width = rays[0].shape[:2]
     tile_height, tile_width = (math.gcd(n, TILE_SIDE) for n in (height, width))
     tile_shape = height // tile_height, tile_height, width // tile_width, tile_width
@@ -278,6 +279,7 @@ def build_depth_fn(
         return kernels.run_on_each_device(cast_in_parts, data)
 
     def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
+        # Batches of worlds that fit into memory.
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, worlds_per_batch = data.states.pos.shape[0], max(1, max_rays // n_rays)
         if n_worlds <= worlds_per_batch:

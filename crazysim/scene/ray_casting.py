@@ -133,6 +133,7 @@ def cast_rays(
         pixel_rays[..., 0], pixel_rays[:, 0, 3] = 1.0, ignored
         camera_poses = jnp.concatenate([origin, axes], axis=-1)
         return cast_rays_in_worlds(model, data, camera_poses, pixel_rays, drones, kernels or RayKernels())
+    # The nearest of all geoms, in one world or around one drone.
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
@@ -140,12 +141,14 @@ def cast_rays(
         body_index=jnp.full(origin.shape[:-1], -1, jnp.int32),
         names=body_names(model, data.core.n_drones if drones else 0),
     )
+    # Fixed geoms, by a hierarchy if there are many.
     targets = Targets(model, 0, drones=False)
     if len(targets.fixed_geoms) * len(origin) <= MAX_PAIRS:
         for target in targets.fixed_geoms:
             best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.body_index)
     else:
         best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit))
+    # Objects that have the same geoms are one batch.
     groups: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
     for index, body in enumerate(model.objects, start=1):
         if body.row is not None:
@@ -298,6 +301,7 @@ def cast_rays_in_worlds(
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
     n_worlds, (n_cameras, n_pixels, _) = camera_poses.shape[0], pixels.shape
+    # The nearest geom of each ray, in kernels.
     boxes, movable = targets.movable_rows(data)
     boxes, links = kernels.node_boxes(targets, jax.lax.stop_gradient(boxes))
     tables = targets.tables(boxes, links, movable, camera_poses, jnp.asarray(pixels, camera_poses.dtype))
@@ -307,6 +311,7 @@ def cast_rays_in_worlds(
     hit_table = ray_length[:, None], geom_index[:, None]
     distance, geom_index = ray_length.reshape(n_worlds, -1), geom_index.reshape(n_worlds, -1)
 
+    # Rays in the world frame.
     pixel_direction = jnp.asarray(pixels[..., :3], camera_poses.dtype)
     axes = camera_poses[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
     direction = sum(axes[..., k] * pixel_direction[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
@@ -314,6 +319,7 @@ def cast_rays_in_worlds(
     names = body_names(model, data.core.n_drones if drones else 0)
     if not targets.all_geoms:
         return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names)
+    # Distance and normal again in JAX, for their derivatives.
     fixed_rows = jnp.broadcast_to(
         tables.fixed_geoms[: len(targets.fixed_geoms)], (n_worlds, len(targets.fixed_geoms), 16)
     )
@@ -322,6 +328,7 @@ def cast_rays_in_worlds(
     differentiable_distance, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
     distance = _replace_derivative(distance, differentiable_distance)
     normal = normal_at(distance)
+    # A kernel computes the normals, too; their derivatives stay JAX's.
     if platform is not None:
         ray_fn = functools.partial(normal_at_hit, targets.surfaces, n_pixels, n_cameras)
         kernel_normal = map_indices(ray_fn, n, [*tables, *hit_table], platform, compile_now=False)

@@ -85,6 +85,7 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
         for name, flown in metrics.items()
         if flown["nonfinite"]
     ]
+    # Hovering must fail, and the demonstration must succeed.
     if hovering["success"] > 0.5:
         findings.append(
             f"Hovering succeeds from {hovering['success']:.0%} of the starts: start farther away, or use a smaller "
@@ -108,6 +109,7 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
                 f"The demonstration succeeds, but loses {-gains[lost]:.3g} by the term {lost!r} against hovering: "
                 f"is its sign right, and is it small enough?"
             )
+    # Crashing early must not pay.
     if crashing["crashed"] > 0.5 > hovering["crashed"] and crashing["reward"] > hovering["reward"]:
         terms, others = terms_of(crashing), terms_of(hovering)
         term = max(terms, key=lambda name: terms[name] - others[name])
@@ -116,6 +118,7 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
             f"{hovering['length']:.1f} s {hovering['reward']:.3g}, mostly by the term {term!r} ({terms[term]:.3g} and "
             f"{others[term]:.3g}): a policy learns to crash. Is the term's sign right, and does failing cost enough?"
         )
+    # Every term must distinguish the flights.
     for name in terms_of(hovering):
         rates = [terms_of(flown)[name] / flown["length"] for flown in metrics.values()]
         if max(rates) - min(rates) <= 1e-3 * max(map(abs, rates)) and max(map(abs, rates)) > 0:

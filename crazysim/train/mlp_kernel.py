@@ -244,10 +244,12 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
         memory += [(f"u16* rows{i}", 2 * 16 * n_warps * (padded_sizes[i] + 8)) for i in layers]
         memory += [(f"u16* below{i}", 2 * 16 * n_warps * (padded_sizes[i + 1] + 8)) for i in layers]
     offsets = list(itertools.accumulate((size for _, size in memory), initial=0))
+    # Each block of threads loads the weights once.
     setup = ["int n = *count;", f"x += (size_t)blockIdx.y * n * {sizes[0]};"]
     setup += [
         f"{name} = ({name.split()[0]})(memory + {offset});" for (name, _), offset in zip(memory, offsets, strict=False)
     ]
+    # Outputs of the hidden layers.
     body = [f"u32 a0[{padded_sizes[0] // 16}][4]; load_rows<{padded_sizes[0]}>(a0, x, row, n, {sizes[0]}, 1.0f);"]
     for i in layers:
         shape, k, n = f"{padded_sizes[i]}, {padded_sizes[i + 1]}", sizes[i], sizes[i + 1]
@@ -257,6 +259,7 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
             body += [
                 f"u32 a{i + 1}[{padded_sizes[i + 1] // 16}][4]; apply_hidden<{shape}>(a{i + 1}, a{i}, w{i}, b{i});"
             ]
+    # Gradient: back through the layers, and sums over the rows.
     epilogue, (inner, outer), width, last = [], padded_sizes[-2:], sizes[-1], layers[-1]
     if is_gradient:
         n_weights = sum((k + 1) * n for k, n in itertools.pairwise(sizes))
@@ -276,6 +279,7 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
         setup += [f"out += (size_t)blockIdx.y * n * {width};"]
         body += [f"float c[{outer // 8}][4]; apply_layer<{inner}, {outer}>(c, a{last}, w{last}, b{last});"]
         body += [f"write_rows<{outer}>(out, c, row, n, {width});"]
+    # The kernel around these lines.
     names = ["const int* count", "const float* x"]
     names += ["const float* scale", "const float* cotangent"] if is_gradient else []
     names += [f"const float* {name}{i}" for i in layers for name in ("weight", "bias")] + ["float* out"]

@@ -203,6 +203,7 @@ def make_variants(
             values,
             f"Use [{values!r}], for example.",
         )
+    # An endless iterable is cut, so that its length is an error.
     values_by_name: dict[str, list[Any]] = {
         name: list(itertools.islice(values, MAX_TRAININGS + 1)) for name, values in {"seeds": seeds, **sweep}.items()
     }
@@ -222,6 +223,7 @@ def make_variants(
             f"counters depend. Train its values one after another, with --config {name}=VALUE and --out.",
         )
         require(name not in config, f"expected {name} to be swept or given, got both. Leave it out of the config.")
+    # Every combination of values with every seed.
     names = list(sweep)
     return {
         "-".join([*(f"{name}-{value}" for name, value in zip(names, values, strict=True)), f"seed-{seed}"]): (

@@ -274,8 +274,10 @@ class Trajectory(PyTree):
             is_number and 0 <= transition <= MAX_SIZE,
             f"expected a transition from 0 to {MAX_SIZE:g} s, got {transition!r}. Use for example 1.0.",
         )
+        # A piece of degree 7 joins the derivatives at both ends.
         if transition > 0:
             before, after = self._end_derivatives(at_end=True), other._end_derivatives(at_end=False)
+            # The yaw turns the shorter way.
             yaw_shift = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
             after[0, 3] += yaw_shift
             lengths = np.array([transition], float)
@@ -286,6 +288,7 @@ class Trajectory(PyTree):
                 coefficients.dtype
             )
             return self.then(piece).then(other.replace(coefficients=shifted_coefficients))
+        # Both with the same degree, in one record.
         degree = max(self.degree, other.degree)
         first, second = self.padded(0, degree), other.padded(0, degree)
         xp = _array_module([first, second])

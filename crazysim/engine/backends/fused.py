@@ -202,6 +202,7 @@ def _parts(program: Program) -> list[Program]:
 
 def _run_parts(program: Program, location: Location) -> CountedRun:
     parts = _parts(program)
+    # Compilers run in parallel.
     with native.compiling_threads() as pool:
         kernels = list(pool.map(lambda part: Kernels(part, location) if part.fused else None, parts))
     runs = [None if x is None else partial(_call_kernel, x) for x in kernels]
@@ -220,6 +221,7 @@ def _run_parts(program: Program, location: Location) -> CountedRun:
     def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
         one_step = jnp.asarray(1, jnp.int32)
         leaves = run_phase("before", leaves, one_step)
+        # A single kernel loops over steps itself; several parts share a loop.
         if [part.fused for part, _ in runs_by_phase["each"]] == [True]:
             leaves = run_phase("each", leaves, count)
         elif runs_by_phase["each"]:

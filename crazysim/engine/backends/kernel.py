@@ -74,6 +74,7 @@ class KernelBody:
         deferred_slots = set() if exchange.depth else _deferred_slots(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
         shared_slots = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
+        # Numbers that all lanes share.
         for slot in shared_slots:
             if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
@@ -85,6 +86,7 @@ class KernelBody:
                 )
         self._n_shared_lines = len(writer.lines)
         exchange.open_loop(writer, 1)
+        # Numbers of each lane: its rows, then their entries.
         lane_slots = [
             slot for slot in slots if slot not in shared_slots and (slot not in written_slots or slot in loaded_slots)
         ]
@@ -105,6 +107,7 @@ class KernelBody:
                 names[slot] = load
             else:
                 names[slot] = exchange.define_constant(writer, names[slot], ctype, load, self._depth)
+        # Stages before the steps, and what no step changes.
         self._write_phase("before")
         hoisted = [self._write_hoisted(segment) for segment in self.step_segments]
         exchange.close_loop(writer, 1)

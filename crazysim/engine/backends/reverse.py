@@ -69,6 +69,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     """
     program, perturbed = prepare_derivative(program, perturbed)
     n_leaves = len(program.leaves)
+    # Leaves for the cotangents of leaves and of hoisted numbers.
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
@@ -76,6 +77,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         for s in step_segments
     ]
     extended_program = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
+    # Transposed segments of stages, then of hoisted operations.
     changed, hoisted_indices = changed_slots(program, perturbed)
     backward_segments = {}
     for s in program.fused_segments:
@@ -88,6 +90,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         for k, s in enumerate(step_segments)
         if hoisted_indices[s]
     }
+    # Numbers that steps change, and those that the way back reads.
     used_by_steps = {slot for s in step_segments for slot in program.drone_slots(s, [*s.reads, *s.writes])}
     changing = program.changing_slots()
     if len(step_segments) == 1 and step_segments[0].scope == "drone":
@@ -233,6 +236,7 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
             return type_name(s.hoisted.outputs[slot[1]].dtype)
         return type_name(program.leaves[slot[0]].number_type)
 
+    # Cotangents: given ones of the seeds, else zeros.
     for i in reverse.seeds:
         writer.write_line(
             kernel.rows_line(f"s{rank[i]}", type_name(program.leaves[i].number_type), program.leaves[i].size), 1
@@ -266,6 +270,7 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
     writer.write_line("if (visit < n_intervals) {", 2)
     write_states("interval + part", carry, 3)
     writer.write_line("}", 2)
+    # Forward: steps of an interval, whose states are stored.
     writer.write_line("for (int step = 0; step < n_part_steps; ++step) {", 2)
     write_states("step", reverse.restored, 3)
     if not last_segments:  # without stages after the steps, the result of the last step is not needed
@@ -274,6 +279,7 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
         kernel.write_segment(writer, program, segment, names, segment_constants, 3)
     writer.write_line("}", 2)
     writer.write_line("if (!is_backward) continue;", 2)
+    # Backward: stages after the steps, then the steps.
     if last_segments:
         writer.write_line("if (part == n_intervals - 1) {", 2)
         _write_backward(kernel_body, reverse, last_segments, [()] * len(last_segments), dict(names), 3)
@@ -287,10 +293,12 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
         writer.write_line(f"const auto {names_before[slot]} = LOAD_STATE({ctype}, step, {k});", 3)
     _write_backward(kernel_body, reverse, step_segments, constants, names_before, 3)
     writer.write_line("}", 2)
+    # State before the previous interval.
     writer.write_line("const int previous_state = interval + (part > 0 ? part - 1 : 0);", 2)
     for k, (slot, ctype) in enumerate(zip(carry, types, strict=True)):
         writer.write_line(f"{names[slot]} = LOAD_STATE({ctype}, previous_state, {k});", 2)
     writer.write_line("}", 1)
+    # Backward: hoisted numbers, and stages before the steps.
     for s in step_segments:
         if s in reverse.backward_hoisted_segments:
             kernel.write_segment(writer, program, reverse.backward_hoisted_segments[s], names, (), 1)
@@ -298,6 +306,7 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
         _write_backward(
             kernel_body, reverse, first_segments, [()] * len(first_segments), names | kernel_body.initial_values, 1
         )
+    # Pointers to inputs, and the results.
     pointers = [f"const {type_name(program.leaves[i].number_type)}* __restrict__ "
                 f"p{rank[i]}"
                 for i in kernel.needed_leaves(program)]  # fmt: skip

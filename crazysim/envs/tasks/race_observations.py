@@ -45,6 +45,7 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     gates_pos, gates_quat, poles = (
         jnp.broadcast_to(x, (n_drones, *x.shape)) for x in (*gates_of(data), obstacles_of(data))
     )
+    # Exact poses of what was in range of the sensor, nominal poses of the rest.
     visited_gates, visited_obstacles = visited_objects(data, sensor_range)
     n_gates, n_obstacles = visited_gates.shape[-1], visited_obstacles.shape[-1]
     nominal_pos, nominal_quat = record.nominal_pos, record.nominal_quat
@@ -57,12 +58,14 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     def to_body_frame(vector: Array) -> Array:
         return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], vector)
 
+    # Corners of the next two gates, body frame.
     corners = []
     for k in (0, 1):
         index = jnp.minimum(record.passed + k, n_gates - 1)
         pos, quat = pick_entry(gates_pos, index)[..., None, :], pick_entry(gates_quat, index)[..., None, :]
         gate_corners = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
         corners.append(to_body_frame(gate_corners - s.pos[..., None, :]))
+    # Horizontal vectors to the nearest poles.
     to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
     square_distance = jnp.sum(to_poles * to_poles, axis=-1)
     obs = {

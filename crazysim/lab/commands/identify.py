@@ -93,6 +93,7 @@ def run(options: argparse.Namespace) -> None:
         f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
         "Leave --network out, or use --dynamics first_principles with logs of rotor speeds.",
     )
+    # Logs, and what was repaired in them.
     columns = _read_columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
     require(
@@ -114,6 +115,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"{log.name}: {repair}")
     logs, held_out = all_logs[: len(options.logs)], all_logs[len(options.logs) :]
     source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
+    # Models of attitude commands.
     if options.dynamics != "first_principles":
         fitted, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
         models = {"identified": FittedModel.create(fitted, options.dynamics)}
@@ -123,6 +125,7 @@ def run(options: argparse.Namespace) -> None:
         _report_errors(options, logs, held_out, models)
         _write_file(options.out, text)
         return
+    # First principles, from rotor speeds.
     result = identify(logs, options.airframe, mass=options.mass)
     print("\n".join(result.describe()))
     logs = [aligned(log, result.delays[log.name]) for log in logs]

@@ -67,6 +67,7 @@ def run(options: argparse.Namespace) -> None:
     from crazysim.lab.live.policy_pilot import typed_lines
     from crazysim.sim.sim import Sim
 
+    # Viewers, and who commands the drones.
     viewers = [name for name in ("window", "browser") if getattr(options, name)]
     if options.headless and viewers:
         raise ConfigError(f"expected --headless or --{viewers[0]}, got both. Leave one out.")
@@ -83,6 +84,7 @@ def run(options: argparse.Namespace) -> None:
         not options.commands or not is_piloted,
         "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad.",
     )
+    # Simulation of a policy's task, or with state commands.
     policy_pilot, n_worlds = _policy_pilot(options), options.worlds
     if policy_pilot is None:
         control_freq = 100 if options.control_freq is None else options.control_freq
@@ -93,6 +95,7 @@ def run(options: argparse.Namespace) -> None:
         sim, control_freq = policy_pilot.env.sim, policy_pilot.env.base.freq
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, options.fps))
+        # Commands of a policy, a client or the demonstration.
         if policy_pilot is not None:
             policy_pilot.add_to(live)
             policy_pilot.listen(live, typed_lines())
@@ -102,11 +105,13 @@ def run(options: argparse.Namespace) -> None:
             live.add(RemoteCommands(fleet, stack.enter_context(CommandServer())), name="commands")
         else:
             live.add(Circles(live, is_piloted), name="circles")
+        # A pilot moves the setpoint of one drone.
         if is_piloted:
             sticks: list[Sticks] = [keyboard_sticks, *([Gamepad()] if options.gamepad else [])]
             pilot = Pilot(sticks)
             live.add(pilot, name="pilot")
             live.on_click = pilot.go_to
+        # Viewers and recording.
         for viewer in viewers:
             if viewer == "browser":
                 browser = live.show(Browser(options.port, options.host, contacts=n_worlds == 1))

@@ -114,6 +114,7 @@ def _source_lines(meta: Mapping[str, Any], level: Control, airframe: Airframe, f
 static bool policy_command(const float pos[3], const float quat[4], const float vel[3], const float ang_vel[3],
                            const float goal[3], float command[{len(actions["centre"])}])
 {{"""
+    # Observations in alphabetical order.
     if "rot" in names:
         yield """    const float x = quat[0], y = quat[1], z = quat[2], w = quat[3];
     const float rot[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -131,10 +132,12 @@ static bool policy_command(const float pos[3], const float quat[4], const float 
     yield "        if (!isfinite(observation[i])) return false;"
     yield f"    float action[{len(actions['centre'])}];"
     yield "    policy(observation, action);"
+    # Command from the action.
     for i, (centre, scale) in enumerate(zip(actions["centre"], actions["scale"], strict=True)):
         yield f"    command[{i}] = {float_literal(centre)} + {float_literal(scale)} * action[{i}];"
     yield "    return true;"
     yield "}"
+    # Functions that the firmware calls.
     if level == Control.rotor_vel:
         yield CFIRMWARE_SOURCE
     yield OUT_OF_TREE_SOURCE.format(

@@ -122,12 +122,14 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         nodes.append(helper.make_node(operator, inputs, [output], **attributes))
         return output
 
+    # Normalised observations, clipped, with zeros for NaN.
     add_node("Div", [add_node("Sub", ["observation", "mean"], "centred"), "std"], "scaled")
     add_node("Clip", ["scaled", "low", "high"], "clipped")
     x = add_node("Where", [add_node("IsNaN", ["scaled"], "is_nan"), "zero", "clipped"], "x")
     if numbers.images:
         x = _add_convolutions(add_node, constants, numbers, x)
     if numbers.n_memory:
+        # Gated recurrent unit.
         constants["one"] = np.float32(1.0)
         for gate, (inputs, recurrent, bias) in zip(GRU_GATES, numbers.gru, strict=True):
             constants |= {f"{gate}_inputs": inputs, f"{gate}_recurrent": recurrent, f"{gate}_bias": bias}
@@ -144,6 +146,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         add_node("Mul", [add_node("Sub", ["one", "update"], "share"), "candidate"], "written")
         add_node("Add", ["kept", "written"], "next_memory")
         x = add_node("Concat", [x, "next_memory"], "features", axis=1)
+    # Perceptron, with tanh after each layer.
     for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
         is_last = i == len(numbers.layers) - 1
@@ -155,6 +158,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     def value_infos(sizes: Mapping[str, int]) -> list[Any]:
         return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n]) for name, n in sizes.items() if n]
 
+    # File with metadata for programs that load it.
     graph = helper.make_graph(
         nodes,
         "policy",
@@ -240,6 +244,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         "#include <math.h>",
         "",
     ]
+    # Weights.
     constants = {"mean": numbers.mean, "std": numbers.std}
     for i, layers in enumerate(numbers.convolutions):
         for k, (weight, bias) in enumerate(layers):
@@ -251,6 +256,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     for constant, x in constants.items():
         lines.append(f"static const float {name}_{constant}{''.join(f'[{n}]' for n in x.shape)} = {_array_literal(x)};")
     lines.append("")
+    # Memory, and the function that resets it.
     if n_memory:
         lines += [
             "/* Memory of one drone between steps. */",
@@ -261,6 +267,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
             f"{{ for (int i = 0; i < {n_memory}; ++i) state->memory[i] = 0.0f; }}",
             "",
         ]
+    # The policy.
     state = f"{name}_state *state, " if n_memory else ""
     lines.append(f"static inline void {name}({state}const float observation[{n_obs}], float action[{n_actions}])")
     lines += ["{", *(f"    {line}" for line in _body_lines(name, numbers)), "}", "", f"#endif /* {guard} */", ""]
@@ -330,6 +337,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
     n_inputs, n_memory, limit = numbers.n_inputs, numbers.n_memory, float_literal(CLIP)
     yield f"float x0[{n_inputs + n_memory}];"
     offset = 0
+    # Normalised observations, then features of images.
     for indices in numbers.vector_ranges:
         yield f"for (int i = {indices.start}; i < {indices.stop}; ++i) {{"
         yield f"    const float x = (observation[i] - {name}_mean[i]) / {name}_std[i];"
@@ -341,6 +349,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
         yield from _convolution_lines(name, i, image, layers, offset)
         offset += math.prod(list(image.shapes([len(bias) for _, bias in layers]))[-1])
     if n_memory:
+        # Gated recurrent unit.
         yield f"for (int j = 0; j < {n_memory}; ++j) {{"
         for gate in GRU_GATES:
             yield f"    float {gate} = {name}_{gate}_bias[j], {gate}_memory = 0.0f;"
@@ -353,6 +362,7 @@ def _body_lines(name: str, numbers: PolicyNumbers) -> Iterator[str]:
         yield f"    x0[{n_inputs} + j] = update * state->memory[j] + (1.0f - update) * candidate;"
         yield "}"
         yield f"for (int j = 0; j < {n_memory}; ++j) state->memory[j] = x0[{n_inputs} + j];"
+    # Perceptron.
     for k, (weight, _) in enumerate(numbers.layers):
         n_in, n_out = weight.shape
         output = "action" if k == len(numbers.layers) - 1 else f"x{k + 1}"

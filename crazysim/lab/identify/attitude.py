@@ -117,6 +117,7 @@ def identify_attitude(
     base_mass = float(base.value("rigid_body.mass"))
     flight_mass = base_mass if mass is None else float(mass)
     check_turning(logs)
+    # Translation and rotation, with standard deviations.
     data = [derivatives_svf(preprocessing(_to_crazyflow_columns(log))) for log in logs]
     force, force_influences = fit_translation(dynamics, flight_mass, data)
     rotation_params, influences = fit_rotation(data)
@@ -124,6 +125,7 @@ def identify_attitude(
     tilt, yaw = (
         _deviations(np.array([x[2 * k] for x in rotation_params.values()]), influences[:, k], logs) for k in (0, 1)
     )
+    # Table of the model.
     table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
     if "thrust_dyn_coef" in force:
         table["thrust_dyn_coef"] = force["thrust_dyn_coef"]
@@ -131,6 +133,7 @@ def identify_attitude(
         table["drag_coefficients"] = [force["drag_xy_coef"], force["drag_xy_coef"], force["drag_z_coef"]]
     table |= {name: x.tolist() for name, x in rotation_params.items()}
     tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
+    # Text of the file.
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
     if flight_mass != base_mass:
         tables["rigid_body"] = {"mass": flight_mass}

@@ -53,6 +53,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             "Convert the log with blackbox_decode or the Blackbox Explorer."
         )
     start, names, settings = header
+    # Columns and units in the header.
     units = {}
     for name in names:
         key, _, unit_text = name.partition(" (")
@@ -66,6 +67,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
     ]
     n_rotors = sum(key.startswith("motor[") for key in keys)
+    # Columns that a flight needs.
     required_names = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
     if "imuQuaternion[0]" in keys:
         required_names += ["imuQuaternion[1]", "imuQuaternion[2]"]
@@ -75,6 +77,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
             "Log these fields in Betaflight."
         )
+    # Rows of numbers.
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [*file][start + 1 :]
     text_rows = split_rows(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
@@ -89,6 +92,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         2 <= poles < math.inf,
         f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.",
     )
+    # Columns in the units of crazysim's logs.
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(units["time"], 1e-6)}
     table |= {f"w{axis}": gyro_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
     table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}

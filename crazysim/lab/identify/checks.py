@@ -229,6 +229,7 @@ def _propose_remedies(
     def scale_columns(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
 
+    # Units of position and velocity.
     for (unit, x), (speed_unit, y) in product(LENGTH_UNITS.items(), repeat=2):
         if "vel" in derived_keys and x != y:
             continue
@@ -241,11 +242,13 @@ def _propose_remedies(
             remedy_text = f"Position and velocity seem to be in {unit} and {speed_unit}/s: give {factors}"
         if (x, y) != (1, 1):
             yield remedy_text, scale_columns(pos=x, vel=y)
+    # Unit of the angular velocity.
     degrees = math.pi / 180
     yield (
         f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
         scale_columns(ang_vel=degrees),
     )
+    # Signs of the angles, or order and sense of the quaternions.
     if "quat" in derived_keys:
         angles = np.asarray(rotation.to_rpy(jnp.asarray(data["quat"])))
         for signs, x in product(product((1, -1), repeat=3), (1.0, degrees)):
@@ -272,6 +275,7 @@ def _propose_remedies(
             "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw",
             {**data, "quat": xyzw_quat * np.array(inverse)},
         )
+    # Axes that point down.
     down_axes = (1, -1, -1)
     yield (
         "z seems to point down, in world and body: give the signs pos=x,-y,-z vel=vx,-vy,-vz quat=qx,-qy,-qz,qw "
@@ -282,6 +286,7 @@ def _propose_remedies(
         "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz",
         scale_columns(pos=(1, 1, -1), vel=(1, 1, -1)),
     )
+    # Order and signs of the axes of one quantity.
     for key, noun, factor, factor_advice in (
         ("vel", "velocity", 1.0, ""),
         ("ang_vel", "angular velocity", 1.0, ""),

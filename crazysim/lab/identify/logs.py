@@ -100,6 +100,7 @@ def read_log(
             "Name the columns in a Columns.",
         )
         columns = KNOWN_COLUMNS[columns]
+    # Columns of the log and of motion capture.
     name, table = read_table(path, repairs, columns)
     if motion is not None:
         _, motion_table = read_table(motion, repairs, columns)
@@ -118,6 +119,7 @@ def read_log(
             "Name them, as in --columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the "
             "flight (--motion)."
         )
+    # Columns in SI units.
     factors = {
         "pos": columns.metres_per_unit,
         "vel": columns.speed_per_unit,
@@ -133,6 +135,7 @@ def read_log(
             data[key] = stack_columns(name, table, (columns.time, *names))[:, 1:] * factors.get(key, 1.0)
     if "attitude_command" in data:
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
+    # Samples of the interval, without missing values.
     t = stack_columns(name, table, [columns.time])[:, 0]
     is_kept = increasing_samples(name, t, repairs)
     elapsed = t - t[is_kept][0]
@@ -143,6 +146,7 @@ def read_log(
             f"{np.sum(is_kept)} of a log of {elapsed[np.isfinite(elapsed)].max():.3g} s. Give other times."
         )
     t, data = interpolate_missing(name, t[is_kept], {key: x[is_kept] for key, x in data.items()}, repairs)
+    # Only samples in the air.
     thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
     if thrust is None and "attitude_command" in data:
         thrust = data["attitude_command"][:, 3]
@@ -153,6 +157,7 @@ def read_log(
         data["rotor_vel"] = remove_spikes(name, data["rotor_vel"], repairs)
     else:
         data["rotor_vel"] = np.zeros((len(t), 0))
+    # Velocities that the log lacks.
     derived_keys = tuple(key for key in ("vel", "ang_vel") if key not in data)
     if "vel" in derived_keys:
         data["vel"] = motion_module.fit_velocity(t, data["pos"])

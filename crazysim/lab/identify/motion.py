@@ -50,6 +50,7 @@ def join_motion_capture(
     t, motion_time = (np.asarray(x[time], np.float64) for x in (table, motion))
     motion_rates = body_rates(motion_time, stack_columns(name, motion, columns.quat))
     n_smoothing = round(DERIVATIVE_DURATION / LAG_STEP)
+    # Size of the angular velocity on both clocks.
     series = []
     for times, rates in ((t, ang_vel), ((motion_time[1:] + motion_time[:-1]) / 2, motion_rates)):
         is_valid = np.isfinite(times) & np.all(np.isfinite(rates), axis=-1)
@@ -63,6 +64,7 @@ def join_motion_capture(
         grid = np.arange(times[is_valid].min(), times[is_valid].max(), LAG_STEP)
         speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(n_smoothing) / n_smoothing, "same")))
+    # Shift at which both agree best.
     (log_start, a), (motion_start, b) = series
     lag, agreement = _find_lag(a, b)
     if agreement < 0.7:
@@ -73,6 +75,7 @@ def join_motion_capture(
         )
     shift = log_start - motion_start + lag * LAG_STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
+    # Both on the clock of the log.
     streams = {
         "the log": Stream(t, _number_columns(table, len(t), (time,))),
         "motion capture": Stream(motion_time + shift, _number_columns(motion, len(motion_time), (time, *table))),

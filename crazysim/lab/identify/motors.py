@@ -51,6 +51,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
         return log
     if "battery.thrust_over_voltage" not in airframe.values:
         return log
+    # Commands from 0 to 1.
     is_valid = (command >= 0) & (command <= 1)
     require(
         np.sum(~is_valid) <= MAX_REPAIRED_SHARE * is_valid.size,
@@ -58,17 +59,20 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
         f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535.",
     )
     command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, is_valid.T, strict=True)], axis=-1)
+    # Thrust from the smoothed voltage at each motor.
     half_window = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
     window = np.hanning(2 * half_window + 3)[1:-1]
     volts = np.convolve(np.pad(voltage, half_window, mode="edge"), window / window.sum(), "valid")[:, None] * command
     thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
     total_thrust = thrust.sum(axis=1)
+    # Motors differ: each gets the same mean thrust.
     mean_thrusts = thrust[total_thrust > np.median(total_thrust) / 2].mean(axis=0)
     commanded = np.asarray(airframe.rotor_vel(thrust * mean_thrusts.mean() / mean_thrusts), np.float64)
     repairs = [*log.repairs, "modelled the rotor speeds from commands and voltage"]
     if not np.all(is_valid):
         repairs.append(f"interpolated {np.sum(~is_valid)} commands that were not from 0 to 1")
     speeds = _lagged_speeds(commanded, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
+    # Only samples in the air, away from the ground.
     flying_indices, margin = (
         np.flatnonzero(total_thrust > 0.75 * np.median(total_thrust)),
         round(GROUND_MARGIN / log.dt),
@@ -165,6 +169,7 @@ def _fit_rate(command: NDArray, speed: NDArray, dt: float, n_taps: int) -> _Rate
         columns = [response[np.minimum(inner - delay - tap, n - 1)] for tap in range(n_taps)]
         return np.concatenate([*columns, np.ones((len(inner), 1))], axis=1)
 
+    # Rates and delays on a grid, refined around the best.
     rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), range(-n_delays, n_delays + 1)
     rate, delay = 0.0, 0
     for _ in range(6):
@@ -179,6 +184,7 @@ def _fit_rate(command: NDArray, speed: NDArray, dt: float, n_taps: int) -> _Rate
         rates, delays = np.geomspace(rate / ratio, rate * ratio, 7), range(delay - 1, delay + 2)
     if not 1.05 * MIN_RATE < rate < MAX_RATE / 1.05:
         return _RateFit(np.nan, np.zeros(0))
+    # Influence of each sample, linearised about the best rate.
     lower, middle, upper = (
         regressors(x, delay)
         for x in np.moveaxis(lag_signal(terms[:, None], dt, rate * np.array([[0.99], [1.0], [1.01]])), 1, 0)

@@ -65,6 +65,7 @@ def fit_residual(
         f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
         f"and {batch_size}. Leave them out for the defaults.",
     )
+    # Windows, and scales of inputs and outputs.
     windows, dt, params = cut_windows(logs, WINDOW_DURATION, WINDOW_STRIDE), logs[0].dt, model.params
     validation_windows = cut_windows(validation, WINDOW_DURATION, 4 * WINDOW_STRIDE) if validation else None
     inputs = jax.vmap(lambda q, v, w, r: residual_inputs(q, v, w, r, params))(
@@ -102,6 +103,7 @@ def fit_residual(
         updates, state = optimizer.update(grads, state, weights)
         return optax.apply_updates(weights, updates), state
 
+    # Linear terms and outputs are zero at first.
     key = jax.random.key(seed)
     n_inputs = inputs.shape[-1]
     weights = {
@@ -110,6 +112,7 @@ def fit_residual(
         "output": jnp.zeros((6, n_hidden)),
     }
     state, validation_loss_fn = optimizer.init(weights), jax.jit(loss)
+    # The weights that predict the validation logs best are kept.
     best_weights, least_loss = weights, np.inf
     for k in range(iterations):
         weights, state = update(weights, state, jax.random.fold_in(key, k))

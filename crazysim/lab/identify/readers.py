@@ -54,6 +54,7 @@ def resample(
         {*map(unsigned_name, columns.pos), *quat, *angles},
         set(map(unsigned_name, columns.voltage)),
     )
+    # Sorted streams, without slow ones.
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
@@ -70,6 +71,7 @@ def resample(
             require(not required_columns & set(values), f"{name}: expected {requirement}. Log it faster.")
             repairs.append(f"left out a slow stream: expected {requirement}")
             continue
+        # Attitudes and angles without jumps, which would be interpolated.
         if quat and all(c in values for c in quat):
             continuous_quat = align_signs(np.stack([values[c] for c in quat], axis=-1))
             values |= dict(zip(quat, continuous_quat.T, strict=True))
@@ -80,6 +82,7 @@ def resample(
         raise ConfigError(
             f"{name}: expected messages every {PERIOD_RANGE[1]:g} s or more often, got none. Log them faster."
         )
+    # Times at which all streams have samples.
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
@@ -139,6 +142,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
         f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
         "firmware's tools/usdlog.",
     )
+    # A log that was cut off has no checksum.
     end = len(content) - 4
     if crc32(content[:end]) != struct.unpack_from("<I", content, end)[0]:
         repairs.append("the checksum does not match: read up to the last whole record")
@@ -151,6 +155,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
         ) from error
     record_header = struct.Struct("<HI" if version == 1 else "<HQ")
     seconds_per_tick = 1e-3 if version == 1 else 1e-6
+    # Records up to the first damaged one.
     rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in events}
     while offset + record_header.size <= end:
         event, time = record_header.unpack_from(content, offset)
@@ -162,6 +167,7 @@ def read_crazyflie(path: Path, repairs: list[str], columns: Columns | None = Non
         offset += record_header.size + events[event][2].size
     if offset < end and not repairs:
         repairs.append(f"left out {end - offset} bytes at the end that are not a record")
+    # One stream for each event.
     n_streams = Counter(variable for key, (_, variables, _) in events.items() if rows[key] for variable in variables)
     streams = {}
     for key, (name, variables, _) in events.items():

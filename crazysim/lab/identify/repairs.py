@@ -134,6 +134,7 @@ def interpolate_missing(
     """
     is_kept, lost_keys, columns = np.ones(len(t), bool), [], {}
     for key, x in data.items():
+        # Samples with finite numbers.
         is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
             is_valid &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > NORM_TOLERANCE
@@ -147,6 +148,7 @@ def interpolate_missing(
             x[is_valid] = normalise_quats(name, x[is_valid], repairs)
             if not np.all(is_valid):
                 x[is_valid] = align_signs(x[is_valid])
+        # Pauses that are too long to be filled.
         indices = np.flatnonzero(is_valid)
         pauses = np.flatnonzero((np.diff(indices) > 1) & (np.diff(t[indices]) > MAX_INTERPOLATION))
         is_known = np.zeros(len(t), bool)
@@ -156,6 +158,7 @@ def interpolate_missing(
         if not np.all(is_known):
             lost_keys.append(key)
             is_kept &= is_known
+        # Short pauses, filled linearly.
         n_filled = int(np.sum(is_known & ~is_valid))
         require(
             n_filled <= MAX_REPAIRED_SHARE * len(t),

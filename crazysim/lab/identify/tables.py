@@ -71,6 +71,7 @@ def _read_source(
         )
     if path.exists() and not path.is_dir():
         check_file(path)
+    # Bags, which may be folders.
     if is_bag(path) and path.exists():
         with wrap_read_errors(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
             return path.stem, read_bag(path, repairs, columns)
@@ -80,6 +81,7 @@ def _read_source(
         f"{path.name}: expected a blackbox log as .csv, got a raw log. Convert it with blackbox_decode, or export it "
         f"from the Blackbox Explorer.",
     )
+    # Files that are no logs, by their first bytes.
     with path.open("rb") as file:
         start = file.read(8)
     for first_bytes, (got, remedy) in OTHER_FORMATS.items():

@@ -135,6 +135,7 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
     )
     message_header, formats, ids, payloads = struct.Struct("<HB"), {}, {}, {}
     offset, n_skipped_bytes, n_dropouts = HEADER_SIZE, 0, 0
+    # Messages; after damaged bytes, from the next synchronisation on.
     while offset + message_header.size <= len(content):
         size, kind = message_header.unpack_from(content, offset)
         start, end = offset + message_header.size, offset + message_header.size + size
@@ -164,6 +165,7 @@ def _read_topics(path: Path, topics: Collection[str], repairs: list[str]) -> dic
         repairs.append(f"left out {n_skipped_bytes} damaged bytes")
     if n_dropouts:
         repairs.append(f"{n_dropouts} dropouts of the logger")
+    # Rows of each topic.
     tables: dict[str, Topic] = {}
     for name, key in ids.items():
         layout = np.dtype(_read_layout(path.name, formats, name))

@@ -71,6 +71,7 @@ class PictureSource:
         pos, quat = sim.scene.host_poses(sim.plugins.with_moved_objects(sim.data), worlds)
         drone_pos = np.asarray(data.states.pos, float)[worlds]
         lights, focus = np.clip(live.lights[worlds], 0.0, 1.0), self._find_focus(live, pos)
+        # Marks: lights, setpoints, contacts, the followed body.
         spheres = {"lights": light_spheres(drone_pos, lights)}
         state, goals = data.controls.state, live.goals
         if self._setpoints and (goals is not None or state is not None):
@@ -82,6 +83,7 @@ class PictureSource:
         is_followed = np.arange(len(worlds))[:, None] == (-1 if focus is None else focus.shown_index)
         mark_pos, radius = (np.zeros(3), MARK_RADIUS) if focus is None else (focus.pos, focus.radius)
         spheres["followed"] = _marks(np.tile(mark_pos, (len(worlds), 1, 1)), is_followed, FOLLOWED_COLOR, radius)
+        # Wind, and the values that are plotted.
         arrows = np.zeros((len(worlds), 0, 2, 3))
         if self._wind and _find_winds(data):
             wind = np.asarray(self._wind_fn(data), float)[worlds]

@@ -53,6 +53,7 @@ def fill_in_corridors(
         OutsideError: If fixed derivatives lead out of the corridor or beyond a height, or if the curve is still outside
             after ``MAX_ITERATIONS`` iterations.
     """
+    # Pieces about one unit of time long, which is better conditioned.
     time_unit = float(np.mean(durations))
     powers = time_unit ** np.arange(nodes.shape[1])[:, None]
     scaled_nodes, lengths = nodes * powers, durations / time_unit
@@ -65,6 +66,7 @@ def fill_in_corridors(
         def deviation(piece: np.ndarray, u: Floats, coefficients: Floats = coefficients) -> Deviations:
             return _deviation(coefficients[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
 
+        # Half-spaces where the curve is outside.
         piece, u = _find_maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
         offset, nearest, distance = deviation(piece, u)
         is_outside = distance > max_radii[piece]
@@ -78,6 +80,7 @@ def fill_in_corridors(
         piece, u, normal, bound = (np.concatenate(parts) for parts in zip(*half_spaces, strict=True))
         if not len(piece):
             return filled_nodes / powers
+        # The nearest curve inside all half-spaces so far.
         program.add_half_spaces(piece, u, normal, bound)
         filled_nodes = program.solve()
     raise OutsideError(

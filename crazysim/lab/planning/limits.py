@@ -211,6 +211,7 @@ def check(
     )
     limit_values = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
     peaks, closest = find_peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
+    # Limits of each drone.
     violations = []
     for name, peak in peaks.items():
         if name not in limit_values:
@@ -220,6 +221,7 @@ def check(
             violations.append(
                 Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
             )
+    # Distance of each pair.
     separation = limit_values.get("separation", 0.0)
     for pair in closest:
         if pair.distance < separation * (1 - LIMIT_TOLERANCE):

@@ -131,6 +131,7 @@ class SharedLoad(PointLoad):
         # The equations of ``link.couple_bodies``, for all links of a world at once.
         p, s, freq = data.params, data.states, data.core.freq
         m, n = self.mass, s.pos.shape[0]
+        # Accelerations along the links without tension.
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
         link = link_geometry(s, self.pos, self.vel, self.attach)
         q, radial_speed = link.direction, rotation.dot(link.direction, link.vel)
@@ -140,6 +141,7 @@ class SharedLoad(PointLoad):
         rhs = rotation.dot(q, rel_acc) + swing_factor / self.length * (
             rotation.dot(link.vel, link.vel) - radial_speed * radial_speed
         )
+        # Taut links, and the correction of their lengths.
         is_active = self.attached
         if dt is None:
             rhs = rhs + 2 * correction_rate(freq) * radial_speed
@@ -149,6 +151,7 @@ class SharedLoad(PointLoad):
             rhs = rhs + freq * (radial_speed - freq * gap)
         tension = _solve_tensions(_tension_matrix(pull, m, p.mass), rhs[:, 0], is_active, self.cable)[:, None]
 
+        # Effect of the tensions on drones and load.
         force = tension * q
         acc = m / p.mass * force
         tip_acc = gravity - jnp.sum(force, axis=0)
@@ -160,6 +163,7 @@ class SharedLoad(PointLoad):
             changes["ang_acc"] = deriv.ang_acc + ang_acc
             if dt is not None:
                 changes["ang_vel"] = deriv.ang_vel + dt * ang_acc
+        # The load moves back where links are too long.
         stretch = link.distance - self.length
         stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
         error = jnp.sum(jnp.where(self.attached[:, None], stretch * q, 0.0), axis=0) / n

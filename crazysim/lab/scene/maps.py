@@ -49,6 +49,7 @@ def map_spec(
         raise ConfigError(
             f"expected finite coordinates, got {n} of {len(points)} points that are not finite. Drop them."
         )
+    # Points in metres; errors propose a likely unit.
     points = to_world_frame(points, pos, quat, scale)
     remedy, work = "Use a larger resolution=.", "finding the voxels of triangles"
     if scale is None:
@@ -57,6 +58,7 @@ def map_spec(
             f" The map is {size} m large: if the file is in millimetres, pass scale=0.001, and in metres scale=1.0."
         )
         work += f" of a map of {size} m (scale=0.001 if the file is in millimetres)"
+    # Voxels of points, or of triangles.
     if triangles is None:
         _check_count("points", len(points), MAX_VOXELS, f"Use a part of the map. {remedy}")
         voxels = voxels_of_points(points, resolution, min_points)
@@ -71,6 +73,7 @@ def map_spec(
         _check_count(label, count_candidates(corners, resolution), max_voxels, remedy)
         with announce_if_slow(work, "up to 2 minutes for large meshes"):
             voxels = voxels_of_triangles(corners, resolution)
+    # Boxes that fill the same space.
     boxes = merge_voxels(voxels)
     require(
         len(boxes) <= MAX_BOXES,

@@ -121,6 +121,7 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
         vertex = read_ply(read_bytes(path, MAX_FILE_BYTES))["vertex"]
     if "packed_position" in vertex:
         raise compressed
+    # Columns of splat files, whose quaternions begin with w.
     names = {
         "pos": ["x", "y", "z"],
         "quat": [f"rot_{k}" for k in (1, 2, 3, 0)],
@@ -141,10 +142,12 @@ def _read_gaussians(path: str | Path) -> dict[str, NDArray[np.float64]]:
         f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {n_rest} in {str(path)!r}. Save it again.",
     )
     require(n, f"expected Gaussian splats, got {str(path)!r}, which has none. Save it again.")
+    # Spherical harmonics, which files list by channel.
     rest = np.array([vertex[f"f_rest_{k}"] for k in range(n_rest)]).reshape(3, n_rest // 3, n)
     values["color"] = np.concatenate([values["color"][:, None], rest.transpose(2, 1, 0)], axis=1)
     values["logit_opacity"] = values["logit_opacity"][:, 0]
     values = {field: np.asarray(x, np.float64) for field, x in values.items()}
+    # Finite numbers, and quaternions that can be normalised.
     is_invalid = ~np.logical_and.reduce([np.isfinite(x).reshape(n, -1).all(axis=1) for x in values.values()])
     is_invalid |= ~values["quat"].any(axis=1)
     if is_invalid.any():

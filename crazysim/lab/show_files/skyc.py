@@ -69,6 +69,7 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
     )
     if not drones:
         checks.raise_error("at least one drone", "none", swarm_location)
+    # Trajectories of all drones, then their lights.
     parsed_drones = []
     for i, drone in enumerate(drones):
         parsed_drones.append(_parse_drone(archive, drone, f"{swarm_location}, drone {i}", i))
@@ -81,6 +82,7 @@ def parse_show(content: bytes, location: str = "a show") -> Show:
             _decode_lights(archive, drone, duration, MAX_LOOPED_COMMANDS // len(parsed_drones), decoded_programs)
         )
         _check_piece_count(len(parsed_drones) * len(lights[-1].times), f"{drone['location']}, lights")
+    # Names and environment.
     names = [drone["name"] for drone in parsed_drones]
     if len(set(names)) < len(names):
         checks.raise_error("different names of the drones", f"{short_repr(sorted(names))}", swarm_location)
@@ -253,6 +255,7 @@ def save_show(show: Show, path: str | Path) -> None:
         f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.",
     )
     files: dict[str, Any] = {}
+    # Files of each drone.
     drones = []
     for i, name in enumerate(show.names):
         folder = f"drones/drone_{i}"
@@ -272,6 +275,7 @@ def save_show(show: Show, path: str | Path) -> None:
         if show.parameters[i]:
             settings["parameters"] = [[x.time, x.name, x.value] for x in show.parameters[i]]
         drones.append({"type": "generic", "settings": settings})
+    # Files of the show.
     head = {
         "version": 1,
         "settings": {**show.settings, "cues": {"$ref": "./cues.json"}},

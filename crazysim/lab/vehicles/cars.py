@@ -183,6 +183,7 @@ class Cars(Population):
         index = start = arc = gains = memory = None
         control_freq = self.freq or default_rates(freq, {"freq": CONTROL_FREQ}, f" of {self.name!r}")["freq"]
         params = CarParams.create(vehicle, freq, self.trailer)
+        # Without a path, cars stand in a row.
         pos, yaw = starts.row_positions(self.n_members), np.zeros((self.n_members, 1))
         if paths is not None and controller is not None:
             controller.check(vehicle, paths)
@@ -195,12 +196,14 @@ class Cars(Population):
             start = np.broadcast_to(check_parameter(sim, "start", start, n_members=self.n_members), (*counts, 1))
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
             gains, memory = controller.gains(vehicle, params, control_freq), controller.memory()
+        # The user's positions take precedence.
         if self.pos is not None:
             check_parameter(sim, "pos", self.pos, (2,), n_members=self.n_members)
             pos = self.pos
         pos = np.broadcast_to(np.asarray(pos, float), (*counts, 2))
         if arc is not None and self.pos is not None:
             arc = starts.project_arcs(paths, index, pos, arc)
+        # Wheels stand on the ground.
         height, normal = ground_at(sim.data, device_array(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         start_poses = self.replace(pos=np.concatenate([pos, z], axis=-1), yaw=yaw if self.yaw is None else self.yaw)

@@ -76,6 +76,7 @@ def single_track(state: CarState, command: Array, params: CarParams, wrench: Arr
             for no external wrench. (..., 3)
     """
     p, vx, vy, w = params, state.body_vel[..., :1], state.body_vel[..., 1:], state.yaw_rate
+    # Forces of the tyres along and across their wheels.
     drive = drive_force(command[..., :1], vx, p)
     cos, sin = jnp.cos(state.steer), jnp.sin(state.steer)
     front_vy, rear_vy = vy + p.front * w, vy - p.rear * w
@@ -83,11 +84,13 @@ def single_track(state: CarState, command: Array, params: CarParams, wrench: Arr
     front = tyre_force(p.front_share * drive, wheel_vel, p.stiffness[..., :1], p.grip[..., :1], p.slip_speed)
     rear_vel = jnp.concatenate([vx, rear_vy], axis=-1)
     rear = tyre_force((1 - p.front_share) * drive, rear_vel, p.stiffness[..., 1:], p.grip[..., 1:], p.slip_speed)
+    # Sum of the forces, and torque about the centre of mass.
     front_side_force = sin * front[0] + cos * front[1]
     force_x, force_y = rear[0] + cos * front[0] - sin * front[1], rear[1] + front_side_force
     torque = p.front * front_side_force - p.rear * rear[1]
     if wrench is not None:
         force_x, force_y, torque = force_x + wrench[..., :1], force_y + wrench[..., 1:2], torque + wrench[..., 2:]
+    # The body's axes turn with the yaw rate.
     acc = jnp.concatenate([force_x / p.mass + vy * w, force_y / p.mass - vx * w], axis=-1)
     return state_rates(state, acc, torque / p.yaw_inertia, steer_rate(state, command, p), p)
 

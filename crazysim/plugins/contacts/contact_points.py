@@ -120,6 +120,7 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     """
     pos, quat = data.states.pos, data.states.quat
     dtype = pos.dtype
+    # Corners of the box, and its upper and lower plate.
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
     plate = Shape("box", (*box[3:5].tolist(), PLATE_HEIGHT_FRACTION * box[5]))
     plate_centres = [
@@ -136,18 +137,21 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
             if velocity_at is None
             else rotation.rotate_inverse(drone_quat, velocity_at(world_corners))
         )
+        # Corners that touch terrain.
         if geom.shape.kind == "hfield":
             gap, normal = _height_above_field(data, geom, world_corners, to_geom, to_world)
             normal = rotation.rotate_inverse(drone_quat, normal)
             points.append(
                 ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
             )
+        # Corners that touch flat faces.
         if geom.shape.kind in FLAT_KINDS:
             gap, pull_back = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), to_geom(world_corners, True))
             normal = rotation.rotate_inverse(drone_quat, to_world(pull_back(jnp.ones_like(gap))[0]))
             points.append(
                 ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, surface_vel)))
             )
+        # Points of the plates that are nearest to the object.
         if geom.shape.kind not in ("plane", "hfield"):
             points += [
                 _nearest_plate_point(data, geom, to_geom, plate, plate_centre, velocity_at)
@@ -246,6 +250,7 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
     dtype = data.states.pos.dtype
     pos = jnp.asarray(geom.pos, dtype)
     rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
+    # Pose and velocity of the object that carries the geom.
     object_pos = object_quat = vel = world_ang_vel = None
     if surface.population is not None:
         record = data.plugins[surface.population]

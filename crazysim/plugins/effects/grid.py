@@ -118,6 +118,7 @@ def load_wind_grid(path: str | Path) -> Grid:
     Raises:
         ConfigError: If the file cannot be read, a column is missing, or the points are not the nodes of a regular grid.
     """
+    # Columns of the file.
     header, *rows = read_text(path, MAX_FILE_BYTES).splitlines() or [""]
     names = [name.strip().strip('"') for name in header.split(",")]
     columns = [f"{kind}:{k}" for kind in ("Points", "U") for k in range(3)]
@@ -129,6 +130,7 @@ def load_wind_grid(path: str | Path) -> Grid:
         )
     if not any(map(str.strip, rows)):
         raise ConfigError(f"expected one row for each node of a grid in {str(path)!r}, got the names of columns only")
+    # Finite numbers in every row.
     try:
         table = np.loadtxt(rows, delimiter=",", usecols=[names.index(name) for name in columns], ndmin=2)
     except ValueError as error:
@@ -140,6 +142,7 @@ def load_wind_grid(path: str | Path) -> Grid:
             f"expected finite numbers in {str(path)!r}, got NaN, infinity or a number above {MAX_NUMBER:g}. "
             f"Fill the gaps."
         )
+    # Nodes of a regular grid.
     axes, indices = zip(*(_find_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))
     is_full = len(table) == math.prod(shape)  # checked before an array of that size is allocated
@@ -151,6 +154,7 @@ def load_wind_grid(path: str | Path) -> Grid:
             f"expected one row for each of the {' x '.join(map(str, shape))} nodes of a regular grid in {str(path)!r}, "
             f"got {len(table)} rows. Resample the flow to an image in ParaView before the export."
         )
+    # Equal distances along each axis.
     spacing = []
     for axis in axes:
         steps = np.diff(axis) if len(axis) > 1 else np.ones(1)

@@ -157,11 +157,13 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
         return 1.0 if self.drag is None else self.factors[..., FACTOR_SETTINGS.index("drag") :]
 
     def bind(self, sim: Simulation) -> Randomize:
+        # Wind needs drag; if it is optional, it is left out.
         has_wind = self.wind is not None
         if has_wind and "wind" in self.optional and not has_drag(sim):
             has_wind = False
         elif has_wind:
             require_drag(sim, "wind")
+        # Ranges of paths, and single numbers as ranges around one.
         settings = {_full_path(sim, path): x for path, x in (self.paths or {}).items()}
         ranges = {
             path: check_parameter(sim, f"paths[{path!r}]", _around_one(path, x), (2,), NOT_NEGATIVE)
@@ -180,6 +182,7 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
             air_vel=drone_array(sim, 0.0, 3) if has_wind else None,
             **({} if has_wind else {"wind": None}),
         )
+        # All ranges are (low, high).
         for name in RANGE_SETTINGS:
             values = settings[name] = getattr(self, name)
             ranges[name] = getattr(bound, name)

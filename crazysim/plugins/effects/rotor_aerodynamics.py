@@ -113,9 +113,11 @@ class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
 
     def influence(self, data: SimData) -> SimData:
         s, p = data.states, data.params
+        # Velocity of each hub through the air.
         vel = rotation.rotate_inverse(s.quat, s.vel - air_velocity(data))
         hub_vel = vel + rotation.cross(s.ang_vel, self.hub_pos)
         u, v, axial_vel = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
+        # Thrust in moving air, minus the thrust that the model already has.
         speed = RPM_TO_RAD_S * s.rotor_vel
         static_thrust = quadratic_curve(s.rotor_vel, p.rpm2thrust)
         blade, drag = drag_factor(data) * self.blade, drag_factor(data) * self.drag
@@ -135,9 +137,11 @@ class RotorAerodynamics(Plugin, replaces=("drag",), requires=needs_rotors):
         )
         thrust_change = jnp.where(blade > 0, thrust - jnp.where(static_thrust > 0, static_thrust, 0.0), 0.0)
 
+        # Drag and flapping moment of each rotor.
         drag_per_vel, moment_per_vel = drag * speed, self.flapping * speed
         forces = jnp.stack([-drag_per_vel * u, -drag_per_vel * v, thrust_change], axis=-1)
         moments = jnp.stack([moment_per_vel * v, -moment_per_vel * u, jnp.zeros_like(moment_per_vel)], axis=-1)
+        # The product with the drag matrix takes the airframe's linear drag back.
         force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)
         torque = jnp.sum(rotation.cross(self.hub_pos, forces) + moments, axis=-2)
         return data.replace(

@@ -159,6 +159,7 @@ def couple_bodies(
     link_ratio = m / mass
     if link_pull.lever is not None and link_pull.ang_acc is not None:
         link_ratio = m / mass + m * dot(link_pull.lever, link_pull.ang_acc)
+    # Tension along the link, without the hinge.
     swing_square = dot(geometry.vel, geometry.vel) - radial_speed * radial_speed
     rhs = dot(geometry.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * swing_square
     rhs = rhs + _radial_term(geometry, radial_speed, rhs, link, dt, freq)
@@ -176,6 +177,7 @@ def couple_bodies(
         tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
     if link.is_attached is not None:
         tensions = [jnp.where(link.is_attached, t, 0.0) for t in tensions]
+    # Damping of the swing.
     damping = None
     if link.damping is not None:  # damping acts against the swing across the link
         damping_rate, swing = _damping_rate(link, dt, freq), _swing_velocities(state, geometry)[1]
@@ -193,6 +195,7 @@ def couple_bodies(
     elif any(p.ang_acc is not None for p in pulls):
         angular_terms = [m * t * p.ang_acc for t, p in zip(tensions, pulls, strict=True) if p.ang_acc is not None]
         new_deriv = _add_torque(deriv, None, sum(angular_terms[1:], angular_terms[0]), dt)
+    # Accelerations of tip and body.
     tip_acc = free_acc - pull
     new_deriv = new_deriv.replace(acc=deriv.acc + mass_ratio * pull)
     new_deriv = new_deriv if dt is None else new_deriv.replace(vel=deriv.vel + dt * mass_ratio * pull)

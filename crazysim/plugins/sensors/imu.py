@@ -183,8 +183,10 @@ class IMU(Sensor):
 
     def measure(self, data: SimData, key: Array) -> tuple[Array, IMU]:
         sensor, s, freq, dt = self, data.states, data.core.freq, self.interval(data)
+        # Motion of the centre of mass in the last step.
         ang_vel = s.ang_vel
         acc, ang_acc = freq * (s.vel - self.vel), freq * (s.ang_vel - self.ang_vel)
+        # Unbalanced rotors shake the body.
         if self.phase is not None:
             speed = RPM_TO_RAD_S * s.rotor_vel
             phase = self.phase + dt * speed
@@ -195,6 +197,7 @@ class IMU(Sensor):
             ang_acc = ang_acc + rotation.matvec(p.J_inv, torque)
             ang_vel = ang_vel + rotation.matvec(p.J_inv, momentum)
             sensor = self.replace(phase=phase)
+        # Both quantities at the sensor, then their errors.
         force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, self.pos)
         truth = _to_sensor_frame(self.quat, ang_vel, force)
         noise = normal(key, (9, 2), truth.dtype)

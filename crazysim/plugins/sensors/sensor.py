@@ -136,6 +136,7 @@ class Sensor(Plugin):
 
     def first_samples(self, sim: Simulation) -> Samples:
         """Return ``samples`` before the first measurement; check the common settings."""
+        # Channels, and the chains of their errors.
         require(
             self.channels, f"expected channels of {type(self).__name__}, got none. Use channels = {{'pos': 3}}, say."
         )
@@ -152,6 +153,7 @@ class Sensor(Plugin):
                 f"Add {missing}: Param = param(default=0.1) or {missing}: Array = state() to {type(self).__name__}."
             )
             expect(missing is None, f"a number or a state in the chain of {name!r}", missing, remedy)
+        # Rows of the queue for the longest delay.
         freq = self.rate(sim.data.core.freq)
         k, shape, max_delay = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         n_rows = math.floor(max_delay * freq + 0.5) + 2 if max_delay > 0 else 0

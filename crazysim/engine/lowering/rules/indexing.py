@@ -206,6 +206,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
     # A window whose position is computed at run time is compared with every position that it may have. A window that is
     # partly outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
     x, indices, updates = args
+    # Axes of rows and of windows.
     dims, is_clipped = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
     window_axes = dims.update_window_dims
     row_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
@@ -216,6 +217,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
     limits = [x.shape[axis] - window_shape[axis] for axis in start_axes]
     window_updates = updates.transpose(*row_axes, *window_axes)
     out = x.copy()
+    # Each row updates its window at every position that it may have.
     for row in np.ndindex(indices.shape[:-1]):
         start, window_update = indices[row], window_updates[(*row, ...)]
         positions_by_axis = [_window_positions(i, limit, is_clipped) for i, limit in zip(start, limits, strict=True)]
@@ -226,6 +228,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Ele
         for positions in itertools.product(*positions_by_axis):
             for axis, k in zip(start_axes, positions, strict=True):
                 corner[axis] = k
+            # Indices that are traced are compared with this position.
             is_here = _conjunction(
                 ctx,
                 (

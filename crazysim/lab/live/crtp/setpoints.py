@@ -55,6 +55,7 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         struct.error: If the data have a wrong length.
     """
     kind, content = data[0], data[1:]
+    # Commands without a group of drones.
     if kind == 0:
         (commander.group,) = struct.unpack("<B", content)
         return
@@ -69,6 +70,7 @@ def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         )
         commander.upload(trajectory_id, trajectory, compressed=bool(encoding))
         return
+    # Commands to one group.
     if not commander.in_group(content[0]):
         return
     content = content[1:]

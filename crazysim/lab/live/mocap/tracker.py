@@ -206,12 +206,14 @@ class Tracker:
     def _update_bodies(self, frame: Frame, now: float) -> None:
         entries, rows = self._find_rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
+        # Invalid poses.
         norm = np.sqrt((quat * quat).sum(-1))
         is_valid = (np.abs(pos) < MAX_COORDINATE).all(-1) & (norm > 1e-3) & np.isfinite(norm)
         if not is_valid.all():
             for k in rows[~is_valid]:
                 self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")
             rows, pos, quat, norm = rows[is_valid], pos[is_valid], quat[is_valid], norm[is_valid]
+        # Jumps that are too fast to be motion.
         dt = now - self._stamps[rows]
         displacement = pos - self.pos[rows]
         was_seen = self.seen[rows] & np.isfinite(dt)
@@ -224,6 +226,7 @@ class Tracker:
         self._n_suspect_frames[rows[is_plausible]] = 0
         for k in rows[is_plausible & self._is_lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
+        # Poses and velocities of the others.
         rows, pos, quat, norm, dt, displacement = (
             rows[is_plausible],
             pos[is_plausible],

@@ -137,11 +137,13 @@ class SoftwareInTheLoop(Closeable):
     def _read_measurements(self) -> tuple[list[Measurements], NDArray]:
         states, time_now = self.sim.data.states, self._n_exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_flatten_drones(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
+        # Measured values, or true ones without a sensor.
         values, steps_taken = zip(*map(self._latest_values, SENSOR_KINDS), strict=True)
         imu, height, field, gps = values
         if field is None:
             field = rotate(quat * [-1, -1, -1, 1], MAGNETIC_FIELD)
         gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
+        # Sensors with a new sample since the last exchange.
         default_numbers: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING_TOLERANCE)}
         sample_numbers = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
         for k, kind in enumerate(SENSOR_KINDS):
