@@ -36,7 +36,7 @@ class AllocationParams(AirframeParams):
 
 
 def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
-    """Return the rotor speeds at which all rotors lift equal shares of the weight, rpm.
+    """Solve for the rotor speeds at which all rotors lift equal shares of the weight, rpm.
 
     Returns:
         (1,), or (n_rotors,) if each rotor has its own thrust curve
@@ -80,7 +80,7 @@ def wrench_matrix(airframe: Airframe) -> np.ndarray:
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
-    """Return the rotor speeds that produce a wrench, each within its limits.
+    """Allocate a wrench to rotor speeds, each within its limits.
 
     The wrench is allocated with the least-norm inverse of the mixing matrix. Each rotor thrust is then clipped
     independently, as in Crazyflow. The Crazyflie firmware instead lowers all motors by the excess of the highest motor,

@@ -59,7 +59,7 @@ def attitude2force_torque(
     *,
     params: AttitudeParams,
 ) -> tuple[Array, Array]:
-    """Return the wrench that rotates the drone to an attitude, and the new integral.
+    """Rotate the drone to an attitude; return the wrench and the new integral.
 
     This is the attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie
     firmware: without the factor one half on the rotation error, with a derivative of the rate error, and in PWM units.
@@ -112,7 +112,7 @@ def body_rate2force_torque(
     *,
     params: AttitudeParams,
 ) -> tuple[Array, Array]:
-    """Return the wrench that follows body rates, and the new integral.
+    """Follow body rates; return the wrench and the new integral.
 
     As in Crazyflow, the attitude controller follows the rates and also levels the drone at its current yaw.
     ``Sim(controller="pid")`` follows rates only, as the firmware's rate mode does. This function also follows rates

@@ -68,7 +68,7 @@ def geometric_control(
     feedforward: bool = True,
     integral: Array | None = None,
 ) -> Array:
-    """Return the wrench that tracks a setpoint.
+    """Track a setpoint; return the wrench.
 
     This is the controller of Lee, Leok and McClamroch (2010). A force follows from the errors of position and velocity.
     The z axis of the desired attitude is along that force. Desired body rates and angular acceleration follow from the

@@ -103,7 +103,7 @@ def indi_control(
     *,
     params: INDIParams,
 ) -> tuple[Array, INDIMemory]:
-    """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
+    """Track a setpoint under unknown forces and torques; return the rotor speeds and the memory.
 
     The loops are the same as in ``geometric_control``, but force and torque are increments to the current force and
     torque of the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):

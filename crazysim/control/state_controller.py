@@ -50,7 +50,7 @@ def state2attitude(
     *,
     params: StateParams,
 ) -> tuple[Array, Array]:
-    """Return the attitude and thrust that track a full-state setpoint, and the new integral.
+    """Track a full-state setpoint; return attitude and thrust, and the new integral.
 
     This is the position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as in the Crazyflie firmware.
     A force follows from position error, velocity error and the integral of the position error. The body z axis is along

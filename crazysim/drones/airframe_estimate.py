@@ -112,7 +112,7 @@ def estimate_airframe(
     resistance: float | None = None,
     name: str = "my_drone",
 ) -> str:
-    """Return the TOML text of an airframe with constants that are estimated from a few numbers.
+    """Estimate the constants of an airframe from a few numbers, and return its TOML text.
 
     The file has the values that the first-principles dynamics, the battery and the controllers without tuned gains
     need, and no gains. Each estimate states its formula and source.

@@ -28,7 +28,7 @@ BODY_KEYS = (
 
 
 def load_airframe(source: AirframeSource) -> Airframe:
-    """Return the airframe from a name, a TOML file anywhere on disk, or a dict of the same tables.
+    """Load an airframe by its name, from a TOML file anywhere on disk, or from a dict of the same tables.
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. The
     key ``base`` is the name or path of another airframe, from which missing numbers are inherited. If one of

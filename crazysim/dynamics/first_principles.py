@@ -127,7 +127,7 @@ def saturate(cmd: Array, params: Params) -> Array:
 
 @jit_eager_calls()
 def hover_rotor_vel(params: Params) -> Array:
-    """Return the rotor speeds at which equal thrusts of all rotors carry the weight, rpm. (..., n_rotors)"""
+    """Solve for the rotor speeds at which equal thrusts of all rotors carry the weight, rpm. (..., n_rotors)"""
     n_rotors = params.mixing_matrix.shape[-1]
     weight = params.mass * rotation.safe_norm(params.gravity_vec)
     if params.rotor_vel_max.shape[-1] == 1:

@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError, UnknownNameError, require
 def load_params(
     dynamics: Dynamics | str, drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters of a drone for a dynamics model, in SI units, but rotor speeds in rpm.
+    """Load the parameters of a drone for a dynamics model, in SI units, but rotor speeds in rpm.
 
     ``thrust_min`` and ``thrust_max`` are limits of one rotor.
 
@@ -45,7 +45,7 @@ def load_params(
 def load_fn_params(
     fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters from ``load_params`` that ``first_principles.dynamics`` uses.
+    """Load the parameters that ``first_principles.dynamics`` uses.
 
     Args:
         fn: ``first_principles.dynamics``.

@@ -44,7 +44,7 @@ MAX_PAIRS = 2**20
 
 
 def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Reduction = "sum") -> Any:
-    """Return the reduction of a function of pairs over all drones of the world, for use in functions of one drone.
+    """Sum a function of pairs over all drones of the world, or take its minimum or maximum, in functions of one drone.
 
     ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. It captures the values of this
     drone. Compute everything that only depends on the other drone in ``values``: they are computed once for each drone,

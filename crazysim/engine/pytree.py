@@ -326,7 +326,7 @@ def _scope(x: Any, metadata: Any, members: Members | None) -> str:
 
 
 def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
-    """Return the tree with ``fn`` applied to the leaves that have an axis over worlds; other leaves are unchanged."""
+    """Apply ``fn`` to the leaves that have an axis over worlds; other leaves are unchanged."""
     return jax.tree.map(
         lambda scope, x, *rest: fn(x, *rest) if n_batch_axes(scope) else x,
         scopes(tree),
@@ -336,7 +336,7 @@ def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
 
 
 def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
-    """Return ``new`` in the worlds of a mask and ``old`` elsewhere, both broadcast to a common shape.
+    """Take ``new`` in the worlds of a mask and ``old`` elsewhere, both broadcast to a common shape.
 
     Args:
         mask: True in worlds with new values; None for all worlds. (n_worlds,), (n_worlds, 1), or () for one world

@@ -90,7 +90,7 @@ def use_device_of(x: object) -> AbstractContextManager[object]:
 
 
 def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
-    """Return a one-dimensional mesh of devices for ``Sim(mesh=...)``."""
+    """Make a one-dimensional mesh of devices for ``Sim(mesh=...)``."""
     return jax.make_mesh((len(devices),), (WORLD_AXIS,), axis_types=(AxisType.Auto,), devices=list(devices))
 
 
@@ -114,7 +114,7 @@ def shardings_of(data: Any, mesh: Mesh) -> Any:
 
 
 def shard(data: Any, mesh: Mesh) -> Any:
-    """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
+    """Distribute the data over a mesh; under a trace, constrain the compiled function to distribute it."""
     distribute_fn = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else distribute
     return distribute_fn(data, shardings_of(data, mesh))
 

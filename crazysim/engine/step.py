@@ -212,7 +212,7 @@ class Step:
         return structure.treedef.unflatten(leaves_after)
 
     def flatten(self, data: Record, n_steps: int | Array | None = None, separate: SeparateLeaves = None) -> FlatData:
-        """Return the data flattened for ``advance``.
+        """Flatten the data for ``advance``.
 
         Args:
             n_steps: Number of steps of the type that will be passed to ``advance``, of any value; None means an array.
@@ -234,7 +234,7 @@ class Step:
             )
 
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
-        """Return the data some steps later, still flattened."""
+        """Advance the data by some steps, still flattened."""
         plan = flat.plan
         step, inputs = plan.static_count_step if isinstance(n_steps, int) else plan.traced_count_step, flat.inputs()
         if plan.numpy_step is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
@@ -247,7 +247,7 @@ class Step:
         return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
-        """Return the data some steps later, computed without XLA; the plan must have a ``host_call``."""
+        """Advance the data by some steps without XLA; the plan must have a ``host_call``."""
         plan, leaves = flat.plan, flat.leaves
         host_call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
@@ -259,7 +259,7 @@ class Step:
         return self._plan(data, *self._flat_structure(data))
 
     def lower(self, data: Record, n_steps: int | Array = 1) -> Any:
-        """Return the step lowered for this data, as ``jax.jit(...).lower`` does, to inspect or to compile it."""
+        """Lower the step for this data, as ``jax.jit(...).lower`` does, to inspect or to compile it."""
         _check_steps(n_steps)
         flat = self.flatten(data, n_steps)
         step = flat.plan.static_count_step if isinstance(n_steps, int) else flat.plan.traced_count_step

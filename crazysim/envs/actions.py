@@ -60,7 +60,7 @@ class Actions:
         return self.centre.shape[-1]
 
     def command(self, action: Array) -> Array:
-        """Return the command of an action, in the units of the command level. (..., k) -> (..., n)"""
+        """Convert an action to the command, in the units of the command level. (..., k) -> (..., n)"""
         dtype = action.dtype
         centre, scale = jnp.asarray(self.centre, dtype), jnp.asarray(self.scale, dtype)
         command = centre + scale * clip(action, -1.0, 1.0)
@@ -75,7 +75,7 @@ class Actions:
 
 
 def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
-    """Return the default actions of a command level; see ``Actions``.
+    """Choose the default actions of a command level; see ``Actions``.
 
     Args:
         airframe: Airframe of all drones, or one for each drone; its rotors limit the commands.

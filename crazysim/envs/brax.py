@@ -80,11 +80,11 @@ class BraxEnv:
         return self.env.task.seconds / self.env.max_steps
 
     def explain(self) -> str:
-        """Return a description of how a step is executed, as ``Env.explain`` does."""
+        """Explain how a step is executed, as ``Env.explain`` does."""
         return self.env.explain()
 
     def reset(self, rng: Array) -> State:
-        """Return the state of all worlds at the start of an episode.
+        """Start an episode in all worlds.
 
         Args:
             rng: A random key, or one key per world as Brax passes them; typed keys or raw key data. Only the first key
@@ -98,7 +98,7 @@ class BraxEnv:
         return State(state, self._flatten_obs(state.obs), zeros, zeros, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
-        """Return the state of all worlds one environment step later.
+        """Advance all worlds by one environment step.
 
         Args:
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)

@@ -124,7 +124,7 @@ class Env(ABC):
         return self.base.physics.with_stages(stages).with_zeros_of(None)
 
     def reset(self, key: Array) -> EnvState:
-        """Return the state of all worlds at the start of an episode; the same key gives the same episodes.
+        """Start an episode in all worlds; the same key gives the same episodes.
 
         Args:
             key: Random key of ``jax.random.key`` for all worlds, (), or one key for each of several blocks of worlds,
@@ -151,7 +151,7 @@ class Env(ABC):
         return state
 
     def restart(self, state: EnvState, mask: Array | None) -> EnvState:
-        """Return the state with new episodes in some worlds.
+        """Start new episodes in some worlds.
 
         Args:
             mask: True where a new episode begins; None for all worlds. (n_worlds,)
@@ -178,7 +178,7 @@ class Env(ABC):
         return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
 
     def step(self, state: EnvState, action: Array) -> EnvState:
-        """Return the state one environment step later. With ``AutoReset``, worlds that are done begin a new episode.
+        """Advance all worlds by one environment step. With ``AutoReset``, worlds that are done begin a new episode.
 
         A world that becomes non-finite, also in an observation or its reward, terminates, sets ``info["nonfinite"]``,
         and is observed as zeros.
@@ -193,14 +193,14 @@ class Env(ABC):
             return EnvState(data).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
-        """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
+        """Flatten the state for ``advance``, which is faster in a loop than ``step``."""
         self._check_state(state)
         record = leaf_indices(state.full_data).plugins[ENV_RECORD_NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in RESULT_FIELDS])
         return self.step_fn.flatten(state.full_data, self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
-        """Return flat data one environment step later; ``EnvState(flat.data())`` is the state of flat data.
+        """Advance flat data by one environment step; ``EnvState(flat.data())`` is the state of flat data.
 
         Args:
             flat: Result of ``flatten`` or ``advance``.
@@ -259,7 +259,7 @@ class Env(ABC):
         return {}
 
     def explain(self) -> str:
-        """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
+        """Explain how a step is executed, as ``Sim.explain`` does for a step of the physics."""
         state = jax.eval_shape(self.reset, jax.random.key(0))
         step, rays = explain(self.step_fn, state.full_data), self.sim.scene.ray_kernels.last_used
         return f"{step}\nrays: {rays}" if rays else step

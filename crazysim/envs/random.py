@@ -73,7 +73,7 @@ def episode_key(data: SimData, name: str) -> Array:
 
 
 def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
-    """Return uniformly distributed random numbers, in steps of 2^-24 of their range.
+    """Draw uniformly distributed random numbers, in steps of 2^-24 of their range.
 
     Unlike with ``jax.random``, a longer draw with the same key begins with the numbers of a shorter draw.
 
@@ -87,7 +87,7 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
 
 
 def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, Array]:
-    """Return random numbers in [0, 1) by name, from one draw that is split in the order of the names.
+    """Draw random numbers in [0, 1) by name, in one draw that is split in the order of the names.
 
     ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). Without
     leading axes, a name appended at the end does not change the numbers of the earlier names; with leading axes it

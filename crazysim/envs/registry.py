@@ -103,7 +103,7 @@ def make(
     sim_freq: int = 500,
     **options: Any,
 ) -> Env:
-    """Return an environment of many worlds of a task, with a new simulation.
+    """Make an environment of many worlds of a task, with a new simulation.
 
     Args:
         task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.

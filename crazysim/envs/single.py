@@ -59,7 +59,7 @@ class DroneSingleEnv(gymnasium.Env):
         return _squeeze_world(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _squeeze_world(info)
 
     def render(self) -> NDArray | None:
-        """Return an image (height, width, 3), or draw into a window.
+        """Render an image (height, width, 3), or draw into a window.
 
         Raises:
             RenderError: If this machine cannot render.

@@ -210,7 +210,7 @@ def state_of_data(data: SimData, task: str = "") -> EnvState:
 
 
 def flatten(obs: Obs) -> Array:
-    """Return named observations concatenated in alphabetical order of their names. (..., n_obs)"""
+    """Concatenate named observations in alphabetical order of their names. (..., n_obs)"""
     return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
 
 

@@ -97,7 +97,7 @@ class Task:
         sim.add(FunctionPlugin(TASK_RECORD_NAME, record, placements))
 
     def read(self, data: SimData) -> Any:
-        """Return the states of the task in data of any scope, as attributes."""
+        """Read the states of the task in data of any scope, as attributes."""
         return data.plugins[TASK_RECORD_NAME]
 
     def write(self, data: SimData, **changes: Any) -> SimData:

@@ -173,7 +173,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return an image (height, width, 3) of each of ``render_worlds``, or draw the first of them into a window.
+        """Render an image (height, width, 3) of each of ``render_worlds``, or draw the first of them into a window.
 
         Raises:
             RenderError: If this machine cannot render.
@@ -182,7 +182,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return tuple(images) if self.render_mode == "rgb_array" else None
 
     def explain(self) -> str:
-        """Return how a step is executed, as ``Env.explain`` does."""
+        """Explain how a step is executed, as ``Env.explain`` does."""
         return self.env.explain()
 
     def close_extras(self, **_: Any) -> None:

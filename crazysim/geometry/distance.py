@@ -21,7 +21,7 @@ DRONE_KINDS = ("sphere", "capsule", "box")
 
 
 def point_distance(shape: Shape, point: Array) -> Array:
-    """Return the signed distance from a point to the surface of a shape, m, negative inside. (...)
+    """Measure the signed distance from a point to the surface of a shape, m, negative inside. (...)
 
     Exact for plane, sphere, capsule, box, cylinder (Ericson 2005, section 5.1) and mesh. For an ellipsoid it is solved
     by Newton's method; for a height field see ``field_distance``.
@@ -35,7 +35,7 @@ def point_distance(shape: Shape, point: Array) -> Array:
 
 
 def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
-    """Return the signed distance between two shapes: between their nearest points, or minus their overlap, m. (...)
+    """Measure the signed distance between two shapes: between their nearest points, or minus their overlap, m. (...)
 
     The overlap is the length of the shortest translation that separates them. For a sphere ``a``, the distance is as
     exact as ``point_distance``. The distance is exact for capsules and boxes against a plane, sphere or capsule, and

@@ -28,7 +28,7 @@ class SizedShapes:
 
 
 def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the distance along rays to the surface of a shape, and its outward normal at the hit.
+    """Cast rays at a shape; return the distance to its surface, and its outward normal at the hit.
 
     The conventions follow MuJoCo's ``mj_ray``: a ray from inside a solid hits the surface where it leaves, and
     the normal still points outward; a plane is hit only from above; a height field is also hit at z = 0, where the box

@@ -89,7 +89,7 @@ class Shape:
 
 @check_arguments
 def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
-    """Return a convex mesh.
+    """Make a convex mesh.
 
     Args:
         vertices: Vertices, m. (n_vertices, 3)
@@ -137,7 +137,7 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
 
 @check_arguments
 def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
-    """Return the ground below a surface of triangles over a rectangular grid, two per cell.
+    """Make the ground below a surface of triangles over a rectangular grid, two per cell.
 
     As in MuJoCo, the diagonal of a cell joins its corners of smallest and of largest x and y.
 

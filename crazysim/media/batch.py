@@ -28,7 +28,7 @@ def render_worlds(
     height: int = 240,
     renderer: str = "auto",
 ) -> NDArray:
-    """Return an image of each of several worlds. (n, height, width, 3), uint8
+    """Render an image of each of several worlds. (n, height, width, 3), uint8
 
     On a GPU, if ``warp-lang`` is installed, MuJoCo Warp ray-traces a camera of the scene in all worlds at once.
     Otherwise MuJoCo's renderer draws one world after the other. A call with the same camera, size and number of worlds

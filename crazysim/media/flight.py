@@ -56,7 +56,7 @@ class Flight:
         return int(indices[0])
 
     def at(self, time: float) -> dict[str, NDArray]:
-        """Return pos, quat, body_pos, body_quat and setpoint at a time, interpolated.
+        """Interpolate pos, quat, body_pos, body_quat and setpoint at a time.
 
         Args:
             time: Time, s; clipped to the flight.

@@ -115,7 +115,7 @@ class Recorder:
 
 @check_arguments
 def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = None) -> Flight:
-    """Return the flight of states that ``sim.rollout`` returned.
+    """Make the flight of states that ``sim.rollout`` returned.
 
     Args:
         sim: Simulation of the rollout; other bodies are recorded at their present poses.

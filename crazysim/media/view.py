@@ -138,7 +138,7 @@ class View:
         return slice(top, top + height), slice(left, left + width)
 
     def render(self, sim: Sim) -> NDArray:
-        """Return an image of a simulation. (height, width, 3), uint8
+        """Render an image of a simulation. (height, width, 3), uint8
 
         Overlays that were drawn with ``crazysim.sim.visualize`` appear in each of the worlds.
 

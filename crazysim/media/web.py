@@ -27,7 +27,7 @@ FOV = 50.0
 
 @check_arguments
 def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = None) -> str:
-    """Return one world of a flight as an HTML page with drones, obstacles, setpoints and trails.
+    """Make an HTML page of one world of a flight with drones, obstacles, setpoints and trails.
 
     The page contains the viewer and the flight, so that it can be opened as a file, without server or network.
 

@@ -161,7 +161,7 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
-    """Return the model as arrays on a device."""
+    """Put the model on a device, as arrays."""
     with _explain_mjx_errors():
         return mjx.put_model(mj_model, device=device)
 

@@ -25,7 +25,7 @@ all drones, and of all objects with handles, whose poses have a further axis of 
 
 
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
-    """Return the data with ``core.mjx_synced`` set, and the MJX data of the scene, updated from the data."""
+    """Sync the MJX data of the scene with the data; return the data with ``core.mjx_synced`` set, and the MJX data."""
     mjx_data = sync_poses(poses_of(data), mjx_data, mjx_model)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 

@@ -51,7 +51,7 @@ CRAZYFLOW_TABLES = {
 def load_params(
     controller: str, drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict[str, dict]:
-    """Return the parameters of a drone for a controller: ``core``, and one table for each function.
+    """Load the parameters of a drone for a controller: ``core``, and one table for each function.
 
     Parameters that the airframe lacks are left out.
 
@@ -75,7 +75,7 @@ def load_params(
 def load_fn_params(
     fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters of one function of the cascade: ``core``, and its own table if it has one.
+    """Load the parameters of one function of the cascade: ``core``, and its own table if it has one.
 
     Args:
         fn: Function of ``crazysim.control``, such as ``state2attitude``.

@@ -54,7 +54,7 @@ def rollout(
     every: int = 1,
     wait: bool = False,
 ) -> tuple[SimData, Any]:
-    """Return the data after some control steps, and the arrays that were recorded after these steps.
+    """Fly some control steps; return the data after them, and the arrays that were recorded after these steps.
 
     A control step evaluates the policy, stages its command, and takes ``n_substeps`` physics steps. The function is
     pure and can be used inside jit, vmap and grad. Leaves that no step writes, mainly parameters, are constants of the

@@ -175,7 +175,7 @@ class Sim:
         plugins: Sequence[Plugin] = (),
         **settings: Any,
     ) -> Sim:
-        """Return a simulation with the vehicles of an MJCF, at their poses; everything else in the file is the scene.
+        """Make a simulation with the vehicles of an MJCF, at their poses; everything else in the file is the scene.
 
         Vehicles are children of the world body that have a joint, or are mocap bodies, and have a name made of a prefix
         and a number: ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by the bodies
@@ -460,7 +460,7 @@ class Sim:
 
     @locked
     def build_step_fn(self) -> Step:
-        """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure.
+        """Build a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure.
 
         If plugins read the scene, the step is for the present scene, and refuses data after an edit of the scene.
         """
@@ -469,7 +469,7 @@ class Sim:
 
     @locked
     def build_reset_fn(self) -> Reset:
-        """Return a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
+        """Build a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
         self._adopt_scene()
         return self._built_reset.build()
 
@@ -525,7 +525,7 @@ class Sim:
         return records
 
     def explain(self, measure: bool = False) -> str:
-        """Return in a few lines which engine runs the step, which stages it fuses, and why it does not fuse others.
+        """Explain in a few lines which engine runs the step, which stages it fuses, and why it does not fuse others.
 
         If rays were cast, for images or for many movable objects, a last line says how.
 
@@ -639,7 +639,7 @@ class Sim:
 
     @locked
     def contacts(self, body: str | None = None) -> Array:
-        """Return which contact slots touch, after a sync if anything has changed.
+        """Find which contact slots touch, after a sync if anything has changed.
 
         A slot is a pair of geoms that may touch; ``mj_model`` and MJX decide which pair it is. With 64 or more
         drones per world MJX keeps only the nearest ``max_geom_pairs``; set it to -1 and call ``build_mjx`` for all.
@@ -657,7 +657,7 @@ class Sim:
         return slots
 
     def contact_report(self, objects: ObjectSelection = None, floor: bool = True, drones: bool = True) -> ContactReport:
-        """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
+        """Report the contacts and distances of every drone: to the floor, to objects, to other drones.
 
         JAX computes the report from the poses in the data, and from the poses in ``mjx_data`` of other bodies that can
         move. Fields that were not requested are None and are not computed.
@@ -678,7 +678,7 @@ class Sim:
         hide_own: bool = True,
         along: Along = "axis",
     ) -> Array:
-        """Return depth images of all worlds, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
+        """Take depth images of all worlds, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
 
         Infinite where nothing is hit.
         """

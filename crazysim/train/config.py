@@ -243,7 +243,7 @@ class TrainConfig:
         network: Network | None = None,
         devices: Devices | None = None,
     ) -> TrainConfig:
-        """Return the configuration of a run; omitted values come from the recipe of the task.
+        """Complete the configuration of a run: omitted values come from the recipe of the task.
 
         Args:
             task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task``.
@@ -296,7 +296,7 @@ class TrainConfig:
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
     def make_training_env(self, n_seeds: int = 1) -> Env:
-        """Return the training environment of some seeds, with its worlds on the devices of the training.
+        """Make the training environment of some seeds, with its worlds on the devices of the training.
 
         Args:
             n_seeds: Number of seeds; each has ``n_worlds`` worlds.
@@ -307,7 +307,7 @@ class TrainConfig:
         return make(self.task, n_worlds, **self.practice_options() | self.options | devices)
 
     def make_env(self, n_worlds: int | None = None, **defaults: Any) -> Env:
-        """Return an environment of the run, on one device.
+        """Make an environment of the run, on one device.
 
         Args:
             n_worlds: Number of worlds; None for the number of the run.

@@ -123,7 +123,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
 
 
 def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None) -> dict[str, float]:
-    """Return the success rate of a policy, its crash rate, its mean error and its mean return.
+    """Evaluate a policy: its success rate, its crash rate, its mean error and its mean return.
 
     A drone succeeds if its error stays below ``task.tolerance`` for the last ``task.hold`` seconds of the episode. If
     the task defines ``succeeded``, this criterion replaces the tolerance.

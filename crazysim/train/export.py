@@ -19,7 +19,7 @@ __getattr__ = lazy_getattr(__name__)
 
 
 def describe(env: Env) -> dict[str, Any]:
-    """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
+    """Describe a policy's inputs and outputs, as ``to_onnx`` and ``to_c`` require."""
     require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
     require(
         env.actions.centre.ndim <= 1,

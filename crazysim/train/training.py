@@ -504,7 +504,7 @@ def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
 def load_policy(
     folder: str | Path, task: str | None = None, network: Network | None = None
 ) -> tuple[Policy, TrainConfig, dict[str, Any]]:
-    """Return the policy of a run, its configuration, and the description of its inputs and outputs.
+    """Load the policy of a run, its configuration, and the description of its inputs and outputs.
 
     Args:
         folder: Folder of the run.

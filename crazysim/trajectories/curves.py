@@ -39,7 +39,7 @@ def figure_eight(
     speed: float | None = None,
     height: float = 1.0,
 ) -> Trajectory:
-    """Return a horizontal figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, that repeats.
+    """Trace a horizontal figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, that repeats.
 
     Args:
         width: Size along x, m.
@@ -60,7 +60,7 @@ def lissajous(
     speed: float | None = None,
     center: ArrayLike = (0.0, 0.0, 1.0),
 ) -> Trajectory:
-    """Return a Lissajous curve, ``center + amplitudes sin(frequencies wt + phases)``, that repeats.
+    """Trace a Lissajous curve, ``center + amplitudes sin(frequencies wt + phases)``, that repeats.
 
     Args:
         amplitudes: Half of the size along each axis, m. (3,)
@@ -89,7 +89,7 @@ def circle(
     height: float = 1.0,
     along: bool = False,
 ) -> Trajectory:
-    """Return a level circle around the z axis, counterclockwise from ``(radius, 0, height)``, that repeats.
+    """Trace a level circle around the z axis, counterclockwise from ``(radius, 0, height)``, that repeats.
 
     Args:
         radius: Radius, m.
@@ -110,7 +110,7 @@ def helix(
     height: float = 0.5,
     along: bool = False,
 ) -> Trajectory:
-    """Return a helix around the z axis, counterclockwise from ``(radius, 0, height)``.
+    """Trace a helix around the z axis, counterclockwise from ``(radius, 0, height)``.
 
     Args:
         radius: Radius, m.
@@ -141,7 +141,7 @@ def helix(
 def line(
     start: ArrayLike, end: ArrayLike, duration: float | None = None, speed: float | None = None, yaw: float = 0.0
 ) -> Trajectory:
-    """Return a straight line from rest to rest, with acceleration and jerk zero at both ends.
+    """Trace a straight line from rest to rest, with acceleration and jerk zero at both ends.
 
     Args:
         start: First point, world frame, m. (3,)
@@ -161,7 +161,7 @@ def line(
 
 
 def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 1.0) -> Trajectory:
-    """Return a trajectory that stays at a point.
+    """Stay at a point.
 
     Args:
         pos: The point, world frame, m. (3,)

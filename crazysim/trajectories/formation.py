@@ -19,7 +19,7 @@ CENTER = (0.0, 0.0, 1.0)
 
 
 def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 0.0) -> np.ndarray:
-    """Return positions on a level line, along x at a yaw of zero, m. (n, 3)
+    """Place drones on a level line, along x at a yaw of zero, m. (n, 3)
 
     Args:
         n: Number of drones.
@@ -50,7 +50,7 @@ def circle(
     center: ArrayLike = CENTER,
     yaw: float = 0.0,
 ) -> np.ndarray:
-    """Return positions on a level circle, counterclockwise, the first along x at a yaw of zero, m. (n, 3)
+    """Place drones on a level circle, counterclockwise, the first along x at a yaw of zero, m. (n, 3)
 
     Args:
         n: Number of drones.

@@ -21,7 +21,7 @@ SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
 def spline(
     times: ArrayLike, points: ArrayLike, degree: int = 5, yaw: ArrayLike = 0.0, at_rest: bool = True
 ) -> Trajectory:
-    """Return the smoothest spline through points at given times.
+    """Fit the smoothest spline through points at given times.
 
     Of all curves through the points, the spline of degree 3, 5 or 7 minimises the integral of the squared acceleration,
     jerk or snap, respectively. Its derivatives are continuous up to the second, fourth or sixth.
@@ -61,7 +61,7 @@ def spline(
 
 
 def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: bool = False) -> Trajectory:
-    """Return the trajectory of a sequence of Bezier curves.
+    """Join a sequence of Bezier curves.
 
     The Bernstein polynomials are expanded in float64: ``c_k = C(n, k) sum_i (-1)^(k - i) C(k, i) P_i``.
 

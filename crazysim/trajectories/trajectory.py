@@ -48,7 +48,7 @@ class Trajectory(PyTree):
 
     @staticmethod
     def of_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
-        """Return the trajectory of pieces that are polynomials in seconds, computed in float64 on the host.
+        """Join pieces that are polynomials in seconds, computed in float64 on the host.
 
         Args:
             durations: Length of each piece, s. (n_pieces,)
@@ -94,7 +94,7 @@ class Trajectory(PyTree):
     @check_arguments
     @jit_eager_calls()
     def evaluate(self, t: ArrayLike) -> Setpoint:
-        """Return the setpoint of one trajectory at one time, with derivatives up to snap.
+        """Evaluate the setpoint of one trajectory at one time, with derivatives up to snap.
 
         Where two pieces meet, the later piece is evaluated. Use ``jax.vmap`` for several trajectories or times.
 
@@ -105,7 +105,7 @@ class Trajectory(PyTree):
 
     @check_arguments
     def evaluate_one(self, index: Array | int, t: ArrayLike) -> Setpoint:
-        """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
+        """Evaluate the setpoint of one of several trajectories at one time, with derivatives up to snap.
 
         It reads only the coefficients of one piece and a few ends, so the cost hardly depends on the number of
         trajectories.
@@ -119,7 +119,7 @@ class Trajectory(PyTree):
     def evaluate_at_rate(
         self, index: Array | int, t: ArrayLike, rate: Array | float, degrees: Sequence[int] | None = None
     ) -> Setpoint:
-        """Return the setpoint of one of several trajectories, flown ``rate`` times as fast.
+        """Evaluate the setpoint of one of several trajectories, flown ``rate`` times as fast.
 
         Args:
             index: Index along the single leading axis, as for ``evaluate_one``. ()
@@ -151,7 +151,7 @@ class Trajectory(PyTree):
 
     @check_arguments
     def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
-        """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
+        """Evaluate x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
 
         Args:
             t: Time since the start of the trajectory, s. ()
@@ -194,7 +194,7 @@ class Trajectory(PyTree):
 
     @staticmethod
     def stack(trajectories: Sequence[Trajectory]) -> Trajectory:
-        """Return several trajectories as one record with a new first axis, padded to common sizes.
+        """Stack several trajectories in one record with a new first axis, padded to common sizes.
 
         Args:
             trajectories: Single trajectories.
@@ -206,13 +206,13 @@ class Trajectory(PyTree):
         return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded_trajectories)
 
     def unstacked(self) -> list[Trajectory]:
-        """Return the trajectories along the leading axis; a single trajectory as a list of one."""
+        """Split a record into the trajectories along its leading axis; a single trajectory gives a list of one."""
         if np.ndim(self.ends) == 1:
             return [self]
         return [jax.tree.map(lambda x, k=k: x[k], self) for k in range(len(self.ends))]
 
     def padded(self, n_pieces: int, degree: int) -> Trajectory:
-        """Return this trajectory of one vehicle, padded to at least ``n_pieces`` pieces and a degree of ``degree``.
+        """Pad this trajectory of one vehicle to at least ``n_pieces`` pieces and a degree of ``degree``.
 
         Added pieces have no length and stay at the last point.
         """
@@ -227,7 +227,7 @@ class Trajectory(PyTree):
         return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest_piece]))
 
     def repeat(self, n: int | None = None) -> Trajectory:
-        """Return this trajectory of one vehicle, flown several times in succession.
+        """Repeat this trajectory of one vehicle several times in succession.
 
         A closed curve such as a circle repeats without end. ``repeat(n)`` ends it after n rounds, so that another
         trajectory can follow by ``then``; ``repeat()`` makes any trajectory start again after its end.
@@ -251,7 +251,7 @@ class Trajectory(PyTree):
         )
 
     def then(self, other: Trajectory, transition: float = 0.0) -> Trajectory:
-        """Return this trajectory of one vehicle, followed by another one that starts when this one ends.
+        """Append another trajectory to this one of one vehicle; it starts when this one ends.
 
         Without a transition, a difference between this trajectory's end and the other one's start is a jump of the
         position, or of the velocity, for example from rest into a curve.
@@ -311,7 +311,7 @@ class Trajectory(PyTree):
         return np.array([polyval(float(at_end), polyder(coefficients, m)) / lengths[k] ** m for m in range(4)])
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0) -> Trajectory:
-        """Return the trajectory rotated around the z axis of the world, then translated; leading axes are allowed.
+        """Rotate the trajectory around the z axis of the world, then translate it; leading axes are allowed.
 
         Args:
             offset: Displacement, m. (3,)

@@ -14,7 +14,7 @@ from crazysim.engine.step import Step
 
 
 def explain(step: Step, data: Record, measure: bool = False) -> str:
-    """Return a few lines about a step: its engine, the stages that are fused, and why other stages are not.
+    """Explain a step in a few lines: its engine, the stages that are fused, and why other stages are not.
 
     Args:
         data: Data to step, or its shapes and types.

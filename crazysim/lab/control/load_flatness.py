@@ -53,7 +53,7 @@ class LoadedState(NamedTuple):
 def load_flat_state(
     path: Array, yaw: Array, mass: Array, load_mass: Array, length: Array, inertia: Array, gravity_vec: Array
 ) -> LoadedState:
-    """Return states and inputs with which a drone carries a point load along a path.
+    """Solve for states and inputs with which a drone carries a point load along a path.
 
     The rod is attached at the drone's centre of mass. Where thrust and yaw do not determine the attitude, it is as in
     ``control.flatness.attitude_of_thrust``. For a load in free fall, which has no tension and no direction, the results

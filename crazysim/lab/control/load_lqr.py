@@ -170,7 +170,7 @@ def load_lqr_control(
     target: SetpointBody = "load",
     rod_jerk: Array | None = None,
 ) -> Array:
-    """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feedforward.
+    """Track a setpoint with a load by the LQR, with the wrench of the setpoint's motion as feedforward.
 
     The law is ``u = u_ref - K e``. The errors e are the errors of ``lqr_control``, and the errors of the two angles of
     the rod and of their rates (``rod_angles``). The angles are in the frame of the desired heading.

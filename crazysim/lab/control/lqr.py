@@ -197,7 +197,7 @@ def to_heading_frame(vector: Array, yaw: Array) -> Array:
 
 
 def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams) -> Array:
-    """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feedforward.
+    """Track a setpoint by the LQR about hover, with the wrench of the setpoint's motion as feedforward.
 
     The law is ``u = u_ref - K e``. Errors of position and velocity are in the frame of the desired heading, so that the
     same gain is valid for every yaw. ``flat_reference`` gives the reference attitude, rates and wrench.

@@ -184,7 +184,7 @@ class MPPI:
         self._memory = jax.device_put(self.init(*self._memory.plan.shape[:2]), self._device)
 
     def command(self, data: SimData, setpoint: Setpoint) -> Array:
-        """Return the command of every drone, and keep the plan for the next call; one compiled call.
+        """Plan the command of every drone, and keep the plan for the next call; one compiled call.
 
         Args:
             data: The data of the simulation, from which rollouts start.
@@ -197,7 +197,7 @@ class MPPI:
         return command
 
     def plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
-        """Return the command of every drone and the memory for the next call; pure, and one compiled call.
+        """Plan the command of every drone, and the memory for the next call; pure, and one compiled call.
 
         Args:
             memory: Result of ``init``, or of the last call.

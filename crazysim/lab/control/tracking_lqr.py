@@ -150,7 +150,7 @@ def interpolate_gain(time: Array, gains: Array, dt: Array) -> Array:
 def tracking_lqr_control(
     pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, time: Array, *, params: TrackingLQRParams
 ) -> Array:
-    """Return the wrench of the LQR along a trajectory, ``u = u_ref - K(t) e``.
+    """Track a trajectory by its LQR, ``u = u_ref - K(t) e``.
 
     Args:
         pos: Position, world frame, m. (3,)

@@ -101,7 +101,7 @@ def _to_crazyflow_columns(log: Log) -> dict[str, NDArray]:
 def identify_attitude(
     logs: Sequence[Log], airframe: str | Path, dynamics: str, source: str, *, mass: float | None = None
 ) -> tuple[Airframe, str]:
-    """Return an airframe with a model fitted to logs with attitude commands, and the text of its TOML file.
+    """Fit a model to logs with attitude commands; return the airframe, and the text of its TOML file.
 
     Args:
         logs: Logs with ``attitude_command`` that begin in hover, without gaps.

@@ -78,7 +78,7 @@ def read_log(
     motion: str | Path | Mapping[str, NDArray] | None = None,
     between: tuple[float, float] = (0.0, math.inf),
 ) -> Log:
-    """Return the log of a file or of a dict of columns, checked and repaired.
+    """Read the log of a file or of a dict of columns, checked and repaired.
 
     A file is a table, ``.csv`` or ``.npz``; a Betaflight blackbox log that was converted to ``.csv``; a PX4 ULog,
     ``.ulg``; a ROS bag, ``.bag``, ``.mcap``, ``.db3`` or a folder; or, with any other ending, a log of a Crazyflie's

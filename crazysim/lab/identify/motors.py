@@ -102,7 +102,7 @@ def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
 
 
 def motor_lag(logs: Sequence[Log]) -> NDArray:
-    """Return the rate of a first-order lag between commands and measured speeds of each rotor, 1/s.
+    """Fit the rate of a first-order lag between commands and measured speeds of each rotor, 1/s.
 
     A speed is a linear function of the lagged command and the lagged square of the command, delayed by the telemetry.
     Rate and delay minimise the squared residuals, so that noise of the speeds does not bias them.

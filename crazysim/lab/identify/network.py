@@ -38,7 +38,7 @@ def fit_residual(
     validation: Sequence[Log] = (),
     seed: int = 0,
 ) -> Model:
-    """Return the model with a trained residual: linear terms and a network that are added to force and torque.
+    """Train the residual of a model: linear terms and a network that are added to force and torque.
 
     Adam minimises Huber's loss of open-loop predictions of 0.5 s, by gradients through the dynamics. The parameters of
     the model are not changed. With validation logs, their loss is computed every 100 iterations, and the result is the

@@ -214,7 +214,7 @@ def attitude_error(quat: Array, reference: Array) -> Array:
 def prediction_errors(
     logs: Sequence[Log], model: Predictor, horizons: Sequence[float] = HORIZONS
 ) -> dict[str, NDArray]:
-    """Return errors of open-loop predictions that start every 0.05 s.
+    """Measure the errors of open-loop predictions that start every 0.05 s.
 
     Args:
         logs: Logs of the same sample time.

@@ -65,7 +65,7 @@ class FastRotation(NamedTuple):
 
 
 def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_factor: float = 1.0) -> FastRotation:
-    """Return moments of inertia, torque curve and delays that explain the fast rotation of logs.
+    """Fit moments of inertia, torque curve and delays to the fast rotation of logs.
 
     About x and y, thrust and arms give the torque, and therefore the scale of the moments of inertia. About z, only the
     ratios of drag torque and rotor inertia to the moment of inertia are observable. The moment about z is therefore
@@ -126,7 +126,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
 
 
 def aligned(log: Log, delay: float) -> Log:
-    """Return the log with rotor speeds and commands delayed by ``delay``, s."""
+    """Delay the rotor speeds and commands of a log by ``delay``, s."""
     command = None if log.command is None else shift_series(log.command, delay / log.dt)
     return replace(log, rotor_vel=shift_series(log.rotor_vel, delay / log.dt), command=command)
 

@@ -35,7 +35,7 @@ def minimum_snap(
     accelerations: ArrayLike | None = None,
     jerks: ArrayLike | None = None,
 ) -> Trajectory:
-    """Return the trajectory through waypoints with the smallest integral of the squared snap.
+    """Plan the trajectory through waypoints with the smallest integral of the squared snap.
 
     The torque of a multirotor follows from the snap of its path (Mellinger and Kumar, "Minimum snap trajectory
     generation and control for quadrotors", ICRA 2011). Pieces have degree 7, and derivatives up to the sixth are
@@ -69,7 +69,7 @@ def minimum_jerk(
     velocities: ArrayLike | None = None,
     accelerations: ArrayLike | None = None,
 ) -> Trajectory:
-    """Return the trajectory through waypoints with the smallest integral of the squared jerk.
+    """Plan the trajectory through waypoints with the smallest integral of the squared jerk.
 
     The pieces have degree 5, and derivatives up to the fourth are continuous. Compared with ``minimum_snap``, the path
     is closer to the straight lines and the body rates are less smooth.

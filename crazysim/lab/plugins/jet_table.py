@@ -81,7 +81,7 @@ def load_jet_table(
     spacing: float = VOXEL_EDGE,
     origin: ArrayLike | None = None,
 ) -> JetTable:
-    """Return the table in a folder of text files as AIMotionLab writes them.
+    """Load the table in a folder of text files as AIMotionLab writes them.
 
     Each file ``*_NNNN.txt`` is the air at NNNN rad/s, the mean of the rotors' speeds: one row per node, z fastest, then
     y, then x, with one number for a pressure, Pa, or three for a velocity, m/s. A folder may have files of both kinds.

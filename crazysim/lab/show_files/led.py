@@ -43,7 +43,7 @@ def decode_lights(
     location: str = "a light program",
     max_repeated: int = MAX_REPEATED_COMMANDS,
 ) -> Lights:
-    """Return the lights of a light program.
+    """Decode the lights of a light program.
 
     A simulated drone has no remote control and no pyrotechnics. Colours from channels of a remote control are therefore
     black, as in libskybrush without channels. Triggers never fire, and pyro commands do nothing.
@@ -177,7 +177,7 @@ class _Machine:
 
 
 def encode_lights(lights: Lights) -> bytes:
-    """Return the light program of one drone's lights, with colours of 8 bits and times in steps of 20 ms.
+    """Encode one drone's lights as a light program, with colours of 8 bits and times in steps of 20 ms.
 
     Args:
         lights: Lights of one drone.

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 def load_show(path: str | Path) -> Show:
-    """Return the show in a ``.skyc`` file.
+    """Load the show in a ``.skyc`` file.
 
     Lights come from the byte code in ``data``, or else from AIMotionLab's ``colors``; a drone without either is white,
     as in Skybrush. A drone without a name is named after its index.

@@ -60,7 +60,7 @@ class ShowFlight:
 
 
 def fly_show(show: Show, seconds: float | None = None, progress: Progress | None = None, **settings: Any) -> ShowFlight:
-    """Return the flight of a show: its drones start hovering at the first points of their trajectories.
+    """Fly a show: its drones start hovering at the first points of their trajectories.
 
     Args:
         seconds: Duration, s; None for the duration of the show.

@@ -15,7 +15,7 @@ N_LISTED_COLLISIONS = 5
 
 
 def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Return the least distance of every pair of drones, and the time at which it occurs.
+    """Find the least distance of every pair of drones, and the time at which it occurs.
 
     Between samples the drones are assumed to move at constant velocities, so that the squared distance is a parabola in
     time. The parabola is fitted through the closest sample and its neighbours.
@@ -65,7 +65,7 @@ def tracking_rms(flight: ShowFlight) -> dict[str, float]:
 
 
 def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
-    """Return the pairs of drones whose collision spheres touched, with the time of first contact, sorted by time."""
+    """Find the pairs of drones whose collision spheres touched, with the time of first contact, sorted by time."""
     contact_distance = 2 * collision_radius(flight)
     distance, _ = sampled_approaches(flight.times, flight.pos)
     pairs = []
@@ -83,7 +83,7 @@ def collision_radius(flight: ShowFlight) -> float:
 
 
 def report(flight: ShowFlight) -> dict[str, Any]:
-    """Return the figures of a flight as JSON, planned and flown separately.
+    """Report the figures of a flight as JSON, planned and flown separately.
 
     The entries ``planned`` and ``flown`` have ``closest``, a list of ``{"drones": [name, name], "distance": m, "time":
     s}`` of every pair, the closest first, and ``duration``, s; ``flown`` also has ``tracking_rms``, m, by name.
@@ -111,7 +111,7 @@ def _closest_pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
 
 
 def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
-    """Return the figures of a flight as text.
+    """Summarise the figures of a flight as text.
 
     Args:
         figures: Result of ``report``.

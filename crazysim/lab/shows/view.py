@@ -62,7 +62,7 @@ def film(
 
 
 def page(flight: ShowFlight) -> str:
-    """Return a flown show as an HTML page to play in a browser, with lights.
+    """Make an HTML page of a flown show to play in a browser, with lights.
 
     Raises:
         ImportError: If viser is not installed.
@@ -145,7 +145,7 @@ class ShowLights:
 
 
 def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
-    """Return a live simulation of a show; its methods ``show`` and ``run`` open a viewer and start it.
+    """Make a live simulation of a show; its methods ``show`` and ``run`` open a viewer and start it.
 
         with live_show(load_show("my_show.skyc")) as live:
             live.show(Browser())

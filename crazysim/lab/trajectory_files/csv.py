@@ -21,7 +21,7 @@ POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y",
 
 
 def load_csv(path: str | Path) -> Trajectory:
-    """Return the trajectory in a CSV file. The number of columns determines the format.
+    """Load the trajectory in a CSV file. The number of columns determines the format.
 
     - 33 or 25: Crazyswarm's polynomials. A row is a piece: its duration, s, and eight coefficients for each of x, y and
       z, m. With 33 columns, eight coefficients of the yaw, rad, follow. The coefficients, constant term first, are for

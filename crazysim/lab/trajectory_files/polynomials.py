@@ -38,7 +38,7 @@ AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
 
 
 def pack_poly4d(trajectory: Trajectory) -> bytes:
-    """Return a trajectory as uncompressed polynomials of the time in seconds, 33 floats per piece.
+    """Pack a trajectory as uncompressed polynomials of the time in seconds, 33 floats per piece.
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
@@ -47,7 +47,7 @@ def pack_poly4d(trajectory: Trajectory) -> bytes:
 
 
 def unpack_poly4d(content: bytes, location: str = "a trajectory memory") -> Trajectory:
-    """Return the trajectory of uncompressed polynomials.
+    """Unpack the trajectory of uncompressed polynomials.
 
     Args:
         location: File, for messages.
@@ -110,7 +110,7 @@ def trajectory_rows(trajectory: Trajectory) -> NDArray:
 
 
 def pack_compressed(trajectory: Trajectory) -> bytes:
-    """Return a trajectory as compressed polynomials: control points in millimetres and tenths of degrees.
+    """Pack a trajectory as compressed polynomials: control points in millimetres and tenths of degrees.
 
     Every axis of a piece has the lowest of the degrees 0, 1, 3 and 7 that is accurate to a tenth of a unit. The
     trajectory is also split every 65 s, because a piece cannot last longer.
@@ -147,7 +147,7 @@ def _pack_shorts(values: NDArray) -> bytes:
 
 
 def unpack_compressed(content: bytes, location: str = "a trajectory memory") -> Trajectory:
-    """Return the trajectory of compressed polynomials.
+    """Unpack the trajectory of compressed polynomials.
 
     Args:
         content: Contents of the memory; bytes after a piece of zero duration are ignored.
@@ -208,7 +208,7 @@ def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = Fal
 
 
 def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
-    """Return the trajectory in a file from ``save_memory``, or in a copy of a Crazyflie's trajectory memory.
+    """Load the trajectory in a file from ``save_memory``, or in a copy of a Crazyflie's trajectory memory.
 
     Args:
         compressed: True for the compressed format, which the contents do not identify.

@@ -13,7 +13,7 @@ __all__ = ["NAMES", "Row", "validate"]
 
 
 def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> list[Row]:
-    """Return the rows that ``crazysim validate`` writes to its page.
+    """Compute the rows that ``crazysim validate`` writes to its page.
 
     Sections whose package is not installed, or whose logs are missing, have no rows. A comparison that raises an error
     is a row with a ``problem``.

@@ -63,7 +63,7 @@ def to_body_frame(yaw: Array, vector: Array) -> Array:
 
 
 def ackermann(steer: Array, wheelbase: float, kingpin_track: float) -> Array:
-    """Return the steering angles of the front wheels for which the axes of all wheels meet in one point.
+    """Steer the front wheels so that the axes of all wheels meet in one point.
 
     ``tan(left) = L tan / (L - (t / 2) tan)`` and ``tan(right) = L tan / (L + (t / 2) tan)`` where tan is the tangent of
     the steering angle in the middle, L the wheelbase and t the distance of the kingpins.

@@ -129,7 +129,7 @@ def vehicle_names() -> tuple[str, ...]:
 
 
 def load_vehicle(source: VehicleSource) -> VehicleModel:
-    """Return the vehicle model of a name, a TOML file anywhere on disk, or a dict of the same tables.
+    """Load the vehicle model of a name, a TOML file anywhere on disk, or a dict of the same tables.
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
     the key ``base``, the name or path of another vehicle, only the numbers that differ from it are given.

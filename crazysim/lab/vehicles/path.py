@@ -100,7 +100,7 @@ class Path(PyTree):
 
     @staticmethod
     def of_points(points: ArrayLike, speed: float = 1.0, closed: bool = False) -> Path:
-        """Return the smoothest path through points, at a constant speed.
+        """Fit the smoothest path through points, at a constant speed.
 
         The path is a quintic spline, parametrised by the cumulative chord length.
 
@@ -140,7 +140,7 @@ class Path(PyTree):
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
-        """Return one record of several paths."""
+        """Stack several paths in one record."""
         if not paths:
             raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
@@ -217,7 +217,7 @@ class Path(PyTree):
         return (s + laps * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
-        """Return the arc length of the point of a path nearest to a position, from a guess nearby.
+        """Project a position to a path, from a guess nearby; return the arc length of the nearest point.
 
         Newton's method, with steps ``along_error / (1 - curvature lateral_error)`` of at most ``MAX_NEWTON_STEP``. The
         errors are the components of the offset along the tangent and to its left. Usable in compiled code.

@@ -110,7 +110,7 @@ def is_inside(shape: tuple[int, ...], position: Array) -> Array:
 
 
 def load_wind_grid(path: str | Path) -> Grid:
-    """Return a grid of velocities from a CSV file, as ParaView exports the points of a flow on a regular grid.
+    """Load a grid of velocities from a CSV file, as ParaView exports the points of a flow on a regular grid.
 
     The columns ``Points:0``, ``Points:1``, ``Points:2`` are positions, m, and ``U:0``, ``U:1``, ``U:2`` velocities,
     m/s, with one row for each node, in any order. Other columns are ignored.

@@ -71,7 +71,7 @@ class HeightField(Plugin, abstract=True):
 
 @jit_eager_calls()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return height and normal of the ground at the x and y of a position; zero and upwards without terrain.
+    """Look up height and normal of the ground at the x and y of a position; zero and upwards without terrain.
 
     Where terrains overlap, the highest one is used.
 
@@ -92,7 +92,7 @@ def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
 
 
 def ground_height(data: SimData, pos: Array) -> Array:
-    """Return the height of the ground at a position, m, as ``ground_at`` does. (..., 1)"""
+    """Look up the height of the ground at a position, m, as ``ground_at`` does. (..., 1)"""
     return ground_at(data, pos)[0]
 
 

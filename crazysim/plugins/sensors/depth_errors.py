@@ -98,7 +98,7 @@ class Distortion:
         check_settings(self)
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image positions of points at distance 1, in units of the focal length. (...) each"""
+        """Distort points at distance 1 to image positions, in units of the focal length. (...) each"""
         r2 = x**2 + y**2
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return (
@@ -107,7 +107,7 @@ class Distortion:
         )
 
     def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points at distance 1 that have image positions, the inverse of ``distort``. (...) each"""
+        """Find the points at distance 1 that have image positions, the inverse of ``distort``. (...) each"""
         # (u, v) is the point, (a, b) its image position, and xx, xy, yy are the derivatives at the point.
         u, v = x.copy(), y.copy()
         with np.errstate(all="ignore"):

@@ -94,7 +94,7 @@ class FunctionSource(MocapSource):
 def show_source(
     trajectories: Trajectory | Sequence[Trajectory], names: Sequence[str] | None = None, freq: float = 120.0
 ) -> FunctionSource:
-    """Return a source of level bodies that follow trajectories, such as a show's from ``load_show(path)``.
+    """Make a source of level bodies that follow trajectories, such as a show's from ``load_show(path)``.
 
     Args:
         trajectories: One trajectory for each body, or one record with a leading axis.

@@ -182,7 +182,7 @@ class Twins(Closeable):
     def playback(
         self, source: MocapSource, seconds: float, freq: int = 100, start: ArrayLike = 0.0, name: str = "playback"
     ) -> Playback:
-        """Return a plugin that moves the objects within the compiled step, in every world, for ``sim.add``.
+        """Make a plugin that moves the objects within the compiled step, in every world, for ``sim.add``.
 
         Args:
             source: Source in simulated time, such as ``ReplaySource(path, by="time")``. Rules, offsets and skeletons
