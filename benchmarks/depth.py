@@ -57,7 +57,6 @@ def main() -> None:
 
 
 def report_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
-    """Print the time of a step with a range finder."""
     n, n_steps = sim.n_worlds, 20
     pos = (
         np.random.default_rng(1)

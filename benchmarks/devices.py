@@ -191,7 +191,6 @@ def build_case(name: str, devices: list[jax.Device], is_small: bool) -> Case:
 
 
 def time_and_report(name: str, cases: dict[int, Case], args: argparse.Namespace) -> None:
-    """Print the lines of a case."""
     size = CASES[name][1]
     states: dict[int, list[Any]] = {n: list(case.arguments) for n, case in cases.items()}
 
@@ -226,7 +225,6 @@ def time_and_report(name: str, cases: dict[int, Case], args: argparse.Namespace)
 def compile_case(
     fn: Any, *arguments: Any, n_units: int, is_carried: bool = False, static: tuple[Any, ...] = ()
 ) -> Case:
-    """Return the case of a jitted function."""
     lowered = fn.lower(*arguments, *static)
     start_time = time.perf_counter()
     call = lowered.compile()

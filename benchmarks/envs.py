@@ -68,7 +68,6 @@ def report_rates(
     image_size: Sequence[int] | None,
     actions: Sequence[str],
 ) -> None:
-    """Print the rates of rollouts and of training."""
     base_env = envs.make(task, n_worlds, device=device)
     env_by_drones = {"as the airframe": envs.AutoReset(base_env)}
     if randomize:

@@ -57,7 +57,6 @@ class Figure(NamedTuple):
     """Command on GPUs, in the same form."""
 
     def command(self, device: str) -> str:
-        """Return the command for a device."""
         return self.gpu if device == "gpu" else self.cpu
 
 
@@ -98,7 +97,6 @@ def main() -> None:
 
 
 def list_figures() -> list[str]:
-    """Return a line for each figure."""
     machines = {name: [record["machine"] for record in load_records() if record["figure"] == name] for name in FIGURES}
     return [
         f"{name}: {figure.cpu or '-'}; {figure.gpu or '-'}; {', '.join(machines[name]) or 'no record'}"
@@ -134,7 +132,6 @@ def measure(args: argparse.Namespace) -> tuple[list[Line], list[str]]:
 
 
 def make_record(name: str, command: str, commit: str, lines: list[Line]) -> Line:
-    """Return the record of a figure."""
     machine_line = next(line for line in lines if "device" in line)
     cores = f"{machine_line['cores']} cores of {machine_line['processor']} ({machine_line['vectors']})"
     return {
@@ -164,12 +161,10 @@ def run_git(*words: str) -> str:
 
 
 def load_records() -> list[Line]:
-    """Return the records of measured figures."""
     return json.loads((RESULTS / "figures.json").read_text())
 
 
 def records_text(records: Iterable[Line]) -> str:
-    """Return records as the text of a file."""
     return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
 
 
@@ -202,7 +197,6 @@ def write_pages() -> None:
 
 
 def figure_names(text: str) -> list[str]:
-    """Return the names of the tables that a page has."""
     return MARKER.findall(text)
 
 
@@ -217,7 +211,6 @@ def insert_tables(text: str, records: list[Line]) -> str:
 
 
 def table_names() -> list[str]:
-    """Return the names of all tables."""
     return sorted(tables.TABLES.keys() | {x["figure"] for x in page_records() if "rows" in x})
 
 

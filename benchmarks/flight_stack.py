@@ -57,7 +57,6 @@ def main() -> None:
 
 
 def make_flight(args: argparse.Namespace, name: str) -> Flight:
-    """Return the compiled flight of a case."""
     reference, settings, add_plugin = CASES[name]
     sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
     if add_plugin is not None:
@@ -66,7 +65,6 @@ def make_flight(args: argparse.Namespace, name: str) -> Flight:
 
 
 def follow_trajectory(sim: Sim) -> None:
-    """Make all drones follow one trajectory."""
     sim.add(Follow(figure_eight(*FIGURE_EIGHT_SIZE), visible=False))
 
 

@@ -40,7 +40,6 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int) -> None:
-    """Print the line of one case."""
     sim = Sim(n_worlds, control=control, device=args.device, engine=args.engine)
     start_hovering(sim, control)
     step, initial_data = sim.build_step_fn().with_zeros_of(sim.data), sim.data

@@ -40,7 +40,6 @@ def main() -> None:
 
 
 def measure(case: str, n_drones: int, seconds: float) -> None:
-    """Print the line of one case."""
     sim = Sim(n_drones=n_drones, control="state", freq=500)
     speed = 1.0 if case in ("pictures", "jitter") else "max"
     with contextlib.ExitStack() as stack:

@@ -43,7 +43,6 @@ def circling_bodies(n_objects: int) -> Callable[[float], dict]:
 
 
 def measure(n_objects: int, freq: float, seconds: float) -> None:
-    """Print the line of one run."""
     bodies = circling_bodies(n_objects)
     sim = Sim(n_drones=4, control="state")
     source = RealTimeSource(FunctionSource(bodies, freq))

@@ -39,7 +39,6 @@ def main() -> None:
 
 
 def report_rate(samples: int, args: argparse.Namespace) -> None:
-    """Print the rate of commands."""
     sim = Sim(control=args.control, device=args.device)
     start_hovering(sim, args.control)
     settings = {"substeps": args.substeps, "knots": args.knots, "freq": args.freq}

@@ -49,7 +49,6 @@ def main() -> None:
 
 
 def measure_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Print and return one line for each case."""
     sizes = [("worlds", n, 1) for n in powers_of_4(args.most_worlds)]
     sizes += [("drones", max(args.total // n, 1), n) for n in powers_of_4(args.most_drones)]
     lines = []
@@ -74,7 +73,6 @@ def powers_of_4(limit: int) -> list[int]:
 
 
 def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> dict[str, Any]:
-    """Return the results of one case."""
     sim = Sim(**case, device=device, controller="crazyflow")
     flight = Flight(sim, case["control"], n_steps, device)
     step_s = medians({"step": flight.seconds}, repeats)["step"]

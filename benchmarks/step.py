@@ -72,7 +72,6 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
 def build_sim(
     args: argparse.Namespace, engine: str, controller: str, control: str, integrator: str, n_worlds: int, n_drones: int
 ) -> Sim:
-    """Return the simulation of a case."""
     sim = Sim(
         n_worlds,
         n_drones,

@@ -39,7 +39,6 @@ def pivot(
 
 
 def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a Markdown table."""
     head = list(head)
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
@@ -65,7 +64,6 @@ def case_text(line: Line) -> str:
 
 
 def worlds_text(line: Line) -> str:
-    """Return the number of worlds as text."""
     return f"{line['n_worlds']:,}"
 
 
@@ -208,7 +206,6 @@ def env_rates(lines: list[Line]) -> str:
 
 
 def poles_text(line: Line) -> str:
-    """Return the poles of a scene as text."""
     return f"{line['n_poles']:,} {'movable' if line['movable'] else 'fixed'} poles" if line["n_poles"] else "none"
 
 
@@ -628,5 +625,4 @@ Any other table is one of ``docs/results/tables.json``.
 
 
 def figures_of(name: str) -> tuple[str, ...]:
-    """Return the figures of a table."""
     return TABLES[name][0] if name in TABLES else (name,)

@@ -267,7 +267,6 @@ def main() -> None:
 def measure_trainer(
     name: str, task: str, device: str, n_worlds: int, config: ppo.Config, n_seeds: int, n_starts: int
 ) -> dict[str, Any]:
-    """Return the line of one trainer and number of worlds."""
     env, eval_env = (make(task, n, device=device) for n in (n_worlds, n_starts))
     env_steps = config.iterations * config.n_steps * n_worlds
     rates, success = [], []

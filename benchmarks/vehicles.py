@@ -61,7 +61,6 @@ def main() -> None:
 
 
 def measure(case: str, args: argparse.Namespace) -> None:
-    """Print the rate of one case."""
     n_worlds = args.worlds or DEFAULT_WORLDS["cpu" if args.device == "cpu" else "gpu"]
     sim = Sim(n_worlds, control="rotor_vel", device=args.device, engine=args.engine)
     cars = sim.add(Cars(args.cars, in_scene=False, **CASES[case]))
@@ -101,7 +100,6 @@ def measure(case: str, args: argparse.Namespace) -> None:
 
 
 def measure_errors(controller: PathController, device: str) -> None:
-    """Print the errors of one controller."""
     errors = {
         vehicle: [round(largest_error(controller, vehicle, speed, device), 4) for speed in SPEEDS]
         for vehicle in ("f1tenth_ros", "aiml_head")

@@ -210,7 +210,6 @@ class Worker:
         self._in, self._out = self._process.stdin, self._process.stdout
 
     def request(self, **request: Any) -> dict[str, Any]:
-        """Return the answer to a request."""
         self._in.write(json.dumps(request) + "\n")
         self._in.flush()
         for line in self._out:

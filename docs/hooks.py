@@ -178,7 +178,6 @@ def _member(package: griffe.Module, path: str) -> Any:
 
 
 def _definition(package: griffe.Module, path: str) -> str:
-    """Return the path of the definition of a public name."""
     member = _member(package, path)
     if member.is_module and member.name in member.members:  # a function with the name of its module
         member = member.members[member.name]

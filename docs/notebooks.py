@@ -46,7 +46,6 @@ get_ipython().system = lambda command: subprocess.run(command, shell=True, check
 
 
 def make(page: Path) -> dict[str, Any]:
-    """Return the notebook of a page, without outputs."""
     text = page.read_text()
     text = re.sub(r"\n.*\(\.\./notebooks/.*\n", "\n", text)  # the link to the notebook itself
     text = re.sub(r"\]\((\w+\.md)", r"](../learn/\1", text)

@@ -31,7 +31,6 @@ settings.load_profile(os.environ.get("CRAZYSIM_HYPOTHESIS", "same"))
 
 
 def pytest_xdist_auto_num_workers():
-    """Return the number of processes of ``make test``."""
     return machine.n_workers(machine.cores(), machine.memory())
 
 
@@ -99,7 +98,6 @@ def pytest_terminal_summary(terminalreporter):
 
 @pytest.fixture
 def x64():
-    """Run a test in float64."""
     with jax.enable_x64(True):
         yield
 
@@ -123,7 +121,6 @@ def rng():
 
 @pytest.fixture(scope="session")
 def plain_scene(tmp_path_factory):
-    """Return the path of the plain scene's file."""
     from cases import PLAIN_SCENE
 
     path = tmp_path_factory.mktemp("scene") / "scene.xml"

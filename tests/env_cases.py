@@ -70,10 +70,8 @@ def select_state(state, mask, without=()):
 
 
 def select_obs(state, mask):
-    """Return the observations of some worlds."""
     return jax.tree.map(lambda x: leaf_on_host(x)[mask], state.obs)
 
 
 def task_names(one_per_class=False):
-    """Return the names of all tasks, or one for each class of tasks."""
     return list({TASKS[name].task: name for name in reversed(TASKS)}.values() if one_per_class else TASKS)

@@ -133,7 +133,6 @@ def test_an_edit_takes_effect_at_the_next_step(sim, edit, is_rebuilt):
 
 
 def heights(data):
-    """Return the heights of all drones. (2, 2)"""
     return np.asarray(data.states.pos)[..., 2]
 
 

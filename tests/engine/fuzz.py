@@ -195,7 +195,6 @@ class Fuzzer:
     """Runner of programs on all engines, which counts the outcomes."""
 
     def __init__(self, seed: int, engines: Sequence[str] = COMPARED_ENGINES, device: str = "cpu"):
-        """Draw the inputs of all programs."""
         self.platform = device
         self.engines = tuple(e for e in engines if e != "fused" or fused.unavailable_reason(device) is None)
         self.rng = np.random.default_rng(seed)

@@ -506,7 +506,6 @@ def random_numbers(d: Draw) -> str:
 
 
 def draw_program(rng: np.random.Generator, input_shapes: dict[str, jax.ShapeDtypeStruct], n_lines: int) -> Program:
-    """Return a random program."""
     inputs = tuple(input_shapes)
     avals = list(input_shapes.values())
     lines: list[str] = []

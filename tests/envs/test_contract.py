@@ -80,7 +80,6 @@ def flight(name):
 
 
 def first_worlds(state, n=N_WORLDS):
-    """Return the state of the first worlds, on the host."""
     state = map_batched(lambda x: np.asarray(x)[:n], state)
     return state.replace(data=state.data.replace(core=state.data.core.replace(n_worlds=n)))
 

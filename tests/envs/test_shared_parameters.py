@@ -43,7 +43,6 @@ def with_random_parameters(data, rng):
 
 
 def drone_states(data):
-    """Return the states of the drones by name."""
     states = data.states
     return {"pos": states.pos, "vel": states.vel, "quat": states.quat, "ang_vel": states.ang_vel}
 

@@ -33,7 +33,6 @@ CASES = {
 
 
 def make_env(n_worlds, n_drones=1, **options):
-    """Return an environment."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
     task = Land(**options)
     task.install(sim)

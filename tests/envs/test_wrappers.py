@@ -44,7 +44,6 @@ def assert_same_world(a, b):
 
 
 def random_steps(env, state, n, seed=0):
-    """Return the states after each of n random steps."""
     states = []
     for i in range(n):
         state = env.step(state, random_action(state, seed + i))

@@ -120,7 +120,6 @@ def make_flight(dynamics, control, engine):
 
 
 def differentiated_inputs(data, commands):
-    """Return the inputs with respect to which gradients are computed."""
     names = ("pos", "quat", "vel", "ang_vel", "rotor_vel")
     return {"command": commands} | {name: getattr(data.states, name) for name in names}
 

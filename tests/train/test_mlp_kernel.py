@@ -50,7 +50,6 @@ def compile_for_host(tmp_path_factory):
 
 @pytest.fixture
 def on_host(monkeypatch, compile_for_host):
-    """Run kernels on the host."""
     lock = threading.Lock()
 
     def run_kernel(source, name, grid, arrays, result):

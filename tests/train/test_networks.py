@@ -37,7 +37,6 @@ RUN_SETTINGS = {"n_worlds": 16, "options": {"seconds": 0.1, "randomize": "generi
 
 
 def train_quietly(folder, config, network=None, iterations=2, **options):
-    """Train hover with a tiny network."""
     config = TrainConfig.create(
         "hover", **RUN_SETTINGS, config=SMALL_CONFIG | {"iterations": iterations} | config, network=network
     )
@@ -45,7 +44,6 @@ def train_quietly(folder, config, network=None, iterations=2, **options):
 
 
 def init_learner(env, **config):
-    """Return an untrained learner of one seed, and its configuration."""
     config = ppo.Config(**SMALL_CONFIG | config)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     return learner, config
@@ -266,7 +264,6 @@ def plain_network():
 
 
 def network_of_page():
-    """Return the network that the page on training makes with Flax."""
     pytest.importorskip("flax")
     blocks = re.findall(r"```py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     (block,) = (block for block in blocks if "from flax " in block)

@@ -57,7 +57,6 @@ def train_quietly(folder, config, **options):
 
 @pytest.fixture(scope="module")
 def uninterrupted_run(tmp_path_factory):
-    """Return an uninterrupted run of four iterations."""
     folder = tmp_path_factory.mktemp("run") / "whole"
     return train_quietly(folder, small_config())
 
@@ -477,7 +476,6 @@ class ConstantPolicy(PyTree):
     """Action. (k,)"""
 
     def __call__(self, obs):
-        """Return the action of every drone."""
         return jnp.broadcast_to(self.action, (*obs["pos"].shape[:-1], *self.action.shape))
 
 

@@ -315,7 +315,6 @@ def test_angles_that_wrap_are_interpolated_across_the_wrap(flights):
 
 
 def concatenate_flights(flights):
-    """Return three flights as one flight of 6 s."""
     parts = range(3)
     return {k: np.concatenate([flights[i][k] + (2.0 * i if k == "t" else 0) for i in parts]) for k in flights[0]}
 

@@ -24,7 +24,6 @@ def swarm():
 
 @pytest.fixture
 def script(swarm):
-    """Return the swarm as scripts use it."""
     swarm.sim.reset()
     swarm.advance(0.02)
     for commander in swarm.commanders:

@@ -366,7 +366,6 @@ def device(swarm):
 
 
 def send(device, port, channel, data):
-    """Return the answers of a device to a packet."""
     return [bytes(answer) for answer in device.handle(bytes([port << 4 | 0x0C | channel]) + bytes(data))]
 
 

@@ -19,7 +19,6 @@ def pack_archive(files):
 
 
 def create_show_json(n, **settings):
-    """Return the ``show.json`` of a show with n drones."""
     drones = []
     for i in range(n):
         drone_settings = {

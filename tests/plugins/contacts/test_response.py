@@ -86,7 +86,6 @@ def test_the_height_of_a_bounce_follows_from_the_restitution():
 
 
 def kinetic_energy(data):
-    """Return the kinetic energy of every drone, J."""
     mass, inertia = float(data.params.mass[0]), np.asarray(data.params.J, np.float64)
     vel, ang = (np.asarray(x, np.float64) for x in (data.states.vel, data.states.ang_vel))
     return 0.5 * mass * (vel**2).sum(-1) + 0.5 * np.einsum("...i,ij,...j", ang, inertia, ang)
