@@ -48,15 +48,12 @@ def add_cross(offset: Array, a: Array, b: Array) -> Array:
 
 
 def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
-    """Return ``matrix @ vector + offset`` for small arrays, column by column.
+    """Return ``matrix @ vector + offset`` for small arrays, column by column. (..., m)
 
     Args:
         matrix: (..., m, n)
         vector: (..., n)
         offset: First summand; None for zero. (..., m)
-
-    Returns:
-        (..., m)
     """
     columns = (matrix[..., :, k] * vector[..., k : k + 1] for k in range(matrix.shape[-1]))
     initial: Any = 0 if offset is None else offset

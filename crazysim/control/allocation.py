@@ -80,7 +80,7 @@ def wrench_matrix(airframe: Airframe) -> np.ndarray:
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
-    """Allocate a wrench to rotor speeds, each within its limits.
+    """Allocate a wrench to rotor speeds, rpm, each within its limits. (..., n_rotors)
 
     The wrench is allocated with the least-norm inverse of the mixing matrix. Each rotor thrust is then clipped
     independently, as in Crazyflow. The Crazyflie firmware instead lowers all motors by the excess of the highest motor,
@@ -90,9 +90,6 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     Args:
         cmd: Collective thrust, N, and body torque, N m. (..., 4)
         params: Parameters, shared or with the same leading axes as the command.
-
-    Returns:
-        Rotor speeds, rpm. (..., n_rotors)
     """
     p = params
     force = cmd[..., :1]

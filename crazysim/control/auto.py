@@ -138,7 +138,7 @@ class AutoMemory(PyTree):
 
 
 def quat_error(quat: Array) -> Array:
-    """Return the rotation error between a body and a desired attitude, as tilt and yaw error.
+    """Return the error between a body and a desired attitude as tilt and yaw error, body frame, rad. (..., 3)
 
     The tilt turns the thrust the shortest way; the yaw is the remaining rotation about the thrust (Brescianini and
     D'Andrea 2018). The length of each error is ``2 sin(angle / 2)``, about the angle where it is small, and 2 at 180
@@ -146,9 +146,6 @@ def quat_error(quat: Array) -> Array:
 
     Args:
         quat: Attitude of the desired frame in the body frame, unit, xyzw. (..., 4)
-
-    Returns:
-        Rotation error, body frame, rad. (..., 3)
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
     square_cosine = w * w + z * z  # of half the tilt

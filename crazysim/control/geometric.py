@@ -68,7 +68,7 @@ def geometric_control(
     feedforward: bool = True,
     integral: Array | None = None,
 ) -> Array:
-    """Track a setpoint; return the wrench.
+    """Track a setpoint; return collective thrust, N, and body torque, N m. (..., 4)
 
     This is the controller of Lee, Leok and McClamroch (2010). A force follows from the errors of position and velocity.
     The z axis of the desired attitude is along that force. Desired body rates and angular acceleration follow from the
@@ -87,9 +87,6 @@ def geometric_control(
         feedforward: False for the law of AIMotionLab-Virtual, in which acceleration, jerk, snap, yaw rates and drag
             are not fed forward.
         integral: Acceleration that is added to the feedback, world frame, m/s^2; None for none. (..., 3)
-
-    Returns:
-        Collective thrust, N, and body torque, N m. (..., 4)
     """
     p, sp = params, setpoint
     if not feedforward:
@@ -120,14 +117,11 @@ def geometric_control(
 
 
 def attitude_torque(matrix: Array, ang_vel: Array, desired: Attitude, *, params: GeometricParams) -> Array:
-    """Return the torque that tracks an attitude with its rates (Lee, Leok and McClamroch 2010).
+    """Track an attitude and its rates (Lee, Leok and McClamroch 2010); return the torque, body frame, N m. (..., 3)
 
     Args:
         matrix: Rotation matrix, body to world. (..., 3, 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-
-    Returns:
-        Torque, body frame, N m. (..., 3)
     """
     p = params
     rotation_error, rate_error, ang_acc = attitude_errors(matrix, ang_vel, desired)

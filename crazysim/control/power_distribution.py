@@ -47,7 +47,7 @@ def torque_allocation(airframe: Airframe) -> np.ndarray:
 def distribute_power(
     thrust: Array, torque: Array, *, params: PowerDistributionParams, whole_numbers: bool = False
 ) -> Array:
-    """Return the PWM of the motors for a thrust and a torque.
+    """Distribute a thrust and a torque over the motors; return the PWM of each. (..., n_rotors)
 
     If a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
     expense of thrust. Then negative PWM is raised to zero, the firmware's default idle thrust. A thrust of zero or less
@@ -62,9 +62,6 @@ def distribute_power(
         torque: Torque about the body axes, PWM. (..., 3)
         params: Parameters, shared or with the leading axes of the command.
         whole_numbers: Whether to truncate to integers where the firmware does; the gradient ignores the truncation.
-
-    Returns:
-        PWM of each motor. (..., n_rotors)
     """
     p = params
     if whole_numbers:

@@ -40,14 +40,11 @@ def seed_key(data: SimData) -> Array:
 
 
 def world_key(data: SimData, name: str) -> Array:
-    """Return the random key of one world, for stages declared for one drone or one world.
+    """Return the typed random key of one world, for stages declared for one drone or one world. ()
 
     Args:
         data: Data of one drone or world, which provides seed, world, episode and step.
         name: Name of the stage; different names give different numbers.
-
-    Returns:
-        Typed key. ()
     """
     return _key(data, name)
 
@@ -63,14 +60,11 @@ def member_key(data: SimData, population: str, name: str) -> Array:
 
 
 def world_keys(data: SimData, name: str) -> Array:
-    """Return the random keys of all worlds, equal to ``world_key`` of each.
+    """Return the typed random keys of all worlds, equal to ``world_key`` of each. (n_worlds,)
 
     Args:
         data: Data of the simulation, which provides seed, episodes and steps.
         name: Name of the stage; different names give different numbers.
-
-    Returns:
-        Typed keys. (n_worlds,)
     """
     return _vmap_worlds(data, lambda world: world_key(world, name))
 

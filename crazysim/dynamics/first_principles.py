@@ -114,13 +114,10 @@ def dynamics(
 
 
 def saturate(cmd: Array, params: Params) -> Array:
-    """Return the rotor speed commands within the limits of the motors, rpm; zero or less switches a motor off.
+    """Limit rotor speed commands as the motors do, rpm; zero or less switches a motor off. (..., n_rotors)
 
     Args:
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
-
-    Returns:
-        Rotor speeds, rpm. (..., n_rotors)
     """
     return jnp.where(cmd <= 0, 0.0, rotation.clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
 

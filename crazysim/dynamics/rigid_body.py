@@ -17,21 +17,18 @@ MIN_STABLE_ANGLE = 0.06
 
 
 def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:
-    """Return the acceleration under a force, world frame, m/s^2 (Newton's second law).
+    """Newton's second law: the acceleration of the centre of mass, world frame, m/s^2. (..., 3)
 
     Args:
         force: Sum of all forces except gravity, world frame, N. (..., 3)
         mass: Mass, kg. (..., 1)
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (..., 3)
-
-    Returns:
-        Acceleration of the centre of mass, world frame, m/s^2. (..., 3)
     """
     return force / mass + gravity_vec
 
 
 def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, rotor_momentum: Array) -> Array:
-    """Return the angular acceleration under a torque, body frame, rad/s^2 (Euler's equation).
+    """Euler's equation: the angular acceleration, body frame, rad/s^2. (..., 3)
 
     ``J w' = torque - w x (J w + h)``
 
@@ -41,9 +38,6 @@ def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, 
         J: Inertia about the centre of mass, body frame, kg m^2. (..., 3, 3)
         J_inv: Inverse of the inertia, 1/(kg m^2). (..., 3, 3)
         rotor_momentum: Angular momentum h of the rotors relative to the body, body frame, N m s. (..., 3)
-
-    Returns:
-        Angular acceleration, body frame, rad/s^2. (..., 3)
     """
     return matvec(J_inv, add_cross(torque, matvec(J, ang_vel, rotor_momentum), ang_vel))
 

@@ -13,7 +13,7 @@ RPM_TO_RAD_S = 2 * math.pi / 60
 
 
 def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> Array:
-    """Return the accelerations of the rotors towards their command, rpm/s.
+    """Return the accelerations of the rotors towards their command, rpm/s. (..., n_rotors)
 
     The acceleration at the speed r is ``a (cmd - r) + b (cmd^2 - r^2)``. A motor's back-EMF gives the linear term, the
     propeller's drag the quadratic one. Spinning up is driven and spinning down is coasting, so each has its own pair
@@ -23,9 +23,6 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         rotor_dyn_coef: a, b on spin-up, then a, b on spin-down, 1/s and 1/(s rpm). (..., 1 or n_rotors, 4)
-
-    Returns:
-        Rotor accelerations, rpm/s. (..., n_rotors)
     """
     is_spin_up = cmd > rotor_vel
     a = jnp.where(is_spin_up, rotor_dyn_coef[..., 0], rotor_dyn_coef[..., 2])
@@ -34,30 +31,24 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
 
 
 def quadratic_curve(rotor_vel: Array, coefficients: Array) -> Array:
-    """Return the value of a quadratic curve over the rotor speed: thrust, N, or drag torque, N m.
+    """Evaluate a quadratic curve over the rotor speed: thrust, N, or drag torque, N m. (..., n_rotors)
 
     Args:
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         coefficients: Constant, linear and quadratic term over rpm. (..., 1 or n_rotors, 3)
-
-    Returns:
-        Value of the curve for each rotor. (..., n_rotors)
     """
     k0, k1, k2 = coefficients[..., 0], coefficients[..., 1], coefficients[..., 2]
     return k0 + rotor_vel * (k1 + rotor_vel * k2)
 
 
 def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Array) -> Array:
-    """Return the torque of the thrusts' lever arms and the propellers' drag, body frame, N m.
+    """Return the torque of the thrusts' lever arms and the propellers' drag, body frame, N m. (..., 3)
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
         drag_torque: Magnitude of each propeller's drag torque, N m. (..., n_rotors)
         L: Arm that scales the first two rows of the mixing matrix, m. (..., 1 or n_rotors)
         mixing_matrix: Rotor positions over L, and signs of the drag torque. (..., 3, n_rotors)
-
-    Returns:
-        Torque about the centre of mass, body frame, N m. (..., 3)
     """
     positions = mixing_matrix[..., :2, :]
     # One arm scales two sums, which costs less than to scale each thrust.
@@ -66,7 +57,7 @@ def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Arr
 
 
 def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the angular momentum of the spinning rotors relative to the body, body frame, N m s.
+    """Return the angular momentum of the spinning rotors relative to the body, body frame, N m s. (..., 3)
 
     It points along body z, against the sign of the drag torques.
 
@@ -74,38 +65,29 @@ def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         yaw_torque_sign: Signs of the rotors' drag torques about body z. (..., n_rotors)
         prop_inertia: Inertia of one propeller with its motor, kg m^2. (..., 1 or n_rotors)
-
-    Returns:
-        Angular momentum, body frame, N m s. (..., 3)
     """
     return along_z(jnp.sum(-RPM_TO_RAD_S * yaw_torque_sign * prop_inertia * rotor_vel, axis=-1))
 
 
 def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the torque that accelerating rotors exert on the body, ``-dh/dt``, body frame, N m.
+    """Return the torque that accelerating rotors exert on the body, ``-dh/dt``, body frame, N m. (..., 3)
 
     Args:
         rotor_acc: Rotor accelerations, rpm/s. (..., n_rotors)
         yaw_torque_sign: Signs of the rotors' drag torques about body z. (..., n_rotors)
         prop_inertia: Inertia of one propeller with its motor, kg m^2. (..., 1 or n_rotors)
-
-    Returns:
-        Torque, body frame, N m. (..., 3)
     """
     return -rotor_momentum(rotor_acc, yaw_torque_sign, prop_inertia)
 
 
 def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
-    """Return the rotor speed that produces a thrust, rpm: the upper root of the thrust curve.
+    """Solve for the rotor speed that gives a thrust, rpm: the upper root of the thrust curve. (..., n_rotors)
 
     For a thrust below the minimum of the curve, which has no root, the speed at the minimum is returned.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
         rpm2thrust: Constant, linear and quadratic term over rpm. (..., 1 or n_rotors, 3)
-
-    Returns:
-        Rotor speeds, rpm. (..., n_rotors)
     """
     return (thrust_slope(thrust, rpm2thrust) - rpm2thrust[..., 1]) / (2 * rpm2thrust[..., 2])
 

@@ -87,7 +87,7 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
 
 
 def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, Array]:
-    """Draw random numbers in [0, 1) by name, in one draw that is split in the order of the names.
+    """Draw random numbers in [0, 1) by name, in one draw that is split in the order of the names. (*batch, size) each
 
     ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). Without
     leading axes, a name appended at the end does not change the numbers of the earlier names; with leading axes it
@@ -96,9 +96,6 @@ def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, A
     Args:
         batch: Leading axes, usually the number of drones; none for numbers per world.
         sizes: Size of the last axis by name, or the shape of several last axes.
-
-    Returns:
-        (*batch, size) each
     """
     shapes = {name: (size,) if isinstance(size, int) else tuple(size) for name, size in sizes.items()}
     lengths = [int(np.prod(shape)) for shape in shapes.values()]

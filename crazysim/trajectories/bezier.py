@@ -23,26 +23,20 @@ def bernstein_matrix(degree: int) -> NDArray:
 
 
 def power_coefficients(points: NDArray) -> NDArray:
-    """Return the coefficients of a Bezier curve of u in [0, 1], constant term first.
+    """Return the coefficients of a Bezier curve of u in [0, 1], constant term first. (k, degree + 1)
 
     Args:
         points: Control points. (degree + 1, k)
-
-    Returns:
-        (k, degree + 1)
     """
     return (_power_matrix(len(points) - 1) @ points).T
 
 
 def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
-    """Return the control points of polynomials of u in [0, 1], whose degree may be raised.
+    """Return the control points of polynomials of u in [0, 1], whose degree may be raised. (degree + 1, k)
 
     Args:
         coefficients: Constant term first. (k, n)
         degree: Degree of the curve, at least ``n - 1``; None for ``n - 1``.
-
-    Returns:
-        (degree + 1, k)
     """
     n = coefficients.shape[1]
     new_degree = n - 1 if degree is None else degree
@@ -51,13 +45,10 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
 
 
 def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArray:
-    """Return polynomials restricted to the interval from ``start`` to ``end``, which is rescaled to [0, 1].
+    """Return polynomials restricted to the interval from ``start`` to ``end``, which is rescaled to [0, 1]. (k, n)
 
     Args:
         coefficients: Constant term first. (k, n)
-
-    Returns:
-        (k, n)
     """
     orders = range(coefficients.shape[1])
     scales = [(end - start) ** i for i in orders]

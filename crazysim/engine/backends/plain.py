@@ -23,9 +23,6 @@ def build(stages: Sequence[Stage], data: Record) -> tuple[Run, list[int]]:
 
     Args:
         data: Data with the structure, shapes and types of the data to step.
-
-    Returns:
-        The function, and the indices of the written leaves.
     """
     axes = Axes(data)
 

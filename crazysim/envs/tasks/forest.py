@@ -138,14 +138,11 @@ class Forest(OutcomeTask):
         return self.write(data, goal=goal)
 
     def nearest_trees(self, data: SimData, n: int) -> Array:
-        """Return the nearest trees of each drone, the nearest first.
+        """Return the nearest trees of each drone, the nearest first. (n_drones, n, 3)
 
         An entry has the horizontal vector from the drone to the trunk's surface, as components ahead and to the left,
         m, and the radius of the trunk, m. The trees of twelve cells around and in front of the drone are searched.
         Trees that are farther away than ``VIEW_RANGE``, and trees that do not stand, are returned at this distance.
-
-        Returns:
-            (n_drones, n, 3)
         """
         forest, pos = self.trees(data.core.n_drones), data.states.pos
         n_cells, cell = forest.n_cells, forest.cell

@@ -147,29 +147,23 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
 
 
 def pick_entry(x: Array, index: Array) -> Array:
-    """Return the entry with an index, by masking all entries, which is faster than indexing.
+    """Return the entry with an index, by masking all entries, which is faster than indexing. (..., k)
 
     Args:
         x: Entries. (..., n, k)
         index: Index of the entry. (...)
-
-    Returns:
-        (..., k)
     """
     is_entry = index[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
     return jnp.sum(jnp.where(is_entry, x, 0), axis=-2)
 
 
 def nearest_entries(distance: Array, x: Array, n: int) -> Array:
-    """Return the entries with the smallest distances, nearest first.
+    """Return the entries with the smallest distances, nearest first. (..., n, k)
 
     Args:
         distance: Distances, or other numbers in the same order, such as their squares. (..., m)
         x: Entries. (..., m, k)
         n: Number of entries to return, at most m.
-
-    Returns:
-        (..., n, k)
     """
     entries = []
     for _ in range(n):

@@ -83,16 +83,13 @@ def remaining_way(data: SimData) -> Array:
 
 
 def way_to_gate(pos: Array) -> Array:
-    """Return the length of the way to a gate's middle that avoids the frame, m.
+    """Return the length of the way to a gate's middle that avoids the frame, m. (...)
 
     In front of the gate it is longer than the straight line for positions outside of the funnel (``FUNNEL_RADIUS``).
     Behind the gate it leads around the frame.
 
     Args:
         pos: Position in the gate's frame, m. (..., 3)
-
-    Returns:
-        (...)
     """
     bypass = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
     bypass_distance = rotation.safe_norm(pos[..., None, :] - bypass)[..., 0]

@@ -7,16 +7,13 @@ from jax import Array
 
 
 def matvec(matrix: Array, vector: Array) -> Array:
-    """Return ``matrix @ vector`` in three operations, which compile faster than the unrolled form.
+    """Return ``matrix @ vector`` in three operations, which compile faster than the unrolled form. (..., m)
 
     On a GPU, a matrix product may be rounded to 10 bits; sums of products have full precision there.
 
     Args:
         matrix: (..., m, n)
         vector: (..., n)
-
-    Returns:
-        (..., m)
     """
     return jnp.sum(matrix * vector[..., None, :], axis=-1)
 

@@ -16,7 +16,7 @@ Model = Callable[[Array, Array], Array]
 
 
 def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Array) -> Array:
-    """Return the derivative of the state of a rigid body under a wrench.
+    """Return the derivative of the state of a rigid body under a wrench, per second. (12,)
 
     Args:
         x: Position, m, and velocity, m/s, world frame; roll, pitch, yaw, rad; body rates, rad/s. (12,)
@@ -24,9 +24,6 @@ def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Arr
         mass: Mass, kg. (1,)
         J: Inertia, body frame, kg m^2. (3, 3)
         gravity_vec: Gravitational acceleration, m/s^2. (3,)
-
-    Returns:
-        Derivative, per second. (12,)
     """
     vel, rpy, ang_vel = x[3:6], x[6:9], x[9:12]
     acc = u[0] * _z_axis(rpy) / mass + gravity_vec
@@ -43,7 +40,7 @@ def load_derivative(
     length: Array,
     attach: Array | None = None,
 ) -> Array:
-    """Return the derivative of the state of a drone with a point load on a rigid, massless rod.
+    """Return the derivative of a drone with a point load on a rigid, massless rod, per second. (16,)
 
     The rod hangs from a frictionless joint. A joint at the centre of mass exerts no torque on the drone. With thrust f,
     masses m of the drone and m_L of the load, length L of the rod and unit vector q from joint to load (Sreenath, Lee
@@ -70,9 +67,6 @@ def load_derivative(
         load_mass: Mass of the load, kg. (1,)
         length: Length of the rod, m. (1,)
         attach: Position of the joint relative to the centre of mass, body frame, m; None for zero. (3,)
-
-    Returns:
-        Derivative, per second. (16,)
     """
     vel, rpy, ang_vel, angles, angle_rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
     force = u[0] * _z_axis(rpy)

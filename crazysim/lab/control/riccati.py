@@ -21,7 +21,7 @@ N_REFINEMENTS = 2
 
 
 def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Return the stabilising solution P of the discrete Riccati equation, or NaN where there is none.
+    """Solve the discrete Riccati equation for its stabilising solution P, or NaN where there is none. (n, n)
 
         P = A^T P A - A^T P B (R + B^T P B)^-1 B^T P A + Q
 
@@ -36,9 +36,6 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
         B: Input matrix. (n, m)
         Q: Weights of the states, symmetric and positive semidefinite. (n, n)
         R: Weights of the inputs, symmetric and positive definite. (m, m)
-
-    Returns:
-        Solution P. (n, n)
     """
     P = _solve_by_doubling(A, B @ jnp.linalg.solve(R, B.T), Q)
     for _ in range(N_REFINEMENTS):
@@ -48,7 +45,7 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Return the stabilising solution P of the continuous Riccati equation, or NaN where there is none.
+    """Solve the continuous Riccati equation for its stabilising solution P, or NaN where there is none. (n, n)
 
         A^T P + P A - P B R^-1 B^T P + Q = 0
 
@@ -60,9 +57,6 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
         B: Input matrix. (n, m)
         Q: Weights of the states, symmetric and positive semidefinite. (n, n)
         R: Weights of the inputs, symmetric and positive definite. (m, m)
-
-    Returns:
-        Solution P. (n, n)
     """
     eye, G = jnp.eye(A.shape[0], dtype=A.dtype), B @ jnp.linalg.solve(R, B.T)
     shift = jnp.sqrt(jnp.sqrt(jnp.linalg.norm(G) * jnp.linalg.norm(Q))) + jnp.linalg.norm(A) / A.shape[0]

@@ -48,7 +48,7 @@ class TrackingLQRParams(RigidBodyParams):
 
 
 def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
-    """Return the derivative of the errors of a drone about a reference, for an error of its wrench.
+    """Return the derivative of the errors about a reference, for an error of the wrench, per second. (12,)
 
     To first order, the errors are the same as in ``state_error``: position, velocity, a small rotation vector e_R with
     ``R = R_d exp(e_R^)``, and ``e_w = w - R^T R_d w_d``, so that ``e_R' = e_w``.
@@ -59,9 +59,6 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
         ang_acc: Angular acceleration of the reference, body frame, rad/s^2. (3,)
         mass: Mass, kg. (1,)
         J: Inertia, body frame, kg m^2. (3, 3)
-
-    Returns:
-        Derivative, per second. (12,)
     """
     vel_error, rot_error, rate_error = error[3:6], error[6:9], error[9:12]
     w_d = reference.ang_vel

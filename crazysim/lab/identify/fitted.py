@@ -191,15 +191,12 @@ def _acceleration_terms(
 
 
 def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
-    """Return a signal, linear between samples, after a first-order lag that starts in equilibrium.
+    """Return a signal, linear between samples, after a first-order lag that starts in equilibrium. (n, ...)
 
     Args:
         x: Samples. (n, ...)
         dt: Time between two samples, s.
         rate: Rate of the lag, 1/s. (...)
-
-    Returns:
-        Samples in the unit of ``x``. (n, ...)
     """
     decay = np.exp(-rate * dt)
     later_weight = 1 - (1 - decay) / (rate * dt)  # weight of the later sample

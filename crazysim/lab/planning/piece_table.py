@@ -103,15 +103,12 @@ class PieceTable:
         return np.maximum(index, self.first_pieces[drone])
 
     def evaluate_pieces(self, piece: Ints, u: Floats, order: int = 0) -> Floats:
-        """Return a derivative of x, y, z and yaw at times within pieces.
+        """Return a derivative of x, y, z and yaw at times within pieces. (..., 4)
 
         Args:
             piece: Indices of pieces. (...)
             u: Time since the start of the piece divided by its duration. (...)
             order: Order of the derivative.
-
-        Returns:
-            (..., 4)
         """
         c = self._derivatives[order][piece]
         value = c[..., -1]

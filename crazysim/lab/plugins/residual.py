@@ -83,7 +83,7 @@ class Residual(Plugin, requires=needs_rotors):
 def residual_inputs(
     quat: Array, vel: Array, ang_vel: Array, rotor_vel: Array, params: first_principles.Params
 ) -> Array:
-    """Return the inputs of a residual, all in the body frame.
+    """Return the inputs of a residual, all in the body frame. (..., 14)
 
     They are the number 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust
     divided by weight; torque of the rotors divided by weight times arm length.
@@ -94,9 +94,6 @@ def residual_inputs(
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         params: Parameters of the model.
-
-    Returns:
-        Inputs. (..., 14)
     """
     p = params
     body_vel = rotation.rotate_inverse(quat, vel)
@@ -118,13 +115,10 @@ def residual_inputs(
 
 
 def residual_wrench(inputs: Array, residual: Residual) -> tuple[Array, Array]:
-    """Return the force, N, and the torque, N m, of a residual in the body frame: linear terms plus the network.
+    """Return force, N, and torque, N m, of a residual, body frame: linear terms plus the network. (..., 3) each
 
     Args:
         inputs: Inputs, see ``residual_inputs``. (..., 14)
-
-    Returns:
-        Force and torque. (..., 3) each
     """
     wrench = rotation.matvec(residual.linear, inputs)
     if residual.hidden is not None and residual.output is not None:

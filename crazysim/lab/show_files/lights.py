@@ -94,13 +94,10 @@ class Lights(PyTree):
         return a + weight * (b - a)
 
     def colors(self, times: ArrayLike) -> np.ndarray:
-        """Return the colours of several drones at several times, 0 to 1.
+        """Return the colours of several drones at several times, 0 to 1. (n, n_drones, 3)
 
         Args:
             times: Times, s. (n,)
-
-        Returns:
-            (n, n_drones, 3)
         """
         return np.asarray(_colors(self, jnp.asarray(times, jnp.asarray(self.times).dtype)))
 

@@ -63,7 +63,7 @@ def to_body_frame(yaw: Array, vector: Array) -> Array:
 
 
 def ackermann(steer: Array, wheelbase: float, kingpin_track: float) -> Array:
-    """Steer the front wheels so that the axes of all wheels meet in one point.
+    """Steer left and right wheel so that the axes of all wheels meet in one point; return the angles, rad. (..., 2)
 
     ``tan(left) = L tan / (L - (t / 2) tan)`` and ``tan(right) = L tan / (L + (t / 2) tan)`` where tan is the tangent of
     the steering angle in the middle, L the wheelbase and t the distance of the kingpins.
@@ -72,9 +72,6 @@ def ackermann(steer: Array, wheelbase: float, kingpin_track: float) -> Array:
         steer: Steering angle of a wheel in the middle, rad, positive to the left. (..., 1)
         wheelbase: Distance of the axles, m.
         kingpin_track: Distance of the kingpins, m.
-
-    Returns:
-        Steering angles of the left and the right wheel, rad. (..., 2)
     """
     tan = jnp.tan(steer)
     wheelbase_tan, half_track_tan = wheelbase * tan, kingpin_track / 2 * tan

@@ -189,7 +189,7 @@ class Path(PyTree):
         return (slowdown_factor * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
-        """Return the arc length, m, and the speed, m/s, at a time.
+        """Return the arc length, m, and the speed, m/s, at a time. (1,) each
 
         On an open path the vehicle rests before the start and after the end. On a closed path the motion continues in
         both directions, and the arc length increases with every lap.
@@ -197,9 +197,6 @@ class Path(PyTree):
         Args:
             index: Index of the path. ()
             t: Time since the start, s. ()
-
-        Returns:
-            Arc length and speed. (1,) each
         """
         duration, is_closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
         laps = jnp.where(is_closed, lax.floor(t / duration), 0.0)
@@ -217,7 +214,7 @@ class Path(PyTree):
         return (s + laps * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
-        """Project a position to a path, from a guess nearby; return the arc length of the nearest point.
+        """Project a position to a path, from a guess nearby; return the arc length of the nearest point, m. ()
 
         Newton's method, with steps ``along_error / (1 - curvature lateral_error)`` of at most ``MAX_NEWTON_STEP``. The
         errors are the components of the offset along the tangent and to its left. Usable in compiled code.
@@ -227,9 +224,6 @@ class Path(PyTree):
             index: Index of the path. ()
             pos: Position, world frame, m. (2,)
             guess: Arc length nearby, m. ()
-
-        Returns:
-            Arc length, m. ()
         """
         s, length, is_closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):

@@ -65,7 +65,7 @@ class Grid(NamedTuple):
 
 
 def interpolate(values: Array, position: Array) -> Array:
-    """Return values between the nodes of a grid, linear along each axis (trilinear with three axes).
+    """Interpolate between the nodes of a grid, linearly along each axis (trilinear with three axes). (..., *core)
 
     A position outside takes the value of the nearest position inside. The gradient with respect to the position is the
     gradient within the cell; outside the grid it is zero.
@@ -73,9 +73,6 @@ def interpolate(values: Array, position: Array) -> Array:
     Args:
         values: Values at the nodes. (n_1, ..., n_d, *core)
         position: Position in units of cells, 0 to n - 1 along each axis. (..., d)
-
-    Returns:
-        Interpolated values. (..., *core)
     """
     n_axes = position.shape[-1]
     axis_weights, nodes = [], []

@@ -111,14 +111,11 @@ def range_deviation(distance: Array, scale: Array) -> Array:
 
 
 def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return the distance to level ground along the body's negative z axis, m, and True if the ground is in view.
+    """Return the distance to level ground along the body's -z axis, m, and True if the ground is in view. (1,) each
 
     Args:
         data: The data of one drone.
         pos: Position of the sensor relative to the centre of mass, body frame, m. (3,)
-
-    Returns:
-        Distance and flag. (1,) each
     """
     s = data.states
     cosine = rotation.z_axis(s.quat)[2:]
