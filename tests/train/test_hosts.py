@@ -64,13 +64,12 @@ class Process:
         return self._process.poll() is not None
 
 
-def start(folder, arguments, others=((), ()), program=("-m", "crazysim")):
-    """Return the processes of two hosts that run a command, with further arguments of each host."""
-    address = free_address()
-    common = f"--coordinator {address} --hosts 2 --heartbeat-timeout {HEARTBEAT_TIMEOUT}".split()
+def start(folder, arguments):
+    """Return the processes of two hosts that run ``HOST``."""
+    common = f"--coordinator {free_address()} --hosts 2 --heartbeat-timeout {HEARTBEAT_TIMEOUT}".split()
     return [
-        Process(folder, f"host{i}", sys.executable, *program, *arguments, *common, "--host-id", str(i), *own)
-        for i, own in enumerate(others)
+        Process(folder, f"host{i}", sys.executable, "-c", HOST, *arguments, *common, "--host-id", str(i))
+        for i in range(2)
     ]
 
 
@@ -122,7 +121,7 @@ sys.exit(main(sys.argv[1:]))
 def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_path):
     """One process with all devices trains the same policy, and continues the training after a host was killed."""
     out, one_process_folder = tmp_path / "two", tmp_path / "one"
-    first, second = start(tmp_path, training_arguments(out, "--iterations", "3"), program=("-c", HOST))
+    first, second = start(tmp_path, training_arguments(out, "--iterations", "3"))
     first.wait_for("trained to the end")
     copytree(out, tmp_path / "ended")
     wait_for(lambda: iteration(out) > 3 or first.has_ended)
@@ -147,16 +146,6 @@ def test_two_hosts_train_the_policy_of_one_stop_together_and_can_lose_one(tmp_pa
     assert iteration(out) == last + 1
 
 
-@pytest.mark.long("two processes import JAX")
-def test_hosts_with_other_settings_stop_together(tmp_path):
-    others = ((), ("--seed", "1"))
-    for i, process in enumerate(start(tmp_path, training_arguments(tmp_path / "out", "--iterations", "1"), others)):
-        status, text = process.end()
-        assert status == 2
-        assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text, i
-    assert not (tmp_path / "out" / CHECKPOINT_FILE).exists()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -171,26 +160,33 @@ def test_options_of_hosts_are_checked(options, message, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.long("two processes import JAX")
-def test_jax_finds_the_hosts_of_a_scheduler_or_there_is_an_error(tmp_path):
-    """A step of SLURM with one task is a training of one host. Without a scheduler the options name the hosts, and a
-    coordinator that does not answer is an error with its address."""
-    arguments = training_arguments(tmp_path, "--set", "secnds=1")
-    address = free_address()
-    slurm = {"JOB_ID": "1", "STEP_NODELIST": "localhost", "NTASKS": "1", "PROCID": "0", "LOCALID": "0"}
+@pytest.mark.long("three processes import JAX")
+def test_hosts_of_a_scheduler_with_other_settings_stop_together_and_without_one_there_is_an_error(tmp_path):
+    """JAX finds the hosts by SLURM's variables. Without a scheduler the options name the hosts, and a coordinator that
+    does not answer is an error with its address."""
+    out, address = tmp_path / "out", free_address()
+    arguments = training_arguments(out, "--iterations", "1")
+    auto = [*arguments, "--coordinator", "auto"]
+    slurm = {"JOB_ID": "1", "STEP_NODELIST": "localhost", "NTASKS": "2"}
     variables = {f"SLURM_{name}": value for name, value in slurm.items()}
     variables |= {"JAX_COORDINATOR_PORT": address.rpartition(":")[2]}
-    auto = [*arguments, "--coordinator", "auto"]
-    started = Process(tmp_path, "slurm", sys.executable, "-m", "crazysim", *auto, **variables)
-    silent = f"--coordinator {address} --hosts 2 --host-id 1 --connect-timeout 1".split()
+    hosts = [
+        Process(tmp_path, f"host{i}", sys.executable, "-m", "crazysim", *auto, "--seed", str(i),
+                SLURM_PROCID=str(i), SLURM_LOCALID=str(i), **variables)
+        for i in range(2)
+    ]  # fmt: skip
+    silent = f"--coordinator {free_address()} --hosts 2 --host-id 1 --connect-timeout 1".split()
     program = f"from crazysim.__main__ import main; print(main({auto})); main({arguments + silent})"
     alone = Process(tmp_path, "alone", sys.executable, "-c", program)
-    (status, text), (other_status, other_text) = started.end(), alone.end()
-    assert status == 2
-    assert "host 0 of 1: 2 cpu" in text
-    assert "did you mean seconds?" in text
-    assert "expected the variables of SLURM or Open MPI" in other_text
-    assert "--hosts and --host-id" in other_text
-    assert "\n2\n" in other_text
-    assert other_status == -signal.SIGABRT
-    assert f"host 1 of 2 connects with {address}" in other_text
+    for i, host in enumerate(hosts):
+        status, text = host.end()
+        assert status == 2
+        assert f"host {i} of 2: 2 cpu" in text
+        assert "expected the same settings on all hosts, got seed = 0 on host 0 and 1 on host 1" in text
+    assert not (out / CHECKPOINT_FILE).exists()
+    status, text = alone.end()
+    assert status == -signal.SIGABRT
+    assert "expected the variables of SLURM or Open MPI" in text
+    assert "--hosts and --host-id" in text
+    assert "\n2\n" in text
+    assert f"host 1 of 2 connects with {silent[1]}" in text
