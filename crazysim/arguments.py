@@ -60,7 +60,7 @@ def check_value(
     Args:
         value_types: Types that it may have, from ``annotated_types``; empty for any.
         shapes: Shapes of numbers; None for any.
-        whole: True for whole numbers, which they must be in any case if ``int`` is the only numeric type.
+        whole: Whether only whole numbers are accepted, as always if ``int`` is the only numeric type.
         remedy: Sentence for the end of messages.
     """
     if not value_types or (value is None and type(None) in value_types):

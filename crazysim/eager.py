@@ -61,12 +61,12 @@ def fetch_rows(x: Any, rows: Any) -> NDArray:
 
 
 def is_on_host(x: Any) -> bool:
-    """Return whether an array is in the host's memory: a NumPy array, or a JAX array on the CPU."""
+    """Whether an array is in the host's memory: a NumPy array, or a JAX array on the CPU."""
     if isinstance(x, jax.core.Tracer):
         return False
     return not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())
 
 
 def is_traced(values: Sequence[Any]) -> bool:
-    """Return True if a leaf of the values is traced: within ``jit``, ``grad`` or a stage of the engine."""
+    """Whether a leaf of the values is traced: within ``jit``, ``grad`` or a stage of the engine."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))

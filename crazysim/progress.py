@@ -17,7 +17,8 @@ def progress_bar(
         items: Items; None for a bar that advances when its method ``update`` is called.
         label: Text in front of the bar.
         unit: Name of one item.
-        required: True to raise an error where tqdm is not installed; False to print the label and return the items.
+        required: Whether to raise an error where tqdm is not installed; else the label is printed and the items are
+            returned.
         **settings: Settings of tqdm, such as ``total``.
 
     Raises:

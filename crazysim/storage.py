@@ -61,7 +61,7 @@ def as_path(path: str | Path) -> Path:
 
 
 def is_file(path: str | Path) -> bool:
-    """Return True if a file of that path exists, and False for what cannot be a path."""
+    """Whether a file of that path exists; False for what cannot be a path."""
     try:
         return Path(path).is_file()
     except (OSError, TypeError, ValueError):

@@ -118,7 +118,7 @@ def build_sim(n_worlds: int, n_drones: int, device: str) -> Sim:
 
 
 def find_pole_contacts(sim: Sim) -> np.ndarray:
-    """Return True where a drone touches a pole. (n_worlds, n_drones, n_poles)"""
+    """Whether a drone touches a pole. (n_worlds, n_drones, n_poles)"""
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 

@@ -94,7 +94,7 @@ def specified_options(options: argparse.Namespace, *names: str) -> dict[str, Any
 
 
 def has_screen() -> bool:
-    """Return True if there may be a screen for a window; on Linux, if an environment variable names one."""
+    """Whether there may be a screen for a window; on Linux, if an environment variable names one."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

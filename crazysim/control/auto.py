@@ -172,7 +172,7 @@ class Auto(Controller):
     outer_freq: int | None = 100
     """Rate at which setpoints take effect, Hz; ``state_freq`` of a simulation replaces it. None without setpoints."""
     yaw_rate: bool = False
-    """True if the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
+    """Whether the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
 
     def adapt(self, control: Control, fitted_model: str | None) -> Controller | None:
         if fitted_model is None and control in self.levels:

@@ -128,7 +128,7 @@ def bandwidth(airframe: Airframe, freq: int, lag_rate: float | None = None, limi
     Args:
         freq: Rate of the controller, Hz.
         lag_rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
-        limits_reaction: True for a controller that does not compensate the reaction to accelerating rotors.
+        limits_reaction: Whether the reaction to accelerating rotors is a limit, unless the controller compensates it.
     """
     loop_rate = 1 / (1 / (rotor_rate(airframe) if lag_rate is None else lag_rate) + 1.5 / freq)
     axis_rates = np.minimum(

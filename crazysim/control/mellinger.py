@@ -136,7 +136,7 @@ class Mellinger(Controller, params=MellingerParams, memory=MellingerMemory):
     freq: int = 500
     """Rate of the controller, Hz (``ATTITUDE_RATE``)."""
     whole_numbers: bool = False
-    """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
+    """Whether to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams

@@ -55,7 +55,7 @@ class PID(Controller):
     loop acts on Euler angles, and therefore disturbs the rates of a strongly tilted drone. False to follow the yaw rate
     in the rate loop."""
     whole_numbers: bool = False
-    """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
+    """Whether to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
     def params(self, airframe: Airframe) -> PIDParams:
         require_gains(airframe, PIDParams)

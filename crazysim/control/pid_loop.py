@@ -117,7 +117,7 @@ def pid_step(
         measured: Measured values. (..., 3)
         freq: Rate, Hz.
         loop: Gains and limits, shared or with the leading axes of the error.
-        is_angle: True for loops of angles in degrees that wrap around.
+        is_angle: Whether the loops are of angles in degrees, which wrap around.
 
     Returns:
         Outputs (..., 3); the memory.

@@ -102,7 +102,7 @@ class Controller:
     memory_type: ClassVar[type[PyTree] | None] = None
     """Class of the memory, declared as ``class PI(Controller, memory=PIMemory)``."""
     follows_rates: ClassVar[bool] = False
-    """True if the controller also follows the body rates of an attitude command,
+    """Whether the controller also follows the body rates of an attitude command,
     ``data.controls.attitude.staged_ang_vel_des``."""
 
     def __init_subclass__(
@@ -192,7 +192,7 @@ class Controller:
 
     @property
     def has_outer(self) -> bool:
-        """True if the controller has an outer loop."""
+        """Whether the controller has an outer loop."""
         return self.outer_freq is not None
 
 

@@ -14,7 +14,7 @@ Carry = TypeVar("Carry")
 
 
 def any_lane(condition: Array) -> Array:
-    """Return True where a condition holds for this element or for another element that is computed together with it.
+    """Whether a condition holds for this element or for another element that is computed together with it.
 
     Which elements are computed together depends on the engine, so the return value may decide what is computed, but
     must not change results. For example, if all elements of a vector take the same path through a loop, the loop reads

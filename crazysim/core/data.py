@@ -121,7 +121,7 @@ class SimCore(PyTree):
     episode: Array = leaf("world")
     """Number of resets of the world. Its random numbers depend on it. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """True where the world has become non-finite in a leaf that ``SimData.roles`` watches, or has taken more than
+    """Whether the world has become non-finite in a leaf that ``SimData.roles`` watches, or has taken more than
     ``MAX_STEPS`` steps, since its last reset. (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
@@ -137,7 +137,7 @@ class SimCore(PyTree):
     rng_key: Array = leaf("parameter", 0)
     """Random key; resets do not change it. (n_worlds, n_drones) for one key per drone, else ()"""
     mjx_synced: Array = leaf("shared", 0)
-    """True if the scene matches this data. ()"""
+    """Whether the scene matches this data. ()"""
 
     @staticmethod
     def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: ArrayLike, rng_key: int | Array) -> SimCore:
@@ -172,7 +172,7 @@ class Objects(PyTree):
     names: tuple[str, ...] = static()
     """Names of the bodies of the objects."""
     recorded: bool = static(default=False)
-    """True if a recording determines the poses of all objects, even those that plugins move, such as loads."""
+    """Whether a recording determines the poses of all objects, even those that plugins move, such as loads."""
 
     def with_poses(self, poses: Mapping[str, tuple[Array, Array]]) -> Objects:
         """Return the objects of one world with new poses for some of them.

@@ -160,7 +160,7 @@ class Integration:
 
     @property
     def couples_world(self) -> bool:
-        """True if a plugin couples the drones of a world, so that the stage has the scope ``world``."""
+        """Whether a plugin couples the drones of a world, so that the stage has the scope ``world``."""
         return any(plugin.constrains and plugin.coupling == "world" for plugin in self.plugins)
 
     def derivative(self, data: SimData) -> SimStateDeriv:

@@ -115,7 +115,7 @@ def param(
         positive: Whether to refuse zero and negative values.
         per_axis: Whether to accept one number for all axes of a vector.
         dtype: Type; None for the type of the states.
-        whole: True for a whole number, of the type of the states unless ``dtype`` is another.
+        whole: Whether it is a whole number, of the type of the states unless ``dtype`` is another.
         shapes: Shapes of a shared number, ``"any"`` for an axis of any length.
         sparse: As in ``crazysim.engine.pytree.leaf``.
         keep: False for a number that only ``bind`` reads, to calculate others; it is None in ``data.plugins``.
@@ -146,7 +146,7 @@ def state(
         core: Shape of the state of one drone, or of one world.
         scope: ``"drone"`` or ``"world"``; ``"member"`` in a population.
         dtype: Type; None for the type of the states.
-        optional: True for a state that is None unless ``bind`` gives it a value.
+        optional: Whether the state is None unless ``bind`` gives it a value.
         sparse: As in ``crazysim.engine.pytree.leaf``.
         scratch: As in ``crazysim.engine.pytree.leaf``.
         init: For type checkers: users do not set states.
@@ -445,14 +445,14 @@ class Plugin(PyTree):
 
     @property
     def is_dynamic(self) -> bool:
-        """True if the integrator must call ``influence``, ``derivative`` or ``constrain``."""
+        """Whether the integrator must call ``influence``, ``derivative`` or ``constrain``."""
         cls = type(self)
         is_overridden = cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
         return is_overridden or self.constrains
 
     @property
     def constrains(self) -> bool:
-        """True if the plugin overrides ``constrain``, which joins bodies of the plugin to drones."""
+        """Whether the plugin overrides ``constrain``, which joins bodies of the plugin to drones."""
         return type(self).constrain is not Plugin.constrain
 
     @property
@@ -479,7 +479,7 @@ class Plugin(PyTree):
 
     @classmethod
     def has_arrays(cls) -> bool:
-        """True if the class declares numbers, states or records of them."""
+        """Whether the class declares numbers, states or records of them."""
         return not all(f.metadata.get("static") for f in dataclasses.fields(cls))
 
     def record(self, sim: Simulation) -> PyTree | None:
@@ -557,7 +557,7 @@ class Plugin(PyTree):
 
     @property
     def resets_episode(self) -> bool:
-        """True if ``reset_episode`` must be called."""
+        """Whether ``reset_episode`` must be called."""
         return type(self).reset_episode is not Plugin.reset_episode
 
     def influence(self, data: SimData) -> SimData:
@@ -610,7 +610,7 @@ class Plugin(PyTree):
 
     @property
     def moves_objects(self) -> bool:
-        """True if the plugin moves objects of the scene by ``move_objects``."""
+        """Whether the plugin moves objects of the scene by ``move_objects``."""
         return type(self).move_objects is not Plugin.move_objects
 
     def observations(self, data: SimData) -> dict[str, Array]:

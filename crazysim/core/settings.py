@@ -68,7 +68,7 @@ class Setting(NamedTuple):
     is_parameter: bool = False
     """True for a field of a plugin that only fills numbers of its record."""
     per_axis: bool = False
-    """True to accept one number for all axes of a vector."""
+    """Whether to accept one number for all axes of a vector."""
     dtype: DTypeLike | None = None
     """Type of the numbers; None for real ones."""
     shapes: Shapes | None = None
@@ -105,7 +105,7 @@ def color(per_item: bool = False) -> Any:
     """Declare a field with a colour, red, green, blue and opacity from 0 to 1, which is None by default.
 
     Args:
-        per_item: True for a field that also accepts an array with one colour for each item. (n, 4)
+        per_item: Whether the field also accepts an array with one colour for each item. (n, 4)
     """
     return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if per_item else ((4,),), keep=False)
 
@@ -223,7 +223,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
 
 
 def is_real(array: Any) -> bool:
-    """Return whether an array has floating-point numbers or integers, neither bools nor complex numbers."""
+    """Whether an array has floating-point numbers or integers, neither bools nor complex numbers."""
     return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
 
 

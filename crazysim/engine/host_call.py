@@ -222,7 +222,7 @@ class HostCall:
 
 
 def is_host_call_possible(kernels: Sequence[Kernels]) -> bool:
-    """Return whether kernels can be called without XLA.
+    """Whether kernels can be called without XLA.
 
     Each must check its results and write them into new memory, not into rows in place. None may write random keys.
     """

@@ -113,7 +113,7 @@ __all__ = [
 ]
 
 FALLBACKS = os.environ.get("CRAZYSIM_JAX_FALLBACKS") == "1"
-"""True to use the replacements that are listed above, where they are implemented."""
+"""Whether to use the replacements that are listed above, where they are implemented."""
 
 
 # Jaxprs ---------------------------------------------------------------------------------------------------------
@@ -449,7 +449,7 @@ def jit_donating(fn: Callable[..., Any]) -> Any:
 
 
 def is_key(x: Any) -> bool:
-    """Return whether an array, or its shape and type, holds random keys."""
+    """Whether an array, or its shape and type, holds random keys."""
     return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
@@ -474,7 +474,7 @@ def add_vmap_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[
 
 
 def is_symbolic_zero(tangent: Any) -> bool:
-    """Return whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
+    """Whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
     return tangent is None or isinstance(tangent, SymbolicZero)
 
 

@@ -104,7 +104,7 @@ class Planner(NamedTuple):
     engine: str
     """Engine that the user chose, one of ``ENGINES``."""
     strict: bool
-    """True to raise an error where otherwise a slower engine would run, with a warning."""
+    """Whether to raise an error where otherwise a slower engine would run, with a warning."""
     location: Location
     """Devices that hold the data."""
     reported: set[str]

@@ -46,11 +46,10 @@ def leaf(
         core_ndim: Number of dimensions of the core shape; None for any.
         core: The core shape, if it is fixed. It prevents, for example, masses of three worlds from being taken
             for masses along three axes.
-        sparse: True for a parameter in which zeros remove terms of the equations, such as an offset along one axis.
-            While the parameter is shared, a step is compiled without these terms. It is compiled again after a zero
-            changes.
-        scratch: True for an array that only carries numbers from one stage of a step to another. Its values are not
-            kept after the step.
+        sparse: Whether zeros of the parameter remove terms of the equations, as for an offset along one axis. While the
+            parameter is shared, a step is compiled without these terms. It is compiled again after a zero changes.
+        scratch: Whether the array only carries numbers from one stage of a step to another. Its values are not kept
+            after the step.
         airframe: Dotted path or function of the airframe that gives the value, in ``AirframeParams``.
     """
     expect(scope in get_args(Scope), f"a scope, one of {', '.join(get_args(Scope))}", scope)

@@ -281,7 +281,7 @@ class Env(ABC):
         return self._evaluate_task(self.task.subjects, state)
 
     def succeeded(self, state: EnvState) -> Array | None:
-        """Return True where a drone has succeeded; None if the task defines success by an error that stays small.
+        """Whether a drone has succeeded; None if the task defines success by an error that stays small.
 
         Returns:
             (n_worlds, n_drones)

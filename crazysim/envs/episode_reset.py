@@ -32,9 +32,9 @@ class EpisodeReset:
         batched_stages = [name for name, fn in other_stages if not isinstance(fn, Stage)]
         batched_stages += [] if first_stage[1] is reset else [first_stage[0]]
         self.has_foreign_record = "batch" in jax.tree.leaves(scopes(sim.default_data))
-        """True if a record in ``data.plugins`` is a class of another library. Such records are not split by world."""
+        """Whether a record in ``data.plugins`` is a class of another library. Such records are not split by world."""
         self.takes_all_worlds = bool(batched_stages) or self.has_foreign_record
-        """True if ``reset_data`` takes all worlds at once."""
+        """Whether ``reset_data`` takes all worlds at once."""
         self.batched_reason: str | None = None
         """Reason why resets are computed for all worlds and then used where an episode begins; None if only worlds in
         which an episode begins are reset."""

@@ -30,7 +30,7 @@ _NAMED_REFERENCES: set[str] = set()
 
 
 def is_reference(name: str) -> bool:
-    """Return True if the name of a task refers to a file or a module."""
+    """Whether the name of a task refers to a file or a module."""
     return ":" in name or name.endswith(".py")
 
 

@@ -33,7 +33,7 @@ class ResetPolicy:
     after_step: Callable[[EnvState], EnvState]
     """``after_step(state)``: the state at the end of any step, before a reset."""
     keeps_final_obs: bool
-    """True if ``after_step`` adds ``info["final_obs"]``."""
+    """Whether ``after_step`` adds ``info["final_obs"]``."""
     after_reset: Callable[[EnvState, EnvState], EnvState]
     """``after_reset(final_state, new_state)``: the state at the start of a new episode, from the states before and
     after the reset."""

@@ -48,17 +48,17 @@ class Transition(PyTree):
 
     @property
     def terminated(self) -> Array:
-        """True where the episode ended by success or failure. (n_worlds,)"""
+        """Whether the episode ended by success or failure. (n_worlds,)"""
         return self.state.terminated
 
     @property
     def truncated(self) -> Array:
-        """True where the episode reached its time limit. (n_worlds,)"""
+        """Whether the episode reached its time limit. (n_worlds,)"""
         return self.state.truncated
 
     @property
     def done(self) -> Array:
-        """True where the episode is over. (n_worlds,)"""
+        """Whether the episode is over. (n_worlds,)"""
         return self.state.done
 
     @property

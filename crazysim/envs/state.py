@@ -47,9 +47,9 @@ class EnvRecord(PyTree):
     reward: Array = leaf("drone")
     """Reward of the last step. (n_worlds, n_drones)"""
     terminated: Array = leaf("world")
-    """True where the episode ended by success or failure. (n_worlds, 1)"""
+    """Whether the episode ended by success or failure. (n_worlds, 1)"""
     truncated: Array = leaf("world")
-    """True where the episode reached its time limit. (n_worlds, 1)"""
+    """Whether the episode reached its time limit. (n_worlds, 1)"""
     action: Array = leaf("drone", 1)
     """Action of the last step. (n_worlds, n_drones, k)"""
     drone_info: dict[str, Any] = leaf("drone", None)
@@ -61,7 +61,7 @@ class EnvRecord(PyTree):
     next_action: Array = leaf("drone", 1, scratch=True)
     """Action passed to ``step``; after ``act``, the action as changed by the wrappers. (n_worlds, n_drones, k)"""
     must_reset: Array = leaf("world", scratch=True)
-    """True where a new episode begins within the step. (n_worlds, 1)"""
+    """Whether a new episode begins within the step. (n_worlds, 1)"""
     task: str = static(default="")
     """Name of the task, whose states no other environment takes."""
 
@@ -102,17 +102,17 @@ class EnvState(PyTree):
 
     @property
     def terminated(self) -> Array:
-        """True where the episode ended by success or failure. (n_worlds,)"""
+        """Whether the episode ended by success or failure. (n_worlds,)"""
         return self._squeeze_axis(self.record.terminated)
 
     @property
     def truncated(self) -> Array:
-        """True where the episode reached its time limit. (n_worlds,)"""
+        """Whether the episode reached its time limit. (n_worlds,)"""
         return self._squeeze_axis(self.record.truncated)
 
     @property
     def done(self) -> Array:
-        """True where the episode is over. (n_worlds,)"""
+        """Whether the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
 
     @property

@@ -155,7 +155,7 @@ class Task:
         raise NotImplementedError(self._undefined("rewards(data, action, last_action)"))
 
     def terminated(self, data: SimData) -> Array:
-        """Return True where the episode ended by success or failure. ()"""
+        """Whether the episode ended by success or failure. ()"""
         raise NotImplementedError(self._undefined("terminated(data)"))
 
     def error(self, data: SimData) -> Array:
@@ -195,7 +195,7 @@ class Task:
         return None
 
     def succeeded(self, data: SimData) -> Array | None:
-        """Return True where a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
+        """Whether a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
         return None
 
     def _undefined(self, method: str) -> str:

@@ -70,7 +70,7 @@ class Access:
 
 
 def is_own_name(host: str, listen_address: str) -> bool:
-    """Return True if a ``Host`` header has a name of this machine that no other site can have.
+    """Whether a ``Host`` header has a name of this machine that no other site can have.
 
     Such names are IP addresses, ``localhost``, the machine's name, and the address that the server listens at.
 

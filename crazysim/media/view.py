@@ -60,7 +60,7 @@ class View:
     trail: float = setting(default=0.0, low=0.0)
     """Duration of the drones' trails, s; 0 for no trails."""
     setpoints: bool = False
-    """True to draw the positions of state commands, as spheres."""
+    """Whether to draw the positions of state commands, as spheres."""
     rgba: ArrayLike | None = color(per_item=True)
     """Colour of trails, setpoints and drones on maps, one or one per drone; None for default colours."""
     text: str | None = None

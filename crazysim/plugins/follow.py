@@ -57,13 +57,13 @@ class Follow(Plugin, replaces=("state commands",)):
     max_pieces: int | None = setting(default=None, low=1)
     """Largest number of pieces of a trajectory in a slot; None for the largest number among ``trajectories``."""
     visible: bool = True
-    """True to draw the path ahead and the setpoint of every drone."""
+    """Whether to draw the path ahead and the setpoint of every drone."""
     ends: Array = derived(("slots", "pieces"), scope="shared")
     """End of each piece of the trajectory in each slot, s since its start. (n_slots, max_pieces)"""
     coefficients: Array = derived(("slots", "pieces", 4, "coefficients"), scope="shared")
     """Coefficients as in ``Trajectory``. (n_slots, max_pieces, 4, degree + 1)"""
     repeats: Array = derived(("slots",), scope="shared")
-    """True where a trajectory starts again after its end. (n_slots,)"""
+    """Whether a trajectory starts again after its end. (n_slots,)"""
     degrees: tuple[int, ...] = dataclasses.field(default=(), kw_only=True, repr=False)
     """Largest degrees of x, y, z and yaw that a trajectory in a slot may have, -1 where all coefficients are zero; set
     by ``bind``. (4,)"""

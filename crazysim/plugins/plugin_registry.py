@@ -47,7 +47,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._is_changing = False
         self._last_revision = 0  # of the scene at the last refresh
         self.is_stale = False
-        """True if scene or plugins have changed since ``refresh``."""
+        """Whether scene or plugins have changed since ``refresh``."""
 
     def __getitem__(self, name: str) -> Plugin:
         require(
@@ -311,7 +311,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
         Args:
             data: The data of all worlds.
-            measured: True for observations that are calculated from the states as sensors measure them.
+            measured: Whether observations are calculated from the states as sensors measure them.
         """
         plugins = tuple(self.values())
         # What has arrays is read from the data; its settings are part of their structure.

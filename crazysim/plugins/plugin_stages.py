@@ -32,7 +32,7 @@ class MadeStages(NamedTuple):
     reset: Stage | None
     """Function of a reset."""
     reads_scene: bool
-    """True if the stages depend on the scene."""
+    """Whether the stages depend on the scene."""
 
 
 class PluginStages:

@@ -67,7 +67,7 @@ class DroneGeoms:
     """Indices of the drones; None for all."""
 
     def drone_mask(self, drone_id: Array) -> Array | None:
-        """Return True where an index is in ``drones``; None if all drones have these geoms. (...)"""
+        """Whether an index is in ``drones``; None if all drones have these geoms. (...)"""
         if self.drones is None:
             return None
         return functools.reduce(

@@ -52,17 +52,17 @@ class ContactReport(PyTree):
     """
 
     floor: Array | None
-    """True where a drone touches the floor. (n_worlds, n_drones)"""
+    """Whether a drone touches the floor. (n_worlds, n_drones)"""
     floor_distance: Array | None
     """Distance to the floor, m. (n_worlds, n_drones)"""
     objects: Array | None
-    """True where a drone touches an object. (n_worlds, n_drones, n_objects)"""
+    """Whether a drone touches an object. (n_worlds, n_drones, n_objects)"""
     object_distance: Array | None
     """Distance to each object, m. (n_worlds, n_drones, n_objects)"""
     nearest_object: Array | None
     """Index of the nearest object in ``object_names``. (n_worlds, n_drones)"""
     drones: Array | None
-    """True where a drone touches another drone. (n_worlds, n_drones)"""
+    """Whether a drone touches another drone. (n_worlds, n_drones)"""
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
@@ -79,7 +79,7 @@ class ContactReport(PyTree):
 
     @property
     def any(self) -> Array:
-        """True where a drone touches anything that was requested. (n_worlds, n_drones)"""
+        """Whether a drone touches anything that was requested. (n_worlds, n_drones)"""
         masks = [x for x in (self.floor, self.drones) if x is not None]
         if self.objects is not None:
             masks.append(jnp.any(self.objects, axis=-1))

@@ -190,8 +190,8 @@ def build_depth_fn(
     Args:
         model: Geoms of the scene that cameras see.
         rays: Unit directions of the pixels of each camera, as from ``pixel_directions``. (height, width, 3) each
-        drones: True for drones to be visible.
-        hide_own: True for a drone to be invisible to its own camera.
+        drones: Whether drones are visible.
+        hide_own: Whether a drone is invisible to its own camera.
         along: Direction of distances; see ``Along``.
         plugins: Function that returns the plugins of the simulation.
         kernels: Kernels that cast the rays if possible.

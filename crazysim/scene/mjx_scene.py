@@ -57,7 +57,7 @@ class MjxScene:
 
     @property
     def is_allocated(self) -> bool:
-        """True once ``data`` has been read or assigned."""
+        """Whether ``data`` has been read or assigned."""
         return self._data is not None
 
     def sync(self, poses: Poses) -> mjx.Data:

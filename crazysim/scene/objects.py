@@ -48,7 +48,7 @@ class Handle:
 
     @property
     def movable(self) -> bool:
-        """True if the objects can be moved, independently in each world."""
+        """Whether the objects can be moved, independently in each world."""
         return bool(self.rows)
 
     def __len__(self) -> int:
@@ -287,7 +287,7 @@ def add_bodies(
             these for each body, except primitives.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)
-        mocap: True for bodies that can be moved.
+        mocap: Whether the bodies can be moved.
         options: Settings of the primitive.
     """
     poses = [{"pos": p, "quat": np.roll(q, 1)} for p, q in zip(pos, quat, strict=True)]

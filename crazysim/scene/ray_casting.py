@@ -70,7 +70,7 @@ class Hits(PyTree):
     names: tuple[str, ...] = static()
     """Names of floor, objects and drones, in the order of ``body_index``."""
     is_hidden: Array | None = None
-    """True where the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
+    """Whether the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
 
 
 def raise_to_floor(model: CollisionModel, pos: Array) -> Array:
@@ -114,8 +114,7 @@ def cast_rays(
         origin: Origins of the rays, world frame, m. (n_worlds, n_rays, 3), without n_worlds in one world or drone
         direction: Unit directions, world frame. Same shape as ``origin``
         ignored_drones: Index of the drone that a ray passes through; None for no drone. (n_rays,)
-        drones: True for rays to meet drones; must be False in a stage of one drone, which has no access to other
-            drones.
+        drones: Whether rays meet drones; must be False in a stage of one drone, which has no access to other drones.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
         limit: Distance beyond which rays of one world or drone may miss fixed geoms, m.
@@ -296,7 +295,7 @@ def cast_rays_in_worlds(
             (n_worlds, n_cameras, 12)
         pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
-        drones: True for rays to meet drones.
+        drones: Whether rays meet drones.
     """
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
@@ -344,7 +343,7 @@ class RayKernels:
     platform: str | None = None
     """Platform of the kernels, ``"cpu"`` or ``"gpu"``; None for XLA."""
     strict: bool = False
-    """True to raise an error where XLA would be used with an ``EngineWarning``."""
+    """Whether to raise an error where XLA would be used with an ``EngineWarning``."""
     mesh: Mesh | None = None
     """Devices over which the worlds are distributed; None for one device."""
     last_used: str = ""

@@ -119,8 +119,8 @@ class Scene:
             name: Prefix of the bodies' names ``name:0``, ``name:1``, ...; None for the name of the primitive or file.
             pos: Initial positions in every world, world frame, m. (3,), (count, 3) or (n_worlds, count, 3)
             quat: Initial attitudes, body to world, xyzw. (4,), (count, 4) or (n_worlds, count, 4)
-            mocap: True for objects that can be moved, independently in each world; False for objects that stay at
-                ``pos`` in all worlds.
+            mocap: Whether the objects can be moved, independently in each world; else they stay at ``pos`` in all
+                worlds.
             **options: Settings of a primitive: lengths, m, and ``rgba``; see ``crazysim.scene.primitives``.
         """
         require(
@@ -344,8 +344,8 @@ class Scene:
                 id of one camera; or a ``DroneCamera``.
             width: Width of the images, pixels; ignored for a ``DroneCamera``.
             height: Height of the images, pixels; ignored for a ``DroneCamera``.
-            drones: True for drones to be visible.
-            hide_own: True for a drone to be invisible to its own camera.
+            drones: Whether drones are visible.
+            hide_own: Whether a drone is invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
         """
@@ -424,7 +424,7 @@ class Scene:
 
     @property
     def is_allocated(self) -> bool:
-        """True once ``mjx_data`` has been allocated."""
+        """Whether ``mjx_data`` has been allocated."""
         return self._mjx.is_allocated
 
     def mocap_poses(self) -> tuple[Array, Array]:

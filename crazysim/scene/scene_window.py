@@ -68,7 +68,7 @@ class SceneWindow:
 
     @property
     def is_open(self) -> bool:
-        """True until the user or ``close`` closes the window."""
+        """Whether the window is open; the user or ``close`` closes it."""
         return self._window is not None
 
     def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
@@ -121,7 +121,7 @@ class SceneWindow:
         return self._cursor[0] / max(width, 1), self._cursor[1] / max(height, 1)
 
     def is_pressed(self, button: str) -> bool:
-        """Return True while a button of the mouse, ``"left"`` or ``"right"``, is pressed."""
+        """Whether a button of the mouse, ``"left"`` or ``"right"``, is pressed."""
         glfw = self._glfw
         number = {"left": glfw.MOUSE_BUTTON_LEFT, "right": glfw.MOUSE_BUTTON_RIGHT}[button]
         return glfw.get_mouse_button(self._window, number) == glfw.PRESS

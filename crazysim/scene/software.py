@@ -27,7 +27,7 @@ false shadows in small images.
 
 
 def uses_cpu_quality() -> bool:
-    """Return True if images are drawn with the lower quality for CPUs."""
+    """Whether images are drawn with the lower quality for CPUs."""
     quality = os.environ.get(QUALITY_VARIABLE, "")
     require(
         quality in ("", "full", "fast"),
@@ -38,7 +38,7 @@ def uses_cpu_quality() -> bool:
 
 @functools.cache
 def has_software_renderer() -> bool:
-    """Return True if OpenGL draws on the CPU; False if there is no OpenGL."""
+    """Whether OpenGL draws on the CPU; False if there is no OpenGL."""
     try:
         from OpenGL import GL
 

@@ -77,7 +77,7 @@ class Configuration:
     engine: str
     """Engine that executes steps, one of ``crazysim.engine.ENGINES``."""
     strict: bool
-    """True to raise an error instead of using a slower engine with a warning."""
+    """Whether to raise an error instead of using a slower engine with a warning."""
 
     def check(self, data: Any, reference: SimData) -> None:
         """Check that data belong to a simulation with these settings; takes some tens of microseconds.

@@ -46,7 +46,7 @@ class Stepper:
         self._step_counts: dict[int, Array] = {}
         """Arrays of numbers of steps that ``advance`` received."""
         self._is_flagged = False
-        """True if ``core.mjx_synced`` is true in the data."""
+        """Whether ``core.mjx_synced`` is true in the data."""
         self._max_step_count: int | None = None
         """Largest number of steps of a world since its reset, or an upper bound; None if unknown."""
         self._last_count: tuple[object, int] = (None, 0)

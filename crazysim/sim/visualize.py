@@ -58,7 +58,7 @@ def draw_capsule(
         p2: The other end, world frame, m. (3,)
         radius: Radius, m.
         rgba: Colour, 0 to 1; None for red. (4,)
-        cylinder: True for flat ends.
+        cylinder: Whether the ends are flat.
     """
     start, end = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     require(

@@ -191,7 +191,7 @@ class TrainConfig:
     config: dict[str, Any]
     """Hyperparameters of the algorithm; omitted ones have their defaults."""
     own_network: bool = False
-    """True if the policy has a custom network instead of the built-in one."""
+    """Whether the policy has a custom network instead of the built-in one."""
     network: Network | None = field(default=None, compare=False)
     """Custom network; None for the built-in one. The files of a run hold its weights, but not its functions."""
     devices: Devices | None = field(default=None, compare=False)

@@ -35,7 +35,7 @@ class Image(NamedTuple):
     channels: int = 1
     """Number of values per pixel."""
     is_depth: bool = True
-    """True if pixels are depths or distances, m."""
+    """Whether pixels are depths or distances, m."""
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -92,7 +92,7 @@ class Interface:
             warn(f"actions of {source} have other ranges than in the policy's training, as of another drone")
 
     def has_ranges_of(self, other: Interface) -> bool:
-        """Return True if actions are the same commands, to rounding."""
+        """Whether the actions of both are the same commands, to rounding."""
         return len(self.ranges) == len(other.ranges) and np.allclose(self.ranges, other.ranges)
 
     def require_observations(self, sizes: Mapping[str, int]) -> None:

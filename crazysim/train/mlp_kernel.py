@@ -233,7 +233,7 @@ def cuda_source(sizes: tuple[int, ...], is_gradient: bool) -> tuple[str, int]:
 
     Args:
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
-        is_gradient: True for the kernel of gradients, False for the kernel of outputs.
+        is_gradient: Whether the kernel computes gradients; else it computes outputs.
     """
     n_warps, n_blocks = WARPS_AND_BLOCKS[sizes[0] > 64, is_gradient]
     padded_sizes, layers = [-(-size // 16) * 16 for size in sizes], range(len(sizes) - 1)

@@ -92,12 +92,12 @@ class Network:
 
     @property
     def has_memory(self) -> bool:
-        """True if the network keeps a memory between steps."""
+        """Whether the network keeps a memory between steps."""
         return bool(jax.tree.leaves(self.initial_memory))
 
     @property
     def is_built_in(self) -> bool:
-        """True if it is a built-in network, with or without convolution and memory."""
+        """Whether it is a built-in network, with or without convolution and memory."""
         apply = self.apply.func if isinstance(self.apply, functools.partial) else self.apply
         return apply in (MEMORYLESS_NETWORK.apply, _apply_gru, _apply_convolution)
 
@@ -329,7 +329,7 @@ class Policy(PyTree):
 
     @property
     def has_memory(self) -> bool:
-        """True if the policy keeps a memory between steps."""
+        """Whether the policy keeps a memory between steps."""
         return self.network.has_memory
 
     def __call__(self, obs: dict[str, Array]) -> Array:

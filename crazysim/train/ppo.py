@@ -157,7 +157,7 @@ class Sample(PyTree):
     reward: Array
     """Reward, plus the discounted value of the final state where the episode was truncated."""
     done: Array
-    """True where the episode ended with the step."""
+    """Whether the episode ended with the step."""
     shown: Array | None = None
     """Actions of the demonstration; None without demonstrations."""
 

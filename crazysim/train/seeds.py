@@ -62,7 +62,7 @@ def join_blocks(tree: T) -> T:
 
 
 def are_seeds_divided(n_seeds: int, mesh: Mesh) -> bool:
-    """Return True if each device of a mesh trains its own seeds."""
+    """Whether each device of a mesh trains its own seeds."""
     return n_seeds % mesh.size == 0
 
 
@@ -109,9 +109,9 @@ class Step(PyTree):
     reward: Array
     """Rewards. (n_worlds, n_drones)"""
     terminated: Array
-    """True where the episode ended by success or failure. (n_worlds,)"""
+    """Whether the episode ended by success or failure. (n_worlds,)"""
     truncated: Array
-    """True where the episode reached its time limit. (n_worlds,)"""
+    """Whether the episode reached its time limit. (n_worlds,)"""
     error: Array
     """Errors of the task. (n_worlds, n_drones)"""
     terms: dict[str, Array]
@@ -121,7 +121,7 @@ class Step(PyTree):
 
     @property
     def done(self) -> Array:
-        """True where the episode is over. (n_worlds,)"""
+        """Whether the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
 
 

@@ -32,7 +32,7 @@ def spline(
         degree: Degree of the polynomials: 3, 5 or 7.
         yaw: Yaw, rad: one value for all points, or one per point. The drone turns the shorter way between points. () or
             (n_points,)
-        at_rest: True to start and end at rest; False for a natural spline, with free derivatives at both ends.
+        at_rest: Whether to start and end at rest; else the spline is natural, with free derivatives at both ends.
     """
     require(
         isinstance(degree, (int, np.integer)) and degree in SPLINE_ORDERS,

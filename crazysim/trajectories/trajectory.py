@@ -44,7 +44,7 @@ class Trajectory(PyTree):
     """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials in ``u``.
     (n_pieces, 4, degree + 1)"""
     repeats: Array = leaf("shared", 0)
-    """True where the trajectory starts again after its end. ()"""
+    """Whether the trajectory starts again after its end. ()"""
 
     @staticmethod
     def of_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:

@@ -8,7 +8,7 @@ from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 
 
 def is_shared(x: Element, shared: Set[Value]) -> bool:
-    """Return True where an element is a constant, a table, or one of the values that are known to be shared."""
+    """Whether an element is a constant, a table, or one of the values that are known to be shared."""
     return not isinstance(x, Value) or x.size > 0 or x in shared
 
 

@@ -183,7 +183,7 @@ def constant(value: Any, dtype: DTypeLike) -> np.generic:
 
 
 def is_constant(x: Element) -> bool:
-    """Return True where an element is known before the program runs."""
+    """Whether an element is known before the program runs."""
     return isinstance(x, np.generic)
 
 

@@ -16,7 +16,7 @@ _file_numbers = itertools.count()
 
 
 def is_enabled() -> bool:
-    """Return True if a folder is set. Callers check it first, because to make the texts takes time."""
+    """Whether a folder is set. Callers check it first, because to make the texts takes time."""
     return bool(os.environ.get(DUMP_VARIABLE))
 
 

@@ -41,7 +41,7 @@ class OperationForm:
     numpy: Callable[..., Any] | None = None
     """NumPy's form, on arrays or scalars, with static parameters as keywords."""
     exact: bool = False
-    """True where NumPy and XLA agree to the last bit, so that operations on constants are folded."""
+    """Whether NumPy and XLA agree to the last bit, so that operations on constants are folded."""
     xla: str | Callable[..., Any] = ""
     """Name in ``jax.lax``, or a function of the operands. By default the name of the row."""
     source: str | Mapping[str, str] = "{name}_({all})"
@@ -54,7 +54,7 @@ class OperationForm:
     cost: float = 1
     """Cost in multiply-adds."""
     structured: bool = False
-    """True where each target implements the operation separately, because it is not one expression of its operands."""
+    """Whether each target implements the operation separately, because it is not one expression of its operands."""
 
     def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
         if "..." in self.operands:

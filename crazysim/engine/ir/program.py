@@ -94,7 +94,7 @@ class Segment:
 
     @functools.cached_property
     def couples_drones(self) -> bool:
-        """True if drones of a world read each other's numbers."""
+        """Whether drones of a world read each other's numbers."""
         return self.scope == "world" or any(op.name == "over_others" for op in self.block.operations)
 
     @property
@@ -157,7 +157,7 @@ class Program:
 
     @functools.cached_property
     def fused(self) -> bool:
-        """True if one kernel can run the whole program."""
+        """Whether one kernel can run the whole program."""
         return not self.unfused_stages
 
     @functools.cached_property

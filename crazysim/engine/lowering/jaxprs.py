@@ -58,7 +58,7 @@ class TableEntry(NamedTuple):
     offset: int
     """Constant part."""
     aligned: bool = True
-    """True where the base is a multiple of four."""
+    """Whether the base is a multiple of four."""
 
 
 class Lowering:

@@ -40,7 +40,7 @@ class GoalTask(Task):
         return state_of(data) | {"difference_to_goal": self.read(data).goal - data.states.pos}
 
     def crashed(self, data: SimData) -> Array:
-        """Return True where a drone has left the arena. (..., n_drones)"""
+        """Whether a drone has left the arena. (..., n_drones)"""
         return out_of_bounds(data, self.half_width, self.height)
 
     def terminated(self, data: SimData) -> Array:
@@ -64,11 +64,11 @@ class OutcomeTask(Task):
     """Names of success and failure in ``info``."""
 
     success: Array = state((), dtype=bool)
-    """True where the drone has done its task."""
+    """Whether the drone has done its task."""
     failure: Array = state((), dtype=bool)
-    """True where the drone has failed."""
+    """Whether the drone has failed."""
     flight_over_before: Array = state((), dtype=bool)
-    """True where the flight was over before this environment step."""
+    """Whether the flight was over before this environment step."""
 
     def judge(self, data: SimData, succeeds: Array, fails: Array) -> SimData:
         """Return data in which flights that succeed or fail in a physics step have ended; failing counts first."""
@@ -90,7 +90,7 @@ class OutcomeTask(Task):
 
 
 def flight_over(record: Any) -> Array:
-    """Return True where a drone has succeeded or failed, by the states of an ``OutcomeTask``."""
+    """Whether a drone has succeeded or failed, by the states of an ``OutcomeTask``."""
     return record.success | record.failure
 
 
@@ -136,12 +136,12 @@ def to_heading(data: SimData, vector: Array) -> Array:
 
 
 def on_floor(data: SimData) -> Array:
-    """Return True where a drone is on or below the floor. (..., n_drones)"""
+    """Whether a drone is on or below the floor. (..., n_drones)"""
     return data.states.pos[..., 2] < FLOOR
 
 
 def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
-    """Return True where a drone is on the floor, too high, or too far from the z axis. (..., n_drones)"""
+    """Whether a drone is on the floor, too high, or too far from the z axis. (..., n_drones)"""
     pos = data.states.pos
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 

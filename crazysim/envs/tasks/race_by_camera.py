@@ -41,7 +41,7 @@ class RaceByCamera(Race):
     speed: float = setting(default=1.5, positive=True)
     """Speed above which flying faster costs reward, m/s."""
     gates_observed: bool = False
-    """True to add true positions of gates and obstacles to the observations, for a teacher of other policies."""
+    """Whether to add true positions of gates and obstacles to the observations, for a teacher of other policies."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         data = super().spawn(data, key)

@@ -55,7 +55,7 @@ def next_gate(data: SimData) -> tuple[Array, Array]:
 
 
 def passes_gate(data: SimData) -> Array:
-    """Return True where the last physics step led forwards through the opening of the next gate. (...)"""
+    """Whether the last physics step led forwards through the opening of the next gate. (...)"""
     record = race_of(data)
     pos, quat = next_gate(data)
     pos_before, pos_now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))

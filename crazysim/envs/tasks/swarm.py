@@ -57,7 +57,7 @@ class Swarm(Task):
     n_seen: int = setting(default=3, low=1)
     """Largest number of nearest other drones that a drone observes."""
     strict: bool = True
-    """True to end an episode when two drones are too close. Being too close costs reward in any case."""
+    """Whether to end an episode when two drones are too close. Being too close costs reward in any case."""
     seconds: float = 8.0
     """Length of an episode, s."""
     tolerance: float = 0.1
@@ -122,7 +122,7 @@ class Swarm(Task):
         }
 
     def is_lost(self, data: SimData) -> Array:
-        """Return True where a drone is on the floor, outside of the arena, or, if ``strict``, was too close to another.
+        """Whether a drone is on the floor, outside of the arena, or, if ``strict``, was too close to another.
 
         Returns:
             (n_drones,)

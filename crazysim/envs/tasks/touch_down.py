@@ -52,7 +52,7 @@ class TouchDown(OutcomeTask):
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
     def has_left_arena(self, data: SimData) -> Array:
-        """Return True where a drone has left its arena. (...)"""
+        """Whether a drone has left its arena. (...)"""
         raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
     def touch_down_stage(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:

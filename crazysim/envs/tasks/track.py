@@ -102,7 +102,7 @@ class TrackTrajectory(Task):
         }
 
     def is_lost(self, data: SimData) -> Array:
-        """Return True where a drone is on the floor or too far from the trajectory. (n_drones,)"""
+        """Whether a drone is on the floor or too far from the trajectory. (n_drones,)"""
         return on_floor(data) | (self.error(data) > MAX_ERROR)
 
     def terminated(self, data: SimData) -> Array:

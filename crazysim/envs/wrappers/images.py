@@ -47,7 +47,7 @@ class CameraImages(Wrapper):
         """Physics steps from one image to the next."""
         camera.check(sim, self._period)
         self._is_immediate = self._period == env.n_substeps and camera.latency == 0
-        """True if each environment step takes an image that is observed at its end."""
+        """Whether each environment step takes an image that is observed at its end."""
         self._take_images = camera.image_fn(sim)
 
     @property

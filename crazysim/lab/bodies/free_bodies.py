@@ -100,7 +100,7 @@ class FreeBodies(Population):
 
     @property
     def pushes_drones(self) -> bool:
-        """True if this plugin computes the contacts of its bodies with drones; ``ContactResponse`` leaves them out."""
+        """Whether this plugin computes the contacts of its bodies with drones; ``ContactResponse`` leaves them out."""
         return self.drones
 
     @property

@@ -106,7 +106,7 @@ def state_variable_filter(
         t: Times, s. (n,)
         f_c: Cutoff, Hz.
         N_deriv: Number of derivatives.
-        zero_order_hold: True for signals that stay constant until the next sample.
+        zero_order_hold: Whether the signals stay constant until the next sample.
 
     Returns:
         Filtered signals and derivatives, (n_signals, N_deriv + 1, n), without axes of length one.

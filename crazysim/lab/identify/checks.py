@@ -72,7 +72,7 @@ class Pair(NamedTuple):
         return np.divide(measured_size, size, out=np.full(3, np.nan), where=size > 0)
 
     def agrees(self) -> bool:
-        """Return True if measured and expected motion agree on every axis that moves, within half of the floor."""
+        """Whether measured and expected motion agree on every axis that moves, within half of the floor."""
         measured_size, size = self.sizes().T
         slack = self.floor / 2
         return bool(
@@ -152,7 +152,7 @@ class Law(NamedTuple):
     fault: str
     """Description of the violation; empty for none."""
     has_motion: bool
-    """True if the log contains the motion that the law describes."""
+    """Whether the log contains the motion that the law describes."""
 
 
 def _check_laws(t: NDArray, data: Mapping[str, NDArray], derived_keys: tuple[str, ...]) -> list[Law]:

@@ -63,7 +63,7 @@ class Log:
     repairs: tuple[str, ...] = ()
     """Descriptions of the repairs."""
     modelled: bool = False
-    """True if the rotor speeds were modelled by ``with_speeds``, not measured."""
+    """Whether the rotor speeds were modelled by ``with_speeds``, not measured."""
 
     @property
     def dt(self) -> float:

@@ -37,7 +37,7 @@ class BrowserPanel:
     """Panel of a viser server; all browsers of the server share it."""
 
     follow: bool
-    """True to keep the followed body in the middle."""
+    """Whether to keep the followed body in the middle."""
     plot: str
     """Quantity that is plotted; empty for none."""
 

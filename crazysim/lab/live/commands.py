@@ -60,7 +60,7 @@ class Start:
     drone: int | None
     """ID of the drone; None for all."""
     relative: bool = False
-    """True if the trajectory is shifted to start at the present setpoint."""
+    """Whether the trajectory is shifted to start at the present setpoint."""
 
 
 @dataclass(frozen=True)

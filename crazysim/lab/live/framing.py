@@ -92,7 +92,7 @@ class MessageBuffer:
 
     @property
     def has_partial_message(self) -> bool:
-        """True if the buffer holds the start of a message."""
+        """Whether the buffer holds the start of a message."""
         return bool(self._buffer)
 
     def feed(self, received: bytes) -> Iterator[Message | Request | ShowFile]:

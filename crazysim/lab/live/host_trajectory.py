@@ -23,7 +23,7 @@ class HostTrajectory(NamedTuple):
     """Coefficients of the polynomials of x, y, z, m, and yaw, rad, constant term first. Their variable is the time
     since the start of the piece divided by its duration. (n_pieces, 4, degree + 1)"""
     repeats: bool
-    """True if the trajectory starts again after its end."""
+    """Whether the trajectory starts again after its end."""
 
     @staticmethod
     def from_trajectory(trajectory: Trajectory) -> HostTrajectory:

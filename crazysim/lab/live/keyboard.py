@@ -45,7 +45,7 @@ class Keyboard(Generic[L]):
         self._hold_times.clear()
 
     def is_held(self, key: str) -> bool:
-        """Return True while a key is held."""
+        """Whether a key is held."""
         return self._hold_times.get(key, 0.0) > time.monotonic()
 
     def axis(self, positive: str, negative: str) -> float:

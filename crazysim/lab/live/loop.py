@@ -113,7 +113,7 @@ class Live(Interaction, Closeable):
 
     @property
     def paused(self) -> bool:
-        """True while the simulation does not advance; may be assigned at any time."""
+        """Whether the simulation is paused; may be assigned at any time."""
         return self._paused
 
     @paused.setter
@@ -223,7 +223,7 @@ class Live(Interaction, Closeable):
 
     @property
     def is_recording(self) -> bool:
-        """True while a recording is being written."""
+        """Whether a recording is being written."""
         return self._recorder is not None
 
     def stop_recording(self) -> None:

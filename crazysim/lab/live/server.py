@@ -178,7 +178,7 @@ class StreamListener(CommandQueue):
 
     @property
     def is_connected(self) -> bool:
-        """True while the connection is open."""
+        """Whether the connection is open."""
         return self._thread.is_alive()
 
     def close(self) -> None:

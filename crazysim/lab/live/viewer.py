@@ -57,7 +57,7 @@ class Viewer(Generic[L]):
 
     @property
     def is_open(self) -> bool:
-        """True until the user or ``close`` closes the viewer."""
+        """Whether the viewer is open; the user or ``close`` closes it."""
         raise NotImplementedError
 
     def close(self) -> None:

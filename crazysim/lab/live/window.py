@@ -63,15 +63,15 @@ class Window(Viewer[Live]):
     cam_config: Mapping[str, ArrayLike] | None = None
     """Initial settings of the free camera: lookat, distance, azimuth, elevation."""
     follow: bool = False
-    """True to let the free camera look at the followed body."""
+    """Whether to let the free camera look at the followed body."""
     trail: float = 2.0
     """Duration of the motion that trails show, s; 0 for no trails."""
     setpoints: bool = True
-    """True to draw the goals of the loop, or else the positions of state commands."""
+    """Whether to draw the goals of the loop, or else the positions of state commands."""
     contacts: bool = False
-    """True to mark drones that touch something; contacts are then computed for every picture."""
+    """Whether to mark drones that touch something; contacts are then computed for every picture."""
     wind: bool = True
-    """True to draw the wind at every drone."""
+    """Whether to draw the wind at every drone."""
     plot: str = ""
     """Quantity of the selected drone that is plotted over time, such as ``"states.pos"``; empty for none."""
 

@@ -137,7 +137,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """True if there is no violation."""
+        """Whether there is no violation."""
         return not self.violations
 
     def __str__(self) -> str:

@@ -41,7 +41,7 @@ class Radar(Plugin):
     tilt: Param = param(default=0.0, core=("radars",), scope="shared", low=-math.pi / 2, high=math.pi / 2)
     """Elevation of the lobe, rad, positive upwards. (n_radars,)"""
     visible: bool = False
-    """True to draw the lobes into images, in red where a drone is detected."""
+    """Whether to draw the lobes into images, in red where a drone is detected."""
     exposure: Array = state(("radars",))
     """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
     name: str = "radar"
@@ -82,7 +82,7 @@ class Radar(Plugin):
         return self.write(data, self.replace(exposure=self.exposure + time))
 
     def detects(self, data: SimData) -> Array:
-        """Return True where a radar detects a drone, for one drone, one world or all worlds. (..., n_radars)"""
+        """Whether a radar detects a drone, for one drone, one world or all worlds. (..., n_radars)"""
         return self.read(data).margin_at(data.states.pos) > 0
 
     def observations(self, data: SimData) -> dict[str, Array]:

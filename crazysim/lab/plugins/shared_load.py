@@ -88,7 +88,7 @@ class SharedLoad(PointLoad):
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
-    """True to put load and links into the scene."""
+    """Whether to put load and links into the scene."""
     pos: Array = state((3,), scope="world")
     """Position, world frame, m. (n_worlds, 1, 3)"""
     vel: Array = state((3,), scope="world")

@@ -53,7 +53,7 @@ class BringLoad(OutcomeTask):
         return self.write(super().before_step(data), remaining_way_before=self.remaining_way(data))
 
     def at_goal(self, data: SimData) -> Array:
-        """Return True where a load is near its goal and at rest. (...)"""
+        """Whether a load is near its goal and at rest. (...)"""
         vel = load_vel(data)
         return (rotation.dot(vel, vel)[..., 0] < SETTLED_SPEED**2) & (self.error(data) < self.tolerance)
 

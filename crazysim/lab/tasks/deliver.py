@@ -70,7 +70,7 @@ class Deliver(BringLoad):
     seconds: float = 8.0
     """Length of an episode, s."""
     taken: Array = state((), dtype=bool)
-    """True where the hook has taken the load off the trailer."""
+    """Whether the hook has taken the load off the trailer."""
 
     def install(self, sim: Sim) -> None:
         car_positions = SPACING * grid_2d(sim.n_drones)
@@ -200,7 +200,7 @@ def initial_car_pos(data: SimData) -> Array:
 
 
 def has_left_arena(data: SimData) -> Array:
-    """Return True where a drone is too far from its car's initial position, too low or too high. (...)"""
+    """Whether a drone is too far from its car's initial position, too low or too high. (...)"""
     pos = data.states.pos
     is_far = jnp.any(jnp.abs(pos - initial_car_pos(data))[..., :2] > HALF_WIDTH, axis=-1)
     return is_far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

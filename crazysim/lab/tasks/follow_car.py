@@ -144,7 +144,7 @@ class FollowCar(Task):
         }
 
     def is_lost(self, data: SimData) -> Array:
-        """Return True where a drone is too low, or too far from its point. (n_drones,)"""
+        """Whether a drone is too low, or too far from its point. (n_drones,)"""
         return (self.error(data) > MAX_DISTANCE) | (data.states.pos[..., 2] < MIN_HEIGHT)
 
     def terminated(self, data: SimData) -> Array:

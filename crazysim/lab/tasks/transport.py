@@ -150,7 +150,7 @@ class Transport(BringLoad):
         return jnp.where(is_behind(load, pos, quat), self.error(data), way_through_gate)
 
     def misses_gate(self, data: SimData) -> Array:
-        """Return True where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
+        """Whether a drone or its load is between the faces of its gate, but not in the opening. (...)"""
         pos, quat = self.gate(data)
         drone_misses, load_misses = (
             (jnp.abs(local_pos[..., 0]) <= BAR_THICKNESS / 2)
@@ -216,7 +216,7 @@ def gate_axis(quat: Array) -> Array:
 
 
 def is_behind(point: Array, pos: Array, quat: Array) -> Array:
-    """Return True where a point is behind the plane of a gate. (...)
+    """Whether a point is behind the plane of a gate. (...)
 
     Args:
         point: Position, m. (..., 3)
@@ -227,7 +227,7 @@ def is_behind(point: Array, pos: Array, quat: Array) -> Array:
 
 
 def is_outside_or_on_floor(data: SimData) -> Array:
-    """Return True where a drone is outside of its corridor, or its load is on the floor. (...)"""
+    """Whether a drone is outside of its corridor, or its load is on the floor. (...)"""
     pos = data.states.pos
     middle = pick_entry(jnp.asarray(corridor_centres(data.core.n_drones), pos.dtype), data.core.drone_id)
     is_far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)

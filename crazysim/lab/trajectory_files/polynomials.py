@@ -199,7 +199,7 @@ def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = Fal
 
     Args:
         trajectory: Trajectory of one vehicle.
-        compressed: True for the compressed format.
+        compressed: Whether to use the compressed format.
 
     Raises:
         ConfigError: If the folder does not exist, or the format cannot hold the trajectory.
@@ -211,7 +211,7 @@ def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
     """Load the trajectory in a file from ``save_memory``, or in a copy of a Crazyflie's trajectory memory.
 
     Args:
-        compressed: True for the compressed format, which the contents do not identify.
+        compressed: Whether the format is the compressed one, which the contents do not identify.
 
     Raises:
         ConfigError: If the file does not exist or is not of that format.

@@ -79,7 +79,7 @@ class Comparison:
     simulated_lag: float
     """Lag behind the setpoint in the simulation, s."""
     failed: bool
-    """True if the real drone was farther than ``MAX_DISTANCE`` from its setpoint in a compared sample."""
+    """Whether the real drone was farther than ``MAX_DISTANCE`` from its setpoint in a compared sample."""
 
     @property
     def ratio(self) -> float:

@@ -40,7 +40,7 @@ class Row:
 
     @property
     def failed(self) -> bool:
-        """True if the figure is out of its bound, or the comparison failed to run."""
+        """Whether the figure is out of its bound, or the comparison failed to run."""
         return bool(self.problem) or (self.bound is not None and not self.bound[0] <= self.figure <= self.bound[1])
 
     @property
@@ -69,7 +69,7 @@ class Section:
     data_problem: str = ""
     """Reason why the section's data are missing; empty if they are not."""
     needs_logs: bool = False
-    """True if the section needs logs of real flights."""
+    """Whether the section needs logs of real flights."""
     axes: tuple[str, str] = ("", "")
     """Labels of the axes of the section's picture; empty for none."""
 

@@ -79,7 +79,7 @@ class Cars(Population):
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
-    """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
+    """Whether to put the cars into the scene, where they are drawn and reported as contacts of drones."""
     name: str = "cars"
     body_vel: Array = state((2,), scope="member")
     """Forward and left velocity of the centre of mass, body frame, m/s. (n_worlds, n_members, 2)"""

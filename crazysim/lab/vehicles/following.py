@@ -114,7 +114,7 @@ class PathController:
     """
 
     can_reverse: ClassVar[bool] = True
-    """True if the controller can drive backwards."""
+    """Whether the controller can drive backwards."""
     position_gain: float = setting(default=4.0, low=0.0)
     """Acceleration per distance from a reference by time, 1/s^2."""
     speed_gain: float = setting(default=4.0, low=0.0)

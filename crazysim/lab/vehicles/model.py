@@ -107,7 +107,7 @@ class VehicleModel:
 
     @property
     def has_trailer(self) -> bool:
-        """True if the vehicle has the numbers of a trailer."""
+        """Whether the vehicle has the numbers of a trailer."""
         return "trailer.hitch" in self.numbers
 
     @property

@@ -73,7 +73,7 @@ class Path(PyTree):
     spacing: Array = leaf("shared", 1)
     """Length of the pieces of each path, m. (n_paths,)"""
     closed: Array = leaf("shared", 1)
-    """True where a path ends at its start. (n_paths,)"""
+    """Whether a path ends at its start. (n_paths,)"""
     speeds: Array = leaf("shared", 2)
     """Speed at the start of each piece, m/s; negative to drive backwards. (n_paths, n_pieces)"""
     progress: Array = leaf("shared", 3)
@@ -107,7 +107,7 @@ class Path(PyTree):
         Args:
             points: Points, x and y, world frame, m; a closed path does not repeat its first point. (n_points, 2)
             speed: Speed, m/s; negative to drive backwards.
-            closed: True for a path that ends at its start.
+            closed: Whether the path ends at its start.
         """
         xy = np.asarray(points, float)
         if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.all(np.isfinite(xy)):
@@ -165,7 +165,7 @@ class Path(PyTree):
 
     @property
     def goes_backwards(self) -> bool:
-        """True if any path is driven backwards; computed on the host."""
+        """Whether any path is driven backwards; computed on the host."""
         return bool(np.any(np.asarray(self.speeds) < 0))
 
     def point_at(self, index: Array | int, s: Array) -> PathPoint:

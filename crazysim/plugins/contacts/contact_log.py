@@ -29,9 +29,9 @@ class ContactLog(Plugin):
     objects: ObjectSelection = param(default=None, core=("objects",), scope="drone")
     """Handles, or names of bodies; None for all bodies in the scene, () for none. (n_worlds, n_drones, n_objects)"""
     floor: bool = param(default=True, core=(), scope="drone")
-    """True to check the floor. Drones that start on the floor touch it at once. (n_worlds, n_drones)"""
+    """Whether to check the floor. Drones that start on the floor touch it at once. (n_worlds, n_drones)"""
     drones: bool = param(default=True, core=(), scope="drone")
-    """True to check drones against each other. (n_worlds, n_drones)"""
+    """Whether to check drones against each other. (n_worlds, n_drones)"""
     first_step: Array = state((), dtype=np.int32)
     """Step in which the drone first touched anything; -1 before. (n_worlds, n_drones)"""
     name: str = "contacts"
@@ -40,7 +40,7 @@ class ContactLog(Plugin):
 
     @property
     def any(self) -> Array:
-        """True where the drone has touched anything. (n_worlds, n_drones)"""
+        """Whether the drone has touched anything. (n_worlds, n_drones)"""
         return self.first_step >= 0
 
     def bind(self, sim: Simulation) -> ContactLog:

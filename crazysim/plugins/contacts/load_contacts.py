@@ -141,7 +141,7 @@ class _VelocityChanges(NamedTuple):
     """Changes of velocity by the contacts between two groups of bodies."""
 
     is_touching: Array
-    """True where a body of the first group touches a body of the second group. (n, m)"""
+    """Whether a body of the first group touches a body of the second group. (n, m)"""
     first: Array
     """Change of the velocity of the body of the first group, m/s. (n, m, 3)"""
     second: Array

@@ -69,7 +69,7 @@ def with_moving_air(data: SimData, air_vel: Array) -> SimData:
 
 
 def has_drag(sim: Simulation) -> bool:
-    """Return True if the model has drag, and the drag of at least one airframe is not zero."""
+    """Whether the model has drag, and the drag of at least one airframe is not zero."""
     drag = getattr(sim.data.params, "drag_matrix", None)
     return drag is not None and bool(np.any(np.asarray(drag)))
 

@@ -271,7 +271,7 @@ def finalize(estimate: Estimate, min_angle: float = SMALL_ANGLE) -> Estimate:
 
 
 def is_within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
-    """Return True where all coordinates, m, and velocities, m/s, are within bounds. ()"""
+    """Whether all coordinates, m, and velocities, m/s, are within bounds. ()"""
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 

@@ -53,7 +53,7 @@ class ErrorStateFilter(Estimator):
         raise NotImplementedError
 
     def is_valid(self, estimate: Estimate) -> Array:
-        """Return True where the estimate of one drone is within its bounds. ()"""
+        """Whether the estimate of one drone is within its bounds. ()"""
         return error_state.is_within_bounds(estimate)
 
     def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:

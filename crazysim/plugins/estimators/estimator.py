@@ -33,7 +33,7 @@ class Estimator(Plugin):
     """An ``IMU`` and other sensors. Add them to the simulation before the estimator, except with
     ``Sim(estimator=...)``, which adds them itself. In ``data.plugins``, their names."""
     control: bool = True
-    """True if the controllers of the simulation use the estimate."""
+    """Whether the controllers of the simulation use the estimate."""
     reset_before: ClassVar[str | None] = "increment_steps"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
     state after that step."""
@@ -61,7 +61,7 @@ class Estimator(Plugin):
         raise NotImplementedError
 
     def can_fuse(self, sensor: Sensor) -> bool:
-        """Return True if the filter can use a sensor, beside its ``IMU``."""
+        """Whether the filter can use a sensor, beside its ``IMU``."""
         return type(sensor) in self.kinds
 
     def filter_stages(self, data: SimData) -> Sequence[tuple[str, Stage]]:

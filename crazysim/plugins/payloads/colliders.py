@@ -31,7 +31,7 @@ class LoadBody(NamedTuple):
     mass: Array
     """Mass, kg. (..., 1)"""
     exists: Array | None = None
-    """True where the body collides; None if it always does. (...)"""
+    """Whether the body collides; None if it always does. (...)"""
 
 
 class Collider(NamedTuple):
@@ -79,7 +79,7 @@ class CollidingPlugin(Plugin, abstract=True):
         raise NotImplementedError
 
     def joined_mask(self, data: SimData) -> Array:
-        """Return True where a rigid rod joins a load to a drone, so that the two cannot touch. (n_loads, n_drones)"""
+        """Whether a rigid rod joins a load to a drone, so that the two cannot touch. (n_loads, n_drones)"""
         raise NotImplementedError
 
 

@@ -72,7 +72,7 @@ class Hook(HangingLoad):
     rgba: ArrayLike | None = color()
     """Colour of the loads; None for the default. (4,)"""
     in_scene: bool = True
-    """True to put loads and rods into the scene."""
+    """Whether to put loads and rods into the scene."""
     tip_pos: Array = state((3,))
     """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
     tip_vel: Array = state((3,))
@@ -262,7 +262,7 @@ class Hook(HangingLoad):
         return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
 
     def joined_head_mask(self, data: SimData) -> Array:
-        """Return True where a hook hangs from a drone, in one world. (n_hooks, n_drones)"""
+        """Whether a hook hangs from a drone, in one world. (n_hooks, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
     def _rod_directions(self, data: SimData) -> Array:

@@ -53,11 +53,11 @@ class LinkParams(NamedTuple):
     restitution: Array | None = None
     """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
     is_attached: Array | None = None
-    """True where the link is connected; None if it always is. ()"""
+    """Whether the link is connected; None if it always is. ()"""
     is_cable: bool = False
     """True for a cable, which can be slack; False for a rod."""
     is_hinge: bool = False
-    """True if the link turns about the body's y axis only."""
+    """Whether the link turns about the body's y axis only."""
 
 
 class LinkGeometry(NamedTuple):

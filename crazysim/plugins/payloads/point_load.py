@@ -46,7 +46,7 @@ class HangingLoad(CollidingPlugin, BodiesInAir, abstract=True):
     vel: Array = state((3,))
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
     attached: Array = state((), dtype=bool)
-    """True where the load hangs from its drone. (n_worlds, n_drones)"""
+    """Whether the load hangs from its drone. (n_worlds, n_drones)"""
     clearance: Array = derived()
     """Height of the load's position above the floor when it rests there, m. (1,)"""
 
@@ -142,7 +142,7 @@ def hanging_state(
         attach: Attachment point, body frame, m; None for the centre of mass. (..., 3)
         length: Length of the link, m. (..., 1)
         clearance: Height of the load above the floor when it rests there, m. (..., 1)
-        is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
+        is_cable: Whether the link is a cable, which is slack where the load rests; a rod then lies behind the drone.
     """
     rot = rotation.matrix(state.quat)
     arm = jnp.zeros(3, state.pos.dtype) if attach is None else attach

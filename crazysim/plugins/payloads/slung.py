@@ -61,7 +61,7 @@ class SlungLoad(PointLoad, HangingLoad):
     rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
-    """True to put loads and links into the scene, where they are drawn and reported as contacts of drones."""
+    """Whether to put loads and links into the scene, where they are drawn and reported as contacts of drones."""
     name: str = "load"
 
     def bind(self, sim: Simulation) -> SlungLoad:
@@ -142,7 +142,7 @@ def bind_load(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ri
 
     Args:
         plugin: The plugin, a ``HangingLoad``.
-        is_cable: True for cables.
+        is_cable: Whether the links are cables.
         clearance: Height of a load's position above the floor when it rests there, m.
         ring: Height above the middle of the load of the ring that a hook holds, m; None without a hook.
     """

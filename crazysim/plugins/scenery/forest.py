@@ -38,7 +38,7 @@ class CellObstacles(NamedTuple):
     size: Array
     """Size, m: the radius of a trunk, or the width of a pillar. (...)"""
     is_standing: Array
-    """True where the cell has an obstacle. (...)"""
+    """Whether the cell has an obstacle. (...)"""
 
 
 class StandingObstacles(Scenery):

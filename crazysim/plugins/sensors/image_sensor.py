@@ -103,7 +103,7 @@ class ImageSensor(Plugin):
 
     @property
     def has_errors(self) -> bool:
-        """True if ``measure`` must be called."""
+        """Whether ``measure`` must be called."""
         return False
 
     @property

@@ -49,9 +49,9 @@ class RangeFinder(Plugin):
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     drones: bool = False
-    """True to measure distances to other drones too."""
+    """Whether to measure distances to other drones too."""
     visible: bool = False
-    """True to draw the rays into images."""
+    """Whether to draw the rays into images."""
     direction: Array = derived(("rays", 3), scope="shared")
     """Unit directions of the rays, body frame. (n_rays, 3)"""
     distance: Array = state(("rays",))

@@ -64,7 +64,7 @@ class Sensor(Plugin):
     chains: ClassVar[Mapping[str, Sequence[Link]]] = {}
     """Errors by channel, for channels that have any; see ``crazysim.plugins.sensors.errors``."""
     measures_motion: ClassVar[bool] = True
-    """True if ``ideal`` is a smooth function of position, velocity, attitude and angular velocity, so that ``ESKF`` can
+    """Whether ``ideal`` is a smooth function of position, velocity, attitude and angular velocity, so that ``ESKF`` can
     use the channels that have ``chains``."""
     reset_before: ClassVar[str | None] = "increment_steps"
     """Name of the stage before which ``reset_episode`` is called in the first step of an episode. The reset uses the
@@ -232,12 +232,12 @@ class Sensor(Plugin):
         return 1 / self.rate(data.core.freq)
 
     def is_sampled(self, data: SimData) -> Array | None:
-        """Return True where the sensor measures in this step; None if it measures in every step."""
+        """Whether the sensor measures in this step; None if it measures in every step."""
         return is_tick(data, self.rate(data.core.freq))
 
     @property
     def is_late(self) -> bool:
-        """True if measurements arrive after a delay."""
+        """Whether measurements arrive after a delay."""
         return bool(self._max_delay) if self.samples is None else self.samples.queue is not None
 
     @property

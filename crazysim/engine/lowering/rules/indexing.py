@@ -266,7 +266,7 @@ def _combine(ctx: Lowering, eqn: JaxprEqn, old: ElementArray, new: ElementArray)
 
 
 def is_known(x: ElementArray) -> bool:
-    """Return True where all elements are constants."""
+    """Whether all elements are constants."""
     return all(map(is_constant, x.reshape(-1)))
 
 

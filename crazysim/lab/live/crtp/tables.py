@@ -45,7 +45,7 @@ class Variable(NamedTuple):
     ctype: str
     """Type in C."""
     read_only: bool = False
-    """True if it cannot be written."""
+    """Whether it cannot be written."""
 
 
 class Table:

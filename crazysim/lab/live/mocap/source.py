@@ -42,7 +42,7 @@ class MocapSource(Closeable):
     name: str = "mocap"
     """Name in reports."""
     simulated: bool = False
-    """True if the frames follow simulated time, which a reset sets back."""
+    """Whether the frames follow simulated time, which a reset sets back."""
 
     def poll(self, step: int, freq: int) -> Poll:
         """Return the frames that have arrived since the last call.

@@ -101,7 +101,7 @@ class Tracker:
 
     @property
     def stalled(self) -> bool:
-        """True if the source has sent no frame for longer than ``Rules.stalled``."""
+        """Whether the source has sent no frame for longer than ``Rules.stalled``."""
         return self._is_stalled
 
     def accept(self, frame: Frame) -> bool:

@@ -60,7 +60,7 @@ class Rate:
         self._period, self._next_time = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
-        """Return True if the action is due at a simulated time, s, and then schedule the next action."""
+        """Whether the action is due at a simulated time, s; if so, the next action is scheduled."""
         if time < self._next_time - ROUNDING_TOLERANCE:
             return False
         self._next_time = max(self._next_time + self._period, time)

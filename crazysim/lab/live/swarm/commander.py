@@ -66,12 +66,12 @@ class Commander:
 
     @property
     def motors_on(self) -> bool:
-        """True while a command is active."""
+        """Whether a command is active."""
         return self.armed and not self.locked and (self._planned_motion is not None or self._stream is not None)
 
     @property
     def finished(self) -> bool:
-        """True if no planned move is in progress."""
+        """Whether no planned move is in progress."""
         return self._planned_motion is None or self._planned_motion.has_ended(self.now)
 
     def goal(self) -> NDArray:
@@ -88,7 +88,7 @@ class Commander:
         return self._drone_motion()
 
     def in_group(self, mask: int) -> bool:
-        """Return True if a command with this group mask, 0 for all drones, addresses this drone."""
+        """Whether a command with this group mask, 0 for all drones, addresses this drone."""
         return mask == 0 or (mask & self.group) != 0
 
     # High-level commands --------------------------------------------------------------------------------------------

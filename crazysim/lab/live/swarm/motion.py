@@ -25,11 +25,11 @@ class PlannedMotion(NamedTuple):
     timescale: float = 1.0
     """Factor of its duration."""
     reversed: bool = False
-    """True if it is followed from its end to its start."""
+    """Whether it is followed from its end to its start."""
     offset: NDArray = np.zeros(4)
     """Offset of position, m, and yaw, rad. (4,)"""
     is_landing: bool = False
-    """True if the motors stop at its end."""
+    """Whether the motors stop at its end."""
 
     @property
     def end_time(self) -> float:
@@ -37,7 +37,7 @@ class PlannedMotion(NamedTuple):
         return self.start_time + self.trajectory.duration * self.timescale
 
     def has_ended(self, t: float) -> bool:
-        """Return True if the motion has ended at a time, s."""
+        """Whether the motion has ended at a time, s."""
         return not self.trajectory.repeats and t >= self.end_time
 
     def evaluate(self, t: float) -> NDArray:
@@ -61,7 +61,7 @@ def plan_move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool =
         start: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)
         goal: Position, m, and yaw, rad, at the end. (4,)
         duration: Duration, s.
-        linear: True for the straight line.
+        linear: Whether to move along the straight line.
     """
     p, v, a = np.asarray(start, float) * np.array([1.0, duration, duration**2 / 2])[:, None]
     goal = np.asarray(goal, float)

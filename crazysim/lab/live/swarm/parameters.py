@@ -29,9 +29,9 @@ class Parameter(NamedTuple):
     value: float = 0.0
     """Value at the start."""
     read_only: bool = False
-    """True if it cannot be written."""
+    """Whether it cannot be written."""
     simulated: bool = True
-    """True if a new value has an effect in the simulation; other parameters refuse new values."""
+    """Whether a new value has an effect in the simulation; other parameters refuse new values."""
 
 
 PARAMETERS: dict[str, Parameter] = {
@@ -68,7 +68,7 @@ def create_parameters(airframe: Airframe, has_multi_ranger: bool) -> dict[str, P
 
     Args:
         airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
-        has_multi_ranger: True for a drone with a multi-ranger deck.
+        has_multi_ranger: Whether the drone has a multi-ranger deck.
     """
     parameters = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", has_multi_ranger, read_only=True)}
     if "pid.attitude.kp" in airframe.values:
@@ -149,7 +149,7 @@ class Light:
         return self._start_color + fraction * (self._target_color - self._start_color)
 
     def is_fading(self, now: float) -> bool:
-        """Return True while a fade is in progress; a reset of the time ends it."""
+        """Whether a fade is in progress; a reset of the time ends it."""
         return self._start_time <= now < self._start_time + self._duration
 
     def update_color(self, values: Mapping[str, float], name: str, now: float) -> None:
