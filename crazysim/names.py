@@ -25,6 +25,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.control.mppi": "MPPI",
         "crazysim.lab.estimators.eskf": "ESKF",
         "crazysim.lab.plugins.radar": "Radar",
+        "crazysim.lab.plugins.random_airframe": "RandomAirframe",
         "crazysim.lab.plugins.residual": "Residual",
         "crazysim.lab.plugins.rotor_jet": "RotorJet",
         "crazysim.lab.plugins.shared_load": "SharedLoad",
@@ -62,7 +63,10 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.envs.sb3": "DroneVecEnv",
     },
     "crazysim.plugins.bodies": {"crazysim.lab.bodies.free_bodies": "FreeBodies FreeBodiesData"},
-    "crazysim.plugins.effects": {"crazysim.lab.plugins.residual": "Residual"},
+    "crazysim.plugins.effects": {
+        "crazysim.lab.plugins.random_airframe": "RandomAirframe",
+        "crazysim.lab.plugins.residual": "Residual",
+    },
     "crazysim.plugins.estimators": {
         "crazysim.lab.estimators.complementary": "Complementary",
         "crazysim.lab.estimators.eskf": "ESKF",

@@ -12,11 +12,13 @@ import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from crazysim import rotation
 from crazysim.drones import load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.plugins.random_airframe import quadrotor_params
 from crazysim.lab.validate.closed_forms import with_states
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.effects import Latency
@@ -191,23 +193,13 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
         delay: Delay of the commands, steps.
         period: Time between two calls of the policy, ms.
     """
-    q, n, max_rotor_vel = quadrotors, len(quadrotors.mass), 20_000.0
+    q, n = quadrotors, len(quadrotors.mass)
     sim = Sim(n, drone="cf21B_500", control="rotor_vel", integrator="rk4")
-    params, world_shape = sim.data.params, (n, 1)
-    thrust_curve = np.zeros((n, 1, 1, 3))
-    thrust_curve[..., 2] = (q.thrust / max_rotor_vel**2)[:, None, None]
-    inertia = np.eye(3) * q.inertia[:, None, None]
-    lag = np.zeros((n, 1, 1, 4))
-    lag[..., ::2] = 1 / q.lag[:, None, None]
-    changes = {
-        "mass": q.mass.reshape(*world_shape, 1), "L": q.arm.reshape(*world_shape, 1),
-        "J": inertia, "J_inv": np.linalg.inv(inertia), "rpm2thrust": thrust_curve,
-        "rpm2torque": thrust_curve * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
-        "drag_matrix": np.zeros((3, 3)), "prop_inertia": np.zeros(1), "rotor_vel_min": np.zeros(1),
-        "rotor_vel_max": np.full(1, max_rotor_vel),
-    }  # fmt: skip
-    sim.data = sim.data.replace(params=params.replace(**{k: np.asarray(x, np.float32) for k, x in changes.items()}))
-    return hold_in_simulation(sim, np.asarray(max_rotor_vel), q.hover_action, delay, period)
+    column = {name: jnp.asarray(x, np.float32).reshape(n, 1, -1) for name, x in vars(q).items()}
+    arm = column.pop("arm")
+    sim.data = sim.data.replace(params=quadrotor_params(sim.data.params, arms=(arm, arm), **column))
+    max_rotor_vel = np.asarray(sim.data.params.rotor_vel_max)
+    return hold_in_simulation(sim, max_rotor_vel, q.hover_action, delay, period)
 
 
 def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
