@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3239,
     "geometry": 940,
-    "lab": 15587,
+    "lab": 15651,
     "media": 1060,
     "plugins": 4874,
     "scene": 2569,
