@@ -7,8 +7,8 @@ All three libraries train the task with the hyperparameters of its recipe: the s
 networks with tanh, initial learning rate, discount, ``gae_lambda``, weight of the entropy, largest norm of the gradient
 and clipping. RSL-RL also uses the weight of the value loss and the initial standard deviation of the recipe. Other
 settings are the defaults of each library. The learning rate decreases linearly to zero in crazysim, and is constant in
-Brax and RSL-RL. Brax steps the environment by ``BraxEnv``, within its compiled program. RSL-RL steps it with one
-compiled call a step, and shares arrays with Torch.
+Brax and RSL-RL. Brax steps the environment by ``BraxEnv``, within its compiled program. RSL-RL steps it by
+``RslRlEnv``, with one compiled call a step, and shares arrays with Torch.
 
 There is a JSON line for each trainer and number of worlds. It has the environment steps per second, the median over the
 seeds, and the success of each seed on 1,000 held-out starts after the same number of steps. The rate is measured over
@@ -148,33 +148,9 @@ def _device_put_replicated(tree: Any, devices: Any) -> Any:
 def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     """Train by RSL-RL, whose networks run in Torch."""
     import torch
-    from rsl_rl.env import VecEnv
     from rsl_rl.runners import OnPolicyRunner
-    from tensordict import TensorDict
 
-    auto_reset_env, n_worlds = _auto_reset(env), env.sim.n_worlds
-    step = _compiled_step(auto_reset_env)
-
-    class TorchEnv(VecEnv):
-        """The environment as RSL-RL steps it."""
-
-        def __init__(self) -> None:
-            self.num_envs, self.num_actions, self.max_episode_length = n_worlds, env.actions.size, env.max_steps
-            self.state = jax.jit(auto_reset_env.reset)(jax.random.key(seed))
-            self.device = str(torch.from_dlpack(self.state.reward).device)
-            self.episode_length_buf = torch.zeros(n_worlds, dtype=torch.long, device=self.device)
-            self.cfg = {}
-
-        def get_observations(self) -> TensorDict:
-            return self._observations(flatten(self.state.obs)[:, 0])
-
-        def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-            self.state, (obs, *rest) = step(self.state, jax.dlpack.from_dlpack(actions.detach().contiguous()))
-            reward, is_done, truncated = map(torch.from_dlpack, rest)
-            return self._observations(obs), reward, is_done, {"time_outs": truncated}
-
-        def _observations(self, obs: Array) -> TensorDict:
-            return TensorDict({"policy": torch.from_dlpack(obs)}, batch_size=[n_worlds], device=self.device)
+    from crazysim.envs.rsl_rl import RslRlEnv
 
     torch.manual_seed(seed)
     network = {"class_name": "MLPModel", "hidden_dims": config.hidden, "activation": "tanh", "obs_normalization": True}
@@ -198,7 +174,7 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
             "max_grad_norm": config.max_grad_norm,
         },
     }
-    torch_env = TorchEnv()
+    torch_env = RslRlEnv(env, seed)
 
     def synchronise() -> float:
         if torch_env.device != "cpu":
@@ -220,16 +196,6 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
     normalizer = actor.obs_normalizer
     mean, std = arrays["obs_normalizer._mean"][0], arrays["obs_normalizer._std"][0] + normalizer.eps
     return seconds, PeerPolicy(mean, std, layers, False)
-
-
-@functools.cache
-def _compiled_step(env: AutoReset) -> Any:
-    @jax.jit
-    def step(state: Any, action: Array) -> Any:
-        state = env.step(state, jnp.clip(action, -1.0, 1.0)[:, None])
-        return state, (flatten(state.obs)[:, 0], state.reward[:, 0], state.done, state.truncated & ~state.terminated)
-
-    return step
 
 
 TRAINERS = {"crazysim": train_crazysim, "brax": train_brax, "rsl_rl": train_rsl_rl}

@@ -60,6 +60,7 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim.envs": {
         "crazysim.envs.brax": "BraxEnv",
         "crazysim.envs.pettingzoo": "make_parallel",
+        "crazysim.envs.rsl_rl": "RslRlEnv",
         "crazysim.envs.sb3": "DroneVecEnv",
     },
     "crazysim.plugins.bodies": {"crazysim.lab.bodies.free_bodies": "FreeBodies FreeBodiesData"},

@@ -56,7 +56,7 @@ def test_public_names_exist_once():
 
 @pytest.mark.parametrize("module", ["crazysim", "crazysim.control", "crazysim.envs"])
 def test_a_star_import_needs_no_optional_package(module, monkeypatch):
-    for name in ("stable_baselines3", "crazysim.envs.pettingzoo", "crazysim.envs.sb3"):
+    for name in ("stable_baselines3", "crazysim.envs.pettingzoo", "crazysim.envs.rsl_rl", "crazysim.envs.sb3"):
         monkeypatch.setitem(sys.modules, name, None)
     names = {}
     exec(f"from {module} import *", names)
@@ -115,7 +115,7 @@ def test_gravity_is_written_once():
 
 def test_extras_are_never_imported_at_module_level():
     extras = {"matplotlib", "imageio_ffmpeg", "tqdm", "casadi", "viser", "trimesh", "onnx", "pettingzoo", "brax"}
-    extras |= {"stable_baselines3", "torch", "splax"}
+    extras |= {"rsl_rl", "stable_baselines3", "tensordict", "torch", "splax"}
     for source in SOURCES:
         for node in ast.parse(source.read_text()).body:
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

@@ -37,6 +37,7 @@ from crazysim.names import lazy_getattr
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv
     from crazysim.envs.pettingzoo import make_parallel as make_parallel
+    from crazysim.envs.rsl_rl import RslRlEnv as RslRlEnv
     from crazysim.envs.sb3 import DroneVecEnv as DroneVecEnv
 
 # Without names that need optional packages, with which ``from crazysim.envs import *`` would fail.

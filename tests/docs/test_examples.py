@@ -9,7 +9,7 @@ import pytest
 from crazysim import train
 from crazysim.train import runs
 
-NEEDS_TORCH = {"sac"}
+NEEDS_TORCH = {"rsl_rl_ppo", "sac"}
 """Examples that need Torch, which ``.ci/sb3`` runs."""
 EXAMPLES = sorted(
     x for x in (Path(__file__).parents[2] / "docs" / "examples").glob("*.py") if x.stem not in NEEDS_TORCH

@@ -25,7 +25,7 @@ MODULES = {
 }
 STAND_IN = {"crazysim.lab.live.crazyflie_py"}
 """Module with the name of a module of Crazyswarm2, for scripts that import it."""
-OPTIONAL_NAMES = {"crazysim.envs": ["DroneVecEnv", "make_parallel"]}
+OPTIONAL_NAMES = {"crazysim.envs": ["DroneVecEnv", "RslRlEnv", "make_parallel"]}
 """Public names that need optional packages, which are not in ``__all__``."""
 EXEMPT = (ROOT / "docs" / "coming-from-crazyflow.md",)
 """The page that uses Crazyflow's own paths."""
