@@ -56,11 +56,11 @@ def make_actor(runner: OnPolicyRunner):
     return act
 
 
-def main(iterations: int = 100, starts: int = 1000) -> tuple[OnPolicyRunner, dict[str, float]]:
+def main(iterations: int = 100, starts: int = 1000, seed: int = 0) -> tuple[OnPolicyRunner, dict[str, float]]:
     """Train for some iterations, evaluate, and return the runner and the metrics."""
     torch.set_num_threads(1)  # small networks: more threads only wait for each other
-    torch.manual_seed(0)
-    env = envs.RslRlEnv(envs.make("hover", WORLDS))
+    torch.manual_seed(seed)
+    env = envs.RslRlEnv(envs.make("hover", WORLDS), seed)
     runner, start_time = OnPolicyRunner(env, SETTINGS, device=env.device), time.perf_counter()
     runner.learn(iterations)
     seconds = time.perf_counter() - start_time
