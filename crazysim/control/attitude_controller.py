@@ -82,6 +82,7 @@ def attitude2force_torque(
     """
     p = params
     quat_des = rotation.from_rpy(cmd[..., :3])
+    # Rotation error on SO(3), and its derivative and integral.
     quat_error = rotation.multiply(rotation.conjugate(quat_des), quat)
     rotation_error = 4 * quat_error[..., 3:] * quat_error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
@@ -91,6 +92,7 @@ def attitude2force_torque(
     torque_pwm = torque_pwm + p.kd_omega * rate_error_dot * jnp.asarray([1.0, 1.0, 0.0], quat.dtype)
     torque_pwm = rotation.clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
 
+    # Shares of the motors in PWM, within their limits.
     thrust = cmd[..., 3:4]
     n_rotors = count_rotors(p.rotors, p.mixing_matrix.shape[-1])
     newton_per_pwm = p.thrust_max / p.pwm_max

@@ -222,11 +222,14 @@ class Auto(Controller):
         # delays are added to the lag of the rotors. The command of the position loop is half a period old on average.
         freq, outer_freq = self.freq, self.outer_freq
         lag_rate, rate_limits = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * max_gain_ratios(airframe)
+        # Lead that makes the rotors as fast as the gains need.
         needed_rate = 1 / max(1 / np.max(rate_limits[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
         lead = max(min(needed_rate / lag_rate, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        # Gains from the rates of the loop about each axis.
         loop_rate = 1 / (1 / (lead * lag_rate) + 1.5 / freq)
         axis_rates = np.minimum(loop_rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), rate_limits)
         stiffness, reaction = STIFFNESS_RATIO * axis_rates**2, momentum_per_torque(airframe)
+        # The position loop is slower by the delay of the attitude.
         position = None
         if outer_freq is not None:
             delay = DAMPING_RATIO / STIFFNESS_RATIO / np.min(axis_rates[:2])

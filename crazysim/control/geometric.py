@@ -89,6 +89,7 @@ def geometric_control(
         integral: Acceleration that is added to the feedback, world frame, m/s^2; None for none. (..., 3)
     """
     p, sp = params, setpoint
+    # The law of AIMotionLab-Virtual feeds nothing forward.
     if not feedforward:
         zero, zero_yaw_rate = jnp.zeros_like(pos), jnp.zeros_like(sp.yaw)
         sp = sp.replace(acc=zero, jerk=zero, snap=zero, yaw_rate=zero_yaw_rate, yaw_acc=zero_yaw_rate)
@@ -102,6 +103,7 @@ def geometric_control(
             return derivative
         return derivative - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
 
+    # Thrust vector with its derivatives, and the attitude along it.
     specific_thrust = subtract_drag(sp.vel, sp.acc) - p.gravity_vec + feedback
     desired = attitude_of_thrust(
         specific_thrust,
@@ -111,6 +113,7 @@ def geometric_control(
         sp.yaw_rate,
         sp.yaw_acc,
     )
+    # Thrust along the present z axis, torque to the desired attitude.
     thrust = p.mass * dot(specific_thrust, matrix[..., 2])
     torque = attitude_torque(matrix, ang_vel, desired, params=p)
     return prioritized_wrench(jnp.concatenate([thrust, torque], axis=-1), params=p.allocation)

@@ -124,6 +124,7 @@ def pid_step(
     """
     error = _wrap_angle(error, is_angle)
     output = loop.kp * error
+    # Derivative of the measured value, which does not react to jumps of the setpoint.
     if loop.kd is not None:
         derivative = _wrap_angle(memory.measured - measured, is_angle) * freq
         memory = memory.replace(measured=measured)
@@ -131,6 +132,7 @@ def pid_step(
             derivative, delays = _low_pass(derivative, memory.delays, loop.low_pass)
             memory = memory.replace(delays=delays)
         output = output + loop.kd * derivative
+    # Integral within its limits.
     if loop.ki is not None:
         integral_max: Any = loop.integral_max
         integral = clip(memory.integral + error / freq, -integral_max, integral_max)

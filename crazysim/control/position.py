@@ -122,12 +122,14 @@ def specific_force(
         Desired acceleration by all known forces other than gravity, world frame, m/s^2 (..., 3); the memory.
     """
     p = params
+    # Observer: the acceleration that no known force explains.
     limit = -MAX_DISTURBANCE_RATIO * GRAVITY[2]
     unknown_acc = clip((vel - memory.vel) * freq, -limit, limit)
     horizontal_acc = jnp.where(dot(vel, vel) == 0, 0.0, unknown_acc[..., :2])
     unknown_acc = _join_vertical(horizontal_acc, unknown_acc[..., 2:])
     disturbance = memory.disturbance + p.observer * (unknown_acc - memory.disturbance)
 
+    # PD loop within limits of speed and acceleration.
     error, reach = setpoint.pos - pos, p.reach[..., 1:]
     error = _join_vertical(_limit_length(error[..., :2], p.reach[..., :1]), clip(error[..., 2:], -reach, reach))
     acc = p.stiffness * error + p.damping * (setpoint.vel - vel)

@@ -69,12 +69,15 @@ def state2attitude(
         Roll, pitch, yaw, rad, and collective thrust, N (..., 4); the new integral, m s (..., 3).
     """
     p = params
+    # PID loop of the position, with gravity and the desired acceleration.
     pos_err, vel_err = cmd[..., 0:3] - pos, cmd[..., 3:6] - vel
     pos_err_i = rotation.clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
+    # Attitude with z along the force and x towards the heading.
     forward, left = rotation.heading(cmd[..., 9:13])
     rpy = rotation.rpy_from_axes(*rotation.axes_from_z(force, forward, left))
 
+    # Only the part of the force along the present z axis.
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
     return jnp.concatenate([rpy, thrust], axis=-1), pos_err_i

@@ -81,6 +81,7 @@ class Switch(Controller):
         index = self._active_index(data, command, params)
         has_switched = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, new_memories = memory.rotor_vel, []
+        # All controllers are computed; the selected one acts when it is due.
         for k, (controller, m, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):

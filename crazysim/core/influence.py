@@ -35,6 +35,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
             f"expected {title} to keep the structure of SimData, but a field became None, or a record was added or "
             f"removed. Add records with sim.add."
         )
+    # Only forces, the command and parameters may change.
     command = "controls.attitude.cmd" if data.controls.rotor_vel is None else "controls.rotor_vel"
     writable_fields = ("states.force", "states.torque", command)
     for (path, old), new in zip(paths, jax.tree.leaves(changed_data), strict=True):
@@ -63,6 +64,7 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
             f"expected {title} to return a dict of fields of its record to rates, got {type(rates).__name__}. "
             f"Use 'return {{}}' for none."
         )
+    # States of the record, which may have rates.
     record = data.plugins.get(plugin.name)
     field_scopes = None if record is None else scopes(record)
     fields = [] if record is None else [f.name for f in dataclasses.fields(record) if not f.metadata.get("static")]

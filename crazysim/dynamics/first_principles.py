@@ -91,19 +91,23 @@ def dynamics(
     """
     del pos  # the argument gives all models one signature
     p = params
+    # Rotors: thrust, drag torque and acceleration.
     thrust = quadratic_curve(rotor_vel, p.rpm2thrust)
     drag_torque = quadratic_curve(rotor_vel, p.rpm2torque)
     rotor_acc = rotor_acceleration(cmd, rotor_vel, p.rotor_dyn_coef)
 
+    # Force on the centre of mass, world frame.
     body_force = along_z(jnp.sum(thrust, axis=-1)) + body_drag_force(quat, vel, p.drag_matrix)
     force = rotation.rotate(quat, body_force, offset=dist_f)
 
+    # Torque about the centre of mass, body frame.
     yaw_torque_sign = p.mixing_matrix[..., 2, :]
     torque = rotor_torque(thrust, drag_torque, p.L, p.mixing_matrix)
     torque = torque + reaction_torque(rotor_acc, yaw_torque_sign, p.prop_inertia)
     if dist_t is not None:
         torque = rotation.rotate_inverse(quat, dist_t, offset=torque)
 
+    # Newton and Euler.
     acc = linear_acceleration(force, p.mass, p.gravity_vec)
     momentum = rotor_momentum(rotor_vel, yaw_torque_sign, p.prop_inertia)
     if dt is None:

@@ -113,15 +113,18 @@ def dynamics(
     del pos  # the argument gives all models one signature
     p = params
     thrust_cmd = cmd[..., 3:4]
+    # Thrust of the command, at once or with a lag.
     if p.thrust_dyn_coef is None:
         thrust, thrust_rate = thrust_cmd, jnp.zeros_like(rotor_vel)
     else:
         thrust, thrust_rate = rotor_vel[..., :1], p.thrust_dyn_coef * (thrust_cmd - rotor_vel)
+    # Force, world frame.
     body_force = along_z((p.acc_coef + p.cmd_f_coef * thrust)[..., 0])
     if p.drag_matrix is not None:
         body_force = body_force + body_drag_force(quat, vel, p.drag_matrix)
     force = rotation.rotate(quat, body_force, offset=dist_f)
 
+    # Attitude as a damped spring that follows the command.
     ang_acc = _fitted_angular_acceleration(quat, ang_vel, cmd[..., :3], p)
     if dist_t is not None:
         ang_acc = ang_acc + matvec(p.J_inv, rotation.rotate_inverse(quat, dist_t))

@@ -95,6 +95,7 @@ def thrust_in_flight(
     lift = (hover_thrust + loss * safe_sqrt(hover_thrust / disc)) * (1 + 1.5 * advance_squared)
 
     disc = disc * ceiling * ceiling
+    # First guess without in-plane speed, then Newton's method.
     squared_speed = in_plane_square + MIN_AIR_SPEED**2
     linear_term = loss - disc * axial_vel
     inflow = (safe_sqrt(linear_term * linear_term + 4 * disc * lift) - linear_term) / (2 * disc)

@@ -69,6 +69,7 @@ def stable_angular_acceleration(
     Returns:
         Mean angular acceleration over the step, body frame, rad/s^2. (..., 3)
     """
+    # Implicit share of the gyroscopic torque; zero for slow rotation.
     square = dot(ang_vel, ang_vel)
     slope = 0.5 * dt * (1 + MIN_STABLE_ANGLE**2) / (MIN_STABLE_ANGLE**2 - MAX_EXPLICIT_ANGLE**2)
     ramp = jnp.maximum(slope * dt**2 * square - slope * MAX_EXPLICIT_ANGLE**2, 0.0)
@@ -96,6 +97,7 @@ def free_rotation(quat: Array, ang_vel: Array, inertia: Array, dt: float) -> tup
     """
     w = [ang_vel[..., k] for k in range(3)]
     inertia = jnp.broadcast_to(inertia, ang_vel.shape)
+    # Strang splitting: turns about x, y, z, y and x.
     for axis, duration in ((0, dt / 2), (1, dt / 2), (2, dt), (1, dt / 2), (0, dt / 2)):
         second, third = (axis + 1) % 3, (axis + 2) % 3
         half = 0.5 * duration * w[axis]
@@ -103,6 +105,7 @@ def free_rotation(quat: Array, ang_vel: Array, inertia: Array, dt: float) -> tup
         zero = jnp.zeros_like(sin)
         quat = multiply(quat, jnp.stack([sin if k == axis else zero for k in range(3)] + [cos], axis=-1))
         twice_sin, twice_cos = 2 * sin * cos, cos * cos - sin * sin
+        # The angular momentum stays in the world and turns back in the body.
         momentum = inertia[..., second] * w[second], inertia[..., third] * w[third]
         w[second] = (twice_cos * momentum[0] + twice_sin * momentum[1]) / inertia[..., second]
         w[third] = (twice_cos * momentum[1] - twice_sin * momentum[0]) / inertia[..., third]

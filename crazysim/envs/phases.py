@@ -219,9 +219,11 @@ class Phases:
                 info=state.info | {"nonfinite": nonfinite} | info,
             )
 
+        # Results of the task, zeros in worlds that are not finite.
         results = vectorize(evaluate, task.batched)(state.data, action, state.action)
         state = vectorize(fill_results, False)(state, action, results)
         state = vectorize(_end_bad_world, False)(state)
+        # Changes of the results by wrappers.
         wrappers = [wrapper for wrapper in self.wrappers if type(wrapper).after_step is not Hooks.after_step]
         for wrapper in wrappers:
             state = vectorize(wrapper.after_step, wrapper.batched)(state)
@@ -235,6 +237,7 @@ class Phases:
             vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
         task, shape = self.task, (self.n_drones, self.actions.size)
+        # Data after the reset, with drones, goals and what wrappers place.
         reset_data = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
         key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(reset_data)
         data = self._apply(task, "spawn", vectorize)(reset_data, key)
@@ -253,6 +256,7 @@ class Phases:
                 info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
             )
 
+        # Observations and info at the start.
         results = vectorize(lambda data: (self._observe_task(data), _step_info(task, data)), task.batched)(data)
         state = vectorize(fill_state, False)(state.replace(data=data), *results)
         for wrapper in self.wrappers:

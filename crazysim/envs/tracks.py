@@ -149,16 +149,19 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
     size = np.array(CELL_SIZE)
     origin = middle - size * (np.array([n_x, n_y]) - 1) / 2
 
+    # Start and gates near the centres of different cells.
     cell = ranks(cell_numbers, n + 1)
     centres = jnp.asarray(origin) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
     shift = CELL_JITTER * (2 * shift_numbers.reshape(*x.shape[:-1], n, 2) - 1)
     gates = centres[..., 1:, :] + shift
     start = jnp.concatenate([centres[..., 0, :], jnp.full_like(centres[..., 0, :1], START_HEIGHT)], axis=-1)
 
+    # Gates face along the way from the one before.
     legs = gates - jnp.concatenate([centres[..., :1, :], gates[..., :-1, :]], axis=-2)
     yaw = jnp.arctan2(legs[..., 1], legs[..., 0]) + MAX_TURN * (2 * yaw_numbers - 1)
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
+    # Poles at different corners of cells.
     corner = ranks(corner_numbers, track.n_obstacles)
     poles = jnp.asarray(origin - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
     return start, _add_height(gates, track.gates_pos), quat, _add_height(poles, track.obstacles_pos)

@@ -103,6 +103,7 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
         b, c = stack_vectors([p, q, r]), stack_vectors([q, r, p])
         points = from_barycentric(closest_point_off_bc(new_point[0], b, c), new_point[0], b, c)
         squares = points.dot(points)
+        # Replace one corner of the triangle, where that comes nearer to the origin.
         for k in range(3):
             is_closer = squares[k] < squared_distance * (1 - rounding_margin(squared_distance.dtype))
             candidate = ((new_point, triangle[k], triangle[(k + 1) % 3]), points[k])
@@ -110,6 +111,7 @@ def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirecti
             squared_distance = jnp.where(is_closer, squares[k], squared_distance)
         return (*simplex, pair.with_candidate(n, best))
 
+    # All corners begin at the same support point.
     first_point = pair.support_point(n)
     triangle, nearest, best = fori_loop(steps, step, ((first_point,) * 3, first_point[0], (pair.gap(n), n)))
     weights = closest_point(*(point for point, _ in triangle))

@@ -51,12 +51,14 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     """
     c, u = _stop_gradient(middle), _stop_gradient(axis)
 
+    # The squared distance is convex along the segment: find the zero of its slope.
     def slope(t: Array) -> Array:
         point = [p + t * d for p, d in zip(c, u, strict=True)]
         return sum(d * (p - jnp.clip(p, -h, h)) for d, p, h in zip(u, point, box, strict=True))  # type: ignore[return-value]
 
     low, high = 0 * c[0] - half, 0 * c[0] + half
     low_slope, high_slope = slope(low), slope(high)
+    # The slope is linear between the planes of the faces, which narrow the bracket.
     for p, d, h in zip(c, u, box, strict=True):
         is_crossing = d * d > MIN_SQUARED_SINE
         inverse = 1 / jnp.where(is_crossing, d, 1.0)
@@ -66,6 +68,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
             is_before_root, is_after_root = (slope_at_side <= 0) & (t > low), (slope_at_side >= 0) & (t < high)
             low, low_slope = jnp.where(is_before_root, t, low), jnp.where(is_before_root, slope_at_side, low_slope)
             high, high_slope = jnp.where(is_after_root, t, high), jnp.where(is_after_root, slope_at_side, high_slope)
+    # Zero of the slope in the bracket, or the nearer end.
     rise = high_slope - low_slope
     is_between = (low_slope < 0) & (high_slope > 0)
     t = low + (high - low) * jnp.where(is_between, -low_slope / jnp.where(is_between, rise, 1.0), 0.0)

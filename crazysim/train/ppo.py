@@ -218,6 +218,7 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     agents, n_seeds = learner.agents.replace(key=key), len(learner.agents.key)
     initial_memory = (agents.network.make_memory(*learner.env.reward.shape),) * 2
     show = env.task.demonstrate if config.demonstrations else None
+    # Fly the worlds of all seeds as one batch.
     state, memory, records = rollout_seeds(
         env,
         learner.env,
@@ -229,6 +230,7 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
         initial_memory,
         learner.memory,
     )
+    # Update each agent with the worlds of its seed.
     blocks = split_blocks((learner.memory, state.obs, memory[1]), n_seeds)
     axes = (0, 0, 1, 0, 0, 0, 0, 0)
     imitates = jnp.broadcast_to(learner.iteration < config.demonstrations, n_seeds)
@@ -288,14 +290,17 @@ def learn(
     ``memory`` is of policy and critic before the rollout; ``last_obs`` and the critic's ``last_memory`` are after it.
     """
     samples, raw_obs, outcome = records
+    # Advantages, and targets of the critic on the scale of the returns.
     last_value, _ = agent.estimate_value(agent.observe(last_obs, config)[1], last_memory, config)
     advantages, targets = estimate_advantages(samples, last_value, config)
     returns = agent.returns.update(targets[..., None])
     targets = (targets - returns.mean) / return_std(returns)
     parameters = (agent.policy, agent.log_std, rescale_value(agent.value, agent.returns, returns))
+    # Epochs of updates on minibatches.
     data = samples, advantages, targets, jax.tree.map(lambda x: x[None], memory)
     loss = partial(compute_loss, agent, config, imitates)
     parameters, optimizer, losses = run_epochs(loss, parameters, agent.optimizer, data, config, key)
+    # Statistics of the observations, and metrics.
     stats = agent.stats.update(raw_obs)
     metrics = losses | {
         "reward": outcome["reward"].mean(),

@@ -52,6 +52,7 @@ def spline(
     )
     durations = np.diff(knots)
     ends_of(durations)
+    # Positions and yaw at the points; derivatives are free, or zero at rest.
     nodes = np.full((len(knots), SPLINE_ORDERS[degree], 4), np.nan)
     nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(knots))[:, None]], axis=1)
     if at_rest:
@@ -90,6 +91,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}. Give "
         "all curves a yaw, or none.",
     )
+    # Polynomials of equal degree.
     durations = np.diff(end_times, prepend=0.0)
     ends_of(durations)
     degree = max(len(curve) for curve in curves) - 1

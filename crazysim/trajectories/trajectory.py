@@ -134,12 +134,14 @@ class Trajectory(PyTree):
             f"expected trajectories along one leading axis, got ends of shape {ends.shape}. Use evaluate(t) for a "
             f"single trajectory, and Trajectory.stack for several.",
         )
+        # Piece at this time, and the time within it.
         end, repeats = _clipped_entry(ends, index, ends.shape[1] - 1), _clipped_entry(jnp.asarray(self.repeats), index)
         local_time, is_active = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _find_piece(ends, index, local_time)
         start = jnp.where(piece > 0, _clipped_entry(ends, index, piece - 1), 0.0)
         inverse = _inverse_length(jnp, _clipped_entry(ends, index, piece) - start)
         u, piece_coefficients = (local_time - start) * inverse, _clipped_entry(coefficients, index, piece)
+        # Axes of equal degree are evaluated together.
         degrees = [self.degree] * 4 if degrees is None else degrees
         derivatives_by_axis: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):

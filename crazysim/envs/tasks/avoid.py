@@ -139,6 +139,7 @@ class Avoid(OutcomeTask):
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
         x = draw(key, cells=N_CELLS_ALONG * field.n_cells_across, obstacles=(n, 4), drones=(n_drones, 12))
+        # Obstacles in different cells of the field.
         cell, shift = ranks(x["cells"], n), 2 * x["obstacles"] - 1
         corner = jnp.asarray((CELL_WIDTH - field.size) / 2, dtype)
         cell_pos = (
@@ -150,10 +151,12 @@ class Avoid(OutcomeTask):
         angle = jnp.pi * shift[:, 3:] / 2
         pos = jnp.concatenate([cell_pos, height[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
+        # Poses of poles, then of boxes.
         first_row = 0
         for handle in self.read(data).handles:
             rows = slice(first_row, first_row + len(handle))
             data, first_row = handle.set_pose(data, pos[rows], quat[rows]), rows.stop
+        # Goals, and starts on the opposite side.
         offset, goal_shift, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
         start = goals * np.array([-1, 1, 1], dtype) + START_JITTER * offset

@@ -140,6 +140,7 @@ class Race(OutcomeTask):
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
+        # Random numbers that this level needs, from one draw.
         sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:
             sizes["inertia"] = (n_drones, 4)
@@ -150,6 +151,7 @@ class Race(OutcomeTask):
         if self.practice:
             sizes |= {"passed": 1, "behind": (n_drones, 2)}
         x = draw(key, **sizes)
+        # Displaced objects and start, and other moments of inertia.
         start = np.asarray(course.start, float).astype(dtype)
         if self.level >= 2:
             data, start = self._displace_objects(data, x)
@@ -158,6 +160,7 @@ class Race(OutcomeTask):
         offset = (2 * x["start"] - 1) * np.array(START_JITTER, dtype)
         pos = start + start_offsets(n_drones).astype(dtype) + offset[..., :3]
         vel = jnp.zeros((), dtype)
+        # Practice starts behind any gate.
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
             passed_gates = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)

@@ -140,6 +140,7 @@ def solve_contacts(
     is_bouncing = (separation_speed < -BOUNCE_SPEED) & (contacts.gap + dt * separation_speed < 0)
     target_speed = jnp.where(is_bouncing, -contacts.restitution * separation_speed, closing_speed)
 
+    # Step sizes: how much the impulses at all points change the speed at each.
     normal_response, slip_response = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
     for body_indices, sum_matrix, lever in ((a, sum_matrices[0], arm), (b, sum_matrices[1], arm + offset[pair])):
         lever_matrix = rotation.cross_matrix(lever)
@@ -193,6 +194,7 @@ def solve_contacts(
     initial = Impulses(normal_start, friction_start)
     impulses, *_ = fori_loop(iterations, iterate, (initial, initial, jnp.zeros((), dtype)))
     total = impulses.normal[:, None] * normal + impulses.friction
+    # Impulses are scaled down where they would add energy.
     vel_change, ang_vel_change = velocity_change(total)
     energy_factor = _energy_factor(total, initial_vel, contact_velocity(vel_change, ang_vel_change))
     impulses, total, vel_change, ang_vel_change = jax.tree.map(

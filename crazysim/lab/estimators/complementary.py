@@ -187,10 +187,12 @@ def update_mahony(
         kp: Gain of the attitude error, 1/s. (1,)
         ki: Gain of the integral of the attitude error, 1/s^2. (1,)
     """
+    # Error between measured and estimated direction of gravity.
     error = rotation.cross(rotation.safe_normalize(accel, jnp.zeros_like(accel)), rotation.matrix(quat)[2])
     integral = integral + ki * dt * error
     has_force = jnp.any(accel != 0)
     rate = gyro + jnp.where(has_force, integral + kp * error, 0.0)
+    # Small rotation, then unit length again.
     quat_step = jnp.concatenate([0.5 * dt * rate, jnp.ones_like(rate[:1])])
     return rotation.safe_normalize(rotation.multiply(quat, quat_step), quat), integral
 

@@ -47,6 +47,7 @@ def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_spe
     """
     longitudinal_vel, lateral_vel = vel[..., :1], vel[..., 1:]
     slip_force = -stiffness * lateral_vel * lax.rsqrt(longitudinal_vel * longitudinal_vel + slip_speed * slip_speed)
+    # Both forces share the grip; saturation is smooth.
     squared_grip_ratio = (drive * drive + slip_force * slip_force) / (grip * grip)
     scale = lax.rsqrt(1 + squared_grip_ratio)
     return drive * scale, slip_force * scale

@@ -64,6 +64,7 @@ def velocity_after_contact(
         normal_speed = jnp.sum(vel * n, axis=-1)
         return normal_speed, rotation.safe_norm(vel - normal_speed[..., None] * n)[..., 0]
 
+    # Impacts bounce; other overlaps are pushed out softly.
     is_impact = is_active & (-point_speeds(initial_vel)[0] > BOUNCE_SPEED)
     target_speed = jnp.where(is_impact, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
 
@@ -90,6 +91,7 @@ def velocity_after_contact(
         )
 
     new_vel = fori_loop(iterations, iterate, initial_vel)
+    # Restitution after all iterations.
     normal_impulse = jnp.where(is_active, stiffness * jnp.maximum(target_speed - point_speeds(new_vel)[0], 0.0), 0.0)
     new_vel = new_vel + material.restitution * solve_symmetric(
         inertia, jnp.sum(jnp.where(is_impact, normal_impulse, 0.0)[..., None] * normal_wrench, axis=-2)

@@ -103,6 +103,7 @@ class Battery(Plugin, replaces=("battery voltage",), requires=needs_rotors):
         empty battery supplies nothing.
         """
         p, rotor_vel = data.params, data.states.rotor_vel
+        # Electric power of rotors and electronics.
         mechanical_power = jnp.sum(
             quadratic_curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True
         )

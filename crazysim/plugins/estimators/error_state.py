@@ -182,10 +182,12 @@ def predict_biased(
         accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
+    # Estimate, and attitude in the middle of the interval.
     vel, predicted_estimate = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
     mid_quat = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
     rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, mid_quat, predicted_estimate.quat))
 
+    # Jacobian of the errors, in blocks.
     error_rot, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
     vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
     gravity_to_vel, gyro_to_vel = (
@@ -200,6 +202,7 @@ def predict_biased(
         return jnp.concatenate([pos_rows, vel_rows, rotated_att - dt * p[12:], p[9:]])
 
     p = transform_errors(transform_errors(covariance(estimate.cov)).T)
+    # Noise of accelerometer and gyroscope.
     gyro_noise = gyro_to_vel * gyro_variance
     vel_noise = (accel_to_vel * accel_variance) @ accel_to_vel.T + gyro_noise @ gyro_to_vel.T
     vel_att_noise = -dt * gyro_noise
@@ -226,6 +229,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     """
     p, rows = covariance(estimate.cov), list(rows)
     n = p.shape[0]
+    # Kalman gain of a single number.
     ph = p[:, rows] @ h
     r = deviation * deviation
     gain = ph * (1 / (jnp.dot(h, ph[jnp.asarray(rows)]) + r))
@@ -237,6 +241,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     p = jnp.where(is_unused, p, 0.0) + reduction @ p[jnp.asarray(rows)]
     p = jnp.where(is_unused.T, p, 0.0) + p[:, rows] @ reduction.T
     p = p + r * gain[:, None] * gain
+    # Correction of the estimate.
     correction = error * gain
     biases = {}
     if estimate.accel_bias is not None and estimate.gyro_bias is not None:

@@ -147,6 +147,7 @@ class Hook(HangingLoad):
         """
         p, s = data.params, data.states
         offset, relative_vel = self.pos - self.tip_pos, self.vel - self.tip_vel
+        # A load in reach, slow, and with a mass.
         can_grip = (
             (dot(offset, offset) < self.reach**2)
             & (dot(relative_vel, relative_vel) < self.max_speed**2)
@@ -154,6 +155,7 @@ class Hook(HangingLoad):
         )
         is_picked_up = self.grip & ~self.attached & can_grip[..., 0]
         new_load = self.replace(attached=self.grip & (self.attached | is_picked_up))
+        # Inelastic impact of hook and load; the link ends the motion along it.
         link = new_load._link_params()
         common_vel = self.tip_vel + self.mass / (link.mass + MIN_MASS) * relative_vel
         new_state, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, self.tip_pos, common_vel)

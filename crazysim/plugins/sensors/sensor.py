@@ -250,11 +250,13 @@ class Sensor(Plugin):
         key, step = drone_key(data, self.name), data.core.steps
         value, sensor = self.measure(data, key)
         samples: Any = self.samples
+        # Loss of this measurement, and jitter of its delay.
         is_lost, jitter_fraction = False, 0.0
         if samples.dropout is not None or samples.queue is not None:
             random_numbers = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
             is_lost = False if samples.dropout is None else random_numbers[:1] < samples.dropout
             jitter_fraction = random_numbers[1:]
+        # Without a queue the measurement arrives at once.
         if samples.queue is None:
             taken_step = jnp.broadcast_to(step, (1,))
             if samples.dropout is not None:
