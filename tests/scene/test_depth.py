@@ -272,6 +272,7 @@ def draw_rays(rng, n):
     return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
+@pytest.mark.long("compiles rays in a stage, and a kernel with its gradient")
 def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
     """Hits agree in the kernel and in the loop over bodies of a stage. Gradients of the kernel are slopes of its
     results."""
@@ -288,7 +289,6 @@ def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
 
     by_kernel, by_world = cast_functions(mixed_scene, own)
 
-    @jax.jit
     def weighted_sum(pos, quat, object_pos, ray_origin, ray_direction):
         states = data.states.replace(pos=pos, quat=quat)
         moved_data = data.replace(states=states, objects=data.objects.replace(pos=object_pos))
@@ -297,7 +297,8 @@ def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
         return lengths + jnp.sum(slant * hits.normal), hits
 
     args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
-    gradients, kernel_hits = jax.jit(jax.grad(weighted_sum, range(len(args)), has_aux=True))(*args)
+    value_and_gradients = jax.jit(jax.value_and_grad(weighted_sum, range(len(args)), has_aux=True))
+    (_, kernel_hits), gradients = value_and_gradients(*args)
     hit_kinds = {kernel_hits.names[k].partition(":")[0] for k in np.unique(kernel_hits.body_index) if k >= 0}
     assert hit_kinds == {"floor", "fixed", "moving", "drone"}
     hits = jax.jit(lambda *args: [getattr(by_world(*args), name) for name in HIT_FIELDS])(data, origin, direction)
@@ -309,7 +310,8 @@ def test_rays_of_all_worlds_equal_those_of_each_world(x64, mixed_scene, rng):
         shift = rng.normal(size=gradient.shape)
         if k == 4:
             shift[:, : n // 8] = 0  # along axes, parallel to the floor
-        sums = [weighted_sum(*args[:k], args[k] + sign * h * shift, *args[k + 1 :])[0] for sign in (1, -1)]
+        shifted = ((*args[:k], args[k] + sign * h * shift, *args[k + 1 :]) for sign in (1, -1))
+        sums = [value_and_gradients(*x)[0][0] for x in shifted]
         np.testing.assert_allclose(np.sum(gradient * shift), (sums[0] - sums[1]) / (2 * h), rtol=1e-6, err_msg=k)
 
 
