@@ -163,7 +163,7 @@ def wrap_read_errors(path: str | Path, content: str, remedy: str) -> Iterator[No
     ``ImportError`` of a missing library, are passed on.
 
     Args:
-        content: Description of its contents, such as ``"a recorded flight"``.
+        content: Description of the file's contents, such as ``"a recorded flight"``.
         remedy: Sentence about what to do.
 
     Raises:
@@ -313,7 +313,7 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     """Check that a file can be written, before the work that produces its contents; an existing file is not changed.
 
     Args:
-        suffixes: Accepted endings of its name; empty for any.
+        suffixes: Accepted endings of the file's name; empty for any.
 
     Raises:
         ConfigError: If its name has another ending, the folder does not exist, or it cannot be written.

@@ -42,7 +42,7 @@ def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) 
 
     Args:
         condition: The condition. ()
-        value: Its argument, any tree of arrays.
+        value: Argument of ``fn``, any tree of arrays.
     """
     carry = condition, value
     return lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(c[0]), fn(c[1])), carry)[1]

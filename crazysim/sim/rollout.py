@@ -34,7 +34,7 @@ def stage_flat(flat: FlatData, reference: SimData, command: Any, feedforward: An
     """Return flat data with a checked command, as ``crazysim.core.functional.stage_command`` does.
 
     Args:
-        reference: The data, or its shapes and devices.
+        reference: Data of the simulation, or its shapes and devices.
         command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
         feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
     """

@@ -44,7 +44,7 @@ def run_block(
     """Return the outputs of a block.
 
     Args:
-        inputs: Its inputs: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
+        inputs: Inputs of the block: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
         shape: Shape of the lanes.
         observe: Function that is called with every operation and its results, or None.
 

@@ -24,7 +24,7 @@ def run_block(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env
     """Return the outputs of a block.
 
     Args:
-        inputs: Its inputs: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
+        inputs: Inputs of the block: arrays of the lanes' shape, scalars that all lanes share, or flat tables.
         shape: Shape of the lanes.
         env: Values of the enclosing blocks.
 

@@ -48,7 +48,7 @@ def to_out_of_tree(
 
     Args:
         folder: Existing folder for ``policy.h`` and ``controller.c``.
-        meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
+        meta: Description of the policy's inputs and outputs, from ``describe(env)`` or from ``load_policy``.
         airframe: The drone, which provides the thrust curve and the largest thrust of the rotors.
         freq: Rate of the policy, a divisor of 1000 Hz.
     """

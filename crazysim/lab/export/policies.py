@@ -105,7 +105,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     each image; pixels are row by row), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
 
     Args:
-        meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
+        meta: Description of the policy's inputs and outputs, from ``describe(env)`` or from ``load_policy``.
 
     Raises:
         ImportError: If onnx is not installed.
@@ -224,7 +224,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     that they stay in flash memory. The functions allocate nothing and call only ``tanhf``, and ``expf`` with memory.
 
     Args:
-        meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
+        meta: Description of the policy's inputs and outputs, from ``describe(env)`` or from ``load_policy``.
         name: Name of the function, and prefix of the names of the constants.
     """
     require(

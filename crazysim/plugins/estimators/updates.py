@@ -24,7 +24,7 @@ HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
 
 
 def update_pos(estimate: Estimate, pos: Array, deviation: Array | float, point: Array | None = None) -> Estimate:
-    """Return the estimate after a measured position, world frame, m (3,), with its standard deviation, m. () or (3,)
+    """Return the estimate after a measured position.
 
     Args:
         pos: The position, world frame, m. (3,)

@@ -142,7 +142,7 @@ class Commander:
         """Follow a trajectory that was uploaded.
 
         Args:
-            timescale: Factor of its duration.
+            timescale: Factor of the trajectory's duration.
             relative: Whether to begin at the present setpoint.
             reversed: Whether to follow it from its end to its start.
             relative_yaw: Whether to begin at the present yaw as well.
