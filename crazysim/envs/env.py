@@ -24,7 +24,7 @@ from crazysim.engine.sharding import put_on_device, shard, use_device_of
 from crazysim.engine.stage import vmap_worlds
 from crazysim.engine.step import FlatData, Step
 from crazysim.engine.tools.explain import explain
-from crazysim.envs.actions import Actions, actions_of
+from crazysim.envs.actions import Actions
 from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.phases import Phases, select_states, vectorize_over_worlds
@@ -315,7 +315,7 @@ class DroneEnv(Env):
             "Use None for the usual ones of the command level.",
         )
         self._sim, self._task, self.freq = sim, task, freq
-        self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
+        self._actions = task.actions(sim) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
         self.measure_states: Callable[[SimData], SimData] | None = None
         """``measure_states(data)``: the data with measured states, for one world, or for all worlds if the task is

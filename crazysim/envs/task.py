@@ -15,6 +15,7 @@ from crazysim.core.plugin import FunctionPlugin, StagePlacement, state
 from crazysim.core.settings import check_settings, setting
 from crazysim.engine.pytree import PyTree, device_array, static
 from crazysim.engine.stage import Stage
+from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError, expect, require
 from crazysim.plugins.sensors.image_sensor import ImageSensor
@@ -82,6 +83,10 @@ class Task:
         Override it for objects, plugins, and stages that need them; end with ``self.add_states(sim, ...)``.
         """
         self.add_states(sim)
+
+    def actions(self, sim: Sim) -> Actions:
+        """Return the meaning of actions, for ``DroneEnv(..., actions=None)``."""
+        return actions_of(sim.airframes, sim.default_data.params, sim.control)
 
     def add_states(self, sim: Sim, placements: Sequence[StagePlacement] = (), **initial: Any) -> None:
         """Add the states and stages of the task to a simulation; for use in ``install``.

@@ -9,8 +9,9 @@ from cases import LEVELS, PAIRS
 from crazysim import ConfigError, Control, Drone, Dynamics, load_airframe
 from crazysim.core.data import create_params
 from crazysim.dynamics import first_principles, fitted, supported_dynamics
-from crazysim.envs import Actions, actions_of
+from crazysim.envs import Actions, actions_of, make
 from crazysim.envs.actions import MAX_BODY_RATES, MAX_OFFSET, MAX_TILT, MAX_YAW, hover_thrust
+from crazysim.envs.tasks.hover import Hover
 
 CASES = [
     (drone, dynamics, control)
@@ -135,3 +136,13 @@ def test_drones_of_several_airframes_have_actions_of_their_own(control):
         )
     equal_actions = actions_of([fleet[0]] * 2, create_params(Dynamics.first_principles, fleet[0]), Control(control))
     assert equal_actions.centre.ndim == 1
+
+
+def test_a_task_may_give_actions_a_meaning_of_its_own():
+    class Slow(Hover):
+        def actions(self, sim):
+            return Actions(np.zeros(4), np.full(4, 0.1), sim.control)
+
+    own = Actions(np.zeros(4), np.ones(4), Control.attitude)
+    np.testing.assert_array_equal(make(Slow()).actions.scale, 0.1)
+    assert make(Slow(), actions=own).actions is own
