@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3307,
+    "envs": 3310,
     "geometry": 940,
     "lab": 15651,
     "media": 1060,
