@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from crazysim.lab.control.mppi import MPPI
     from crazysim.lab.estimators.eskf import ESKF
     from crazysim.lab.plugins.radar import Radar
+    from crazysim.lab.plugins.random_airframe import RandomAirframe
     from crazysim.lab.plugins.residual import Residual
     from crazysim.lab.plugins.rotor_jet import RotorJet
     from crazysim.lab.plugins.shared_load import SharedLoad
@@ -93,6 +94,7 @@ __all__ = [
     "Population",
     "PyTree",
     "Radar",
+    "RandomAirframe",
     "Randomize",
     "RangeFinder",
     "Residual",

@@ -16,6 +16,7 @@ from crazysim.plugins.effects.wind import Wind
 from crazysim.plugins.effects.wind_field import WindField
 
 if TYPE_CHECKING:
+    from crazysim.lab.plugins.random_airframe import RandomAirframe
     from crazysim.lab.plugins.residual import Residual
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "GroundEffect",
     "Latency",
     "MotorFailure",
+    "RandomAirframe",
     "Randomize",
     "Residual",
     "RotorAerodynamics",
