@@ -15,7 +15,7 @@ from crazysim.lab.commands import identify, live, show, validate
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
           "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",
-          "pymavlink": "mavlink"}  # fmt: skip
+          "pymavlink": "mavlink", "flatbuffers": "tflite"}  # fmt: skip
 """Extra of crazysim that installs each package."""
 
 

@@ -129,6 +129,8 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim.train.export": {
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
+        "crazysim.lab.export.rl_tools": "read_rl_tools to_rl_tools weights_to_c",
+        "crazysim.lab.export.tflite": "to_tflite",
     },
     "crazysim.trajectories": {
         "crazysim.lab.planning.approaches": "Approach",

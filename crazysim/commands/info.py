@@ -20,7 +20,7 @@ REQUIRED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasiu
 """Packages that crazysim needs."""
 OPTIONAL_PACKAGES = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo",
                      "warp-lang", "cflib", "motioncapture", "pymavlink", "rosbags", "splax", "ziglang", "tqdm",
-                     "trimesh")  # fmt: skip
+                     "trimesh", "flatbuffers")  # fmt: skip
 """Packages of the extras."""
 VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
              "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_JAX_FALLBACKS",

@@ -72,12 +72,14 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
     _add_task_and_device(add)
 
-    text = "write a trained policy as ONNX, as a C header or as a controller of the Crazyflie's firmware"
-    add = _add_policy_command(commands, "export", text, export)
+    text = "write a trained policy for flight controllers, or as ONNX or C"
+    folder_help = "folder of the run, or a checkpoint of rl-tools (.tar) with a policy of RAPTOR's shape"
+    add = _add_policy_command(commands, "export", text, export, folder_help)
     add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
     out_of_tree_help = "existing folder for an out of tree controller of the Crazyflie's firmware"
     add("--out-of-tree", type=Path, metavar="FOLDER", help=out_of_tree_help)
+    add("--rl-tools", type=Path, metavar="FILE", help="policy.tar of PX4's mc_raptor to write, from a checkpoint")
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
@@ -86,10 +88,12 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     _add_task_and_device(add)
 
 
-def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
+def _add_policy_command(
+    commands: argparse._SubParsersAction, name: str, text: str, run: Any, folder_help: str = "folder of the run"
+) -> Any:
     parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
-    parser.add_argument("folder", type=Path, help="folder of the run")
+    parser.add_argument("folder", type=Path, help=folder_help)
     return parser.add_argument
 
 
@@ -241,17 +245,34 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    from crazysim.train.export import to_c, to_onnx, to_out_of_tree
+    from crazysim.train.export import read_rl_tools, to_c, to_onnx, to_out_of_tree, to_rl_tools, weights_to_c
     from crazysim.train.training import load_policy
 
+    files = {".onnx": options.onnx, ".h": options.c, ".tar": options.rl_tools}
     require(
-        options.onnx is not None or options.c is not None or options.out_of_tree is not None,
-        "expected a file to write, got none; use --onnx FILE, --c FILE, or --out-of-tree FOLDER",
+        any(path is not None for path in (*files.values(), options.out_of_tree)),
+        "expected a file to write, got none; use --onnx FILE, --c FILE, --out-of-tree FOLDER, or --rl-tools FILE",
         ValueError,
     )
-    for path, suffix in ((options.onnx, ".onnx"), (options.c, ".h")):
+    for suffix, path in files.items():
         if path is not None:
             check_writable(path, (suffix,))
+    is_checkpoint = options.folder.suffix == ".tar"
+    require(
+        options.onnx is options.out_of_tree is None if is_checkpoint else options.rl_tools is None,
+        "expected --c or --rl-tools with a checkpoint of rl-tools, and neither --onnx nor --out-of-tree, got others"
+        if is_checkpoint
+        else f"expected a checkpoint of rl-tools (.tar) for --rl-tools, got {str(options.folder)!r}; mc_raptor flies "
+        f"policies of RAPTOR's shape only. Use --onnx, --c or --out-of-tree.",
+        ValueError,
+    )
+    if is_checkpoint:
+        weights = read_rl_tools(options.folder)
+        for path, write in ((options.c, weights_to_c), (options.rl_tools, to_rl_tools)):
+            if path is not None:
+                write(weights, path)
+                print(f"wrote {path}")
+        return
     policy, config, meta = load_policy(options.folder)
     for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
         if path is not None:

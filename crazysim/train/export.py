@@ -1,4 +1,4 @@
-"""Export of policies as ONNX, C and out of tree controllers, and the description that it needs."""
+"""Export of policies for flight controllers and other programs, and the description that it needs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from crazysim.train.interface import describe_env
 if TYPE_CHECKING:
     from crazysim.lab.export.out_of_tree import to_out_of_tree
     from crazysim.lab.export.policies import to_c, to_onnx
+    from crazysim.lab.export.rl_tools import read_rl_tools, to_rl_tools, weights_to_c
+    from crazysim.lab.export.tflite import to_tflite
 
-__all__ = ["describe", "to_c", "to_onnx", "to_out_of_tree"]
+__all__ = [
+    "describe", "read_rl_tools", "to_c", "to_onnx", "to_out_of_tree", "to_rl_tools", "to_tflite", "weights_to_c",
+]  # fmt: skip
 
 __getattr__ = lazy_getattr(__name__)
 

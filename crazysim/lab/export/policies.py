@@ -254,7 +254,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     for i, (weight, bias) in enumerate(numbers.layers):
         constants |= {f"weight{i}": weight, f"bias{i}": bias}
     for constant, x in constants.items():
-        lines.append(f"static const float {name}_{constant}{''.join(f'[{n}]' for n in x.shape)} = {_array_literal(x)};")
+        lines.append(constant_line(f"{name}_{constant}", x))
     lines.append("")
     # Memory, and the function that resets it.
     if n_memory:
@@ -407,6 +407,11 @@ def float_literal(x: float) -> str:
     """Return a number as a C literal that is read back bit for bit: nine digits identify any float32."""
     text = f"{float(x):.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def constant_line(name: str, x: np.ndarray) -> str:
+    """Return the definition of an array as a C constant."""
+    return f"static const float {name}{''.join(f'[{n}]' for n in x.shape)} = {_array_literal(x)};"
 
 
 def _array_literal(x: np.ndarray) -> str:
