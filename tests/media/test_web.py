@@ -114,7 +114,7 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
             np.testing.assert_allclose(chromium.find(MAGENTA, expected), expected, atol=MAX_PIXEL_DISTANCE)
     finally:
         program.send_signal(signal.SIGINT)
-        assert program.wait(30) == 0
+        assert program.wait(300) == 0
         program.stdout.close()
 
 

@@ -248,18 +248,23 @@ WINDOW_SCRIPT = textwrap.dedent("""
     sim.step()
     sim.render(**shot)
     assert not window.is_open
+    sim.render("rgb_array", width=32, height=24)
     print("done", flush=True)
 """)
 
 
 @pytest.mark.parametrize("backend", ["glfw", "egl"])
-def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
-    """A window shows the simulation from call to call, beside images in memory, and closes without a crash."""
+def test_a_window_shows_the_world_and_closes(screen, backend, tmp_path, opengl):
+    """A window shows the simulation from call to call, beside images in memory, and closes without a crash.
+
+    The program does not close its simulation: contexts are freed before the interpreter ends, so that no error is
+    printed at exit.
+    """
     display, pixels = screen
+    errors = tmp_path / "errors.txt"
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": backend, "PYTHONWARNINGS": "error"}
-    program = subprocess.Popen(
-        [sys.executable, "-c", WINDOW_SCRIPT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
-    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors.open("w"), "text": True}
+    program = subprocess.Popen([sys.executable, "-c", WINDOW_SCRIPT], env=environment, **pipes)
 
     def wait_for_color(word):
         """Return the screen once it shows the point of this colour: a screen server draws with a delay."""
@@ -292,12 +297,13 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         assert not red.any(), "overlays are for one picture only"
         assert np.nonzero(blue)[1].mean() < lit[1].mean() - 20
         assert program.stdout.readline().strip() == "done"
-        assert program.wait(60) == 0
+        assert program.wait(300) == 0
+        assert not errors.read_text()
     finally:
         program.kill()
         program.wait()
-        program.stdin.close()
-        program.stdout.close()
+        for pipe in (program.stdin, program.stdout, pipes["stderr"]):
+            pipe.close()
 
 
 @pytest.mark.parametrize("display", [None, ":54321"])
@@ -378,22 +384,13 @@ def test_any_thread_may_draw_with_and_free_contexts_of_another_thread(opengl, pl
 
     def draw():
         images.put(sim.render(**SHOT))
-        end.wait(60)
+        end.wait(300)
 
     thread = threading.Thread(target=draw)
     thread.start()
     try:
-        np.testing.assert_array_equal(images.get(timeout=60), sim.render(**SHOT))
+        np.testing.assert_array_equal(images.get(timeout=300), sim.render(**SHOT))
         sim.close()
     finally:
         end.set()
         thread.join()
-
-
-def test_a_program_that_does_not_close_its_simulation_exits_without_errors(opengl):
-    """Contexts are freed before the interpreter ends: no error is printed at exit."""
-    program = "from crazysim.sim import Sim; sim = Sim(2); sim.render('rgb_array', width=32, height=24)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0
-    assert not done.stderr
-    assert not done.stdout

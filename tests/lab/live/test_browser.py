@@ -58,7 +58,7 @@ class LoopThread:
 
     def __exit__(self, *_):
         self.live.post(lambda live: live.stop())
-        self._thread.join(30)
+        self._thread.join(300)
         self.live.close()
 
 
@@ -238,7 +238,8 @@ def connect(page, path=None, **headers):
     parts = urlsplit(page.url)
     address = f"ws://{parts.netloc}{parts.path if path is None else path}"
     origin = headers.pop("origin", f"http://{parts.netloc}")
-    return open_websocket(address, origin=origin, subprotocols=["viser-v0"], additional_headers=headers)
+    options = {"subprotocols": ["viser-v0"], "additional_headers": headers, "open_timeout": 300, "ping_interval": None}
+    return open_websocket(address, origin=origin, **options)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +285,7 @@ def test_the_page_and_other_programs_connect(page):
 )
 def test_the_page_is_served_under_names_of_this_machine(page, host, status):
     parts = urlsplit(page.url)
-    connection = HTTPConnection(parts.netloc, timeout=20)
+    connection = HTTPConnection(parts.netloc, timeout=300)
     connection.putrequest("GET", parts.path, skip_host=True)
     connection.putheader("Host", host)
     connection.endheaders()

@@ -1,14 +1,13 @@
 """A live window on a virtual screen: its picture, windows that are killed, errors, LEDs and reports of clicks."""
 
-import os
-import subprocess
 import sys
-import textwrap
+import threading
 
 import mujoco
 import numpy as np
 import pytest
 from screens import screen_pixels, virtual_screen
+from waiting import wait_for
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.lab.live import Live, Window
@@ -24,75 +23,48 @@ def screen(tmp_path_factory):
     yield from virtual_screen(tmp_path_factory.mktemp("screen"))
 
 
-SIMULATION_SCRIPT = textwrap.dedent("""
-    import sys, threading, time
-    import numpy as np
-    from crazysim import Sim
-    from crazysim.lab.live import Live, Window
-
-    sim = Sim(n_worlds=2, n_drones=1, control="state")
-    sim.spec.visual.quality.shadowsize = sim.spec.visual.quality.offsamples = 0  # drawn sooner without a GPU
-    pos = np.array([[[0.0, 0.0, 1.0]], [[0.3, 0.0, 1.0]]])
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-    live = Live(sim, fps=10)
-    live.selected = None
-    live.paused = True
-    camera = {"lookat": [0, 0, 1], "distance": 2.0, "azimuth": 90, "elevation": -90}
-    window = live.show(Window(worlds=(0, 1), width=400, height=200, cam_config=camera, setpoints=False, trail=0.0))
-    other = live.show(Window(width=64, height=48))
-    thread = threading.Thread(target=live.run)
-    thread.start()
-    print("shown", flush=True)
-    for line in sys.stdin:
-        if line.strip() == "select":
-            live.post(lambda live: live.select(1, 0))
-        if line.strip() == "kill":
-            window._process.kill()
-            window._process.wait()
-        if line.strip() == "kill_other":
-            other._process.kill()
-            thread.join(300)
-            assert not thread.is_alive() and not other.is_open, "the run ends with its last window"
-        time.sleep(0.1)
-        print(line.strip(), live.step, window.is_open, flush=True)
-    live.close()
-""")
-
-
 def mark_columns(pixels):
     """Return the columns of the pixels that show the mark of the selected drone in the right tile."""
     tile = pixels[:200, 200:400].astype(int)
     return 200 + np.nonzero(tile[..., 2] > tile[..., 0] + 25)[1]
 
 
-def test_a_window_shows_worlds_and_the_run_continues_when_it_is_killed(screen, opengl):
+def test_a_window_shows_worlds_and_the_run_continues_when_it_is_killed(screen, opengl, monkeypatch):
+    """The run ends with its last window."""
     display, path = screen
-    environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "egl", "PYTHONPATH": ":".join(sys.path)}
-    command = [sys.executable, "-c", SIMULATION_SCRIPT]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    ) as program:
-
-        def send(line):
-            program.stdin.write(line + "\n")
-            program.stdin.flush()
-            return program.stdout.readline().split()
-
-        assert program.stdout.readline().strip() == "shown"
-        for _ in range(20):
-            send("select")
-            columns = mark_columns(screen_pixels(path))
-            if len(columns) > 50:
-                break
-        # The right tile shows world 1, whose drone is selected. It is 0.3 m to the right of the point that the camera
-        # looks at from a distance of 2 m. The camera's 45 degrees fill 200 pixels, so a metre takes
-        # 200 / (2 * 2 * tan 22.5 deg) = 121 pixels, and the mark is 36 pixels to the right of the middle.
-        assert len(columns) > 50, "no mark of the selected drone"
-        np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
-        assert send("kill") == ["kill", "0", "False"]
-        assert send("kill_other")[0] == "kill_other"
-        program.stdin.close()
-        assert program.wait(300) == 0
+    monkeypatch.setenv("DISPLAY", display)
+    sim = Sim(n_worlds=2, control="state")
+    sim.spec.visual.quality.shadowsize = sim.spec.visual.quality.offsamples = 0  # drawn sooner without a GPU
+    pos = np.array([[[0.0, 0.0, 1.0]], [[0.3, 0.0, 1.0]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    camera = {"lookat": [0, 0, 1], "distance": 2.0, "azimuth": 90, "elevation": -90}
+    with Live(sim, fps=10) as live:
+        live.selected, live.paused = None, True
+        window = live.show(Window(worlds=(0, 1), width=400, height=200, cam_config=camera, setpoints=False, trail=0.0))
+        other = live.show(Window(width=64, height=48))
+        thread = threading.Thread(target=live.run)
+        thread.start()
+        try:
+            live.post(lambda live: live.select(1, 0))
+            wait_for(lambda: len(mark_columns(screen_pixels(path))) > 50)
+            # The right tile shows world 1, whose drone is selected. It is 0.3 m to the right of the point that the
+            # camera looks at from a distance of 2 m. The camera's 45 degrees fill 200 pixels, so a metre takes
+            # 200 / (2 * 2 * tan 22.5 deg) = 121 pixels, and the mark is 36 pixels to the right of the middle.
+            np.testing.assert_allclose(mark_columns(screen_pixels(path)).mean(), 200 + 100 + 36, atol=6)
+            window._process.kill()
+            wait_for(lambda: not window.is_open)
+            steps = []
+            live.post(lambda live: live.advance(1))
+            live.post(lambda live: steps.append(live.step))
+            wait_for(lambda: steps)
+            assert steps == [1]
+            other._process.kill()
+            thread.join(300)
+            assert not thread.is_alive()
+            assert not other.is_open
+        finally:
+            live.post(lambda live: live.stop())
+            thread.join(300)
 
 
 def test_without_a_screen_a_window_is_refused(monkeypatch):

@@ -61,7 +61,7 @@ def test_commands_stay_in_force(live):
 
 def test_real_time_and_slow_motion(live):
     """An idle loop is never ahead of real time, at any speed."""
-    for speed, seconds in ((1.0, 1.0), (4.0, 16.0), (0.25, 0.2)):
+    for speed, seconds in ((1.0, 0.5), (4.0, 2.0), (0.25, 0.2)):
         live.speed = speed
         start_time = time.perf_counter()
         report = live.run(seconds)
@@ -231,11 +231,10 @@ def test_the_run_ends_when_the_last_viewer_is_closed(live):
 
 def test_a_broken_viewer_is_closed_and_named(live, caplog):
     live.speed = 1.0
-    broken, other = live.show(CountingViewer(broken=True)), live.show(CountingViewer())
-    report = live.run(0.3)
-    assert report.simulated_s == pytest.approx(0.3)
+    broken, other = live.show(CountingViewer(broken=True)), live.show(CountingViewer(max_pictures=8))
+    live.run()  # until the other one closes
+    assert (broken.n, other.n) == (3, 8)
     assert broken.closed
-    assert not other.closed
     assert "CountingViewer failed" in caplog.text
     assert "no light" in caplog.text
 
@@ -251,11 +250,10 @@ class EqualViewer(CountingViewer):
 
 def test_only_the_closed_one_of_two_equal_viewers_is_removed(live):
     live.speed = 1.0
-    open_viewer, closed_viewer = live.show(EqualViewer()), live.show(EqualViewer(max_pictures=2))
-    live.run(0.3)
+    open_viewer, closed_viewer = live.show(EqualViewer(max_pictures=6)), live.show(EqualViewer(max_pictures=2))
+    live.run()
+    assert (open_viewer.n, closed_viewer.n) == (6, 2)
     assert closed_viewer.closed
-    assert not open_viewer.closed
-    assert open_viewer.n > 4
 
 
 def test_missed_real_time_is_reported(live, caplog, monkeypatch):

@@ -54,7 +54,7 @@ def autopilot_commands(link, pos, vel, rotation, gyro):
 
 
 class StandInThread(threading.Thread):
-    """Thread of a stand-in. It ends when its socket is closed or silent; ``end`` raises an error of the thread."""
+    """Thread of a stand-in. It ends with its socket or after an empty packet; ``end`` raises an error of the thread."""
 
     def __init__(self, serve):
         super().__init__(daemon=True)
@@ -70,7 +70,7 @@ class StandInThread(threading.Thread):
             self.error = error
 
     def end(self):
-        self.join(10.0)
+        self.join(300.0)
         if self.error:
             raise self.error
 
@@ -116,8 +116,8 @@ def test_betaflight_receives_the_state_and_flies():
     received, origin = [], Origin(10.0, 20.0, 100.0)
 
     def serve():
-        while True:
-            packet = np.frombuffer(state.recv(200), "<f8")
+        while content := state.recv(200):
+            packet = np.frombuffer(content, "<f8")
             received.append(packet)
             gyro, quat, vel, place = packet[1:4], packet[7:11], packet[11:14], packet[14:17]
             w, x, y, z = quat * [1, 1, -1, -1]
@@ -136,7 +136,8 @@ def test_betaflight_receives_the_state_and_flies():
         loop.links[0].channels[:] = np.arange(1000, 1016)
         loop.run(12.0)
         controls = [rc.recv(100) for _ in range(12 * 5)]
-    thread.end()
+        rc.sendto(b"", ("127.0.0.1", ports[1]))
+        thread.end()
     assert_at_goal(sim)
     times = np.array([packet[0] for packet in received])
     np.testing.assert_allclose(times, np.arange(len(times)) / 250, atol=1e-9)
@@ -267,8 +268,7 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer(monkeypatch):
         peer.settimeout(60.0)
 
         def serve():
-            while True:
-                peer.recv(200)
+            while peer.recv(200):
                 sent.append(np.float32([0.5, 0.6, 0.7, 0.8]) + np.float32(1e-4) * len(sent))
                 peer.sendto(sent[-1].astype("<f4").tobytes(), ("127.0.0.1", ports[0]))
                 answered.release()
@@ -281,7 +281,8 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer(monkeypatch):
         thread, start_time = StandInThread(serve), clock.now
         loop.run(0.5)
         assert clock.now - start_time == pytest.approx(0.496)  # the last step begins 4 ms before the end
-    thread.end()
+        peer.sendto(b"", ("127.0.0.1", ports[1]))
+        thread.end()
     command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._max_rotor_vel[0])[loop._orders[0]]
     assert len(sent) in (124, 125)  # the last answer may come after the end
     assert min(np.abs(command - motors).max() for motors in sent[123:]) < 1e-6
