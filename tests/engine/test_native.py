@@ -6,7 +6,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from random import Random
 
@@ -275,7 +277,6 @@ def compiler_commands(folder):
 
 @pytest.mark.parametrize("ended", [False, True])
 def test_an_interrupt_at_any_time_kills_all_compilers(ended):
-    """``KernelError`` would make another engine compile for minutes in a program that is to end."""
     slow = "constexpr long f() { long s = 0; for (long i = 0; i < 1000000000; i++) s += i; return s; }"
     slow += "constexpr long x = f();"
     flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
@@ -285,24 +286,36 @@ def test_an_interrupt_at_any_time_kills_all_compilers(ended):
         futures = []
 
         def interrupt_after(seconds, futures=futures):
-            signal.setitimer(signal.ITIMER_REAL, seconds)
             with native.compiling_threads(2) as pool:
                 futures.extend(pool.submit(native._compile, command, slow) for _ in range(4))
                 if not ended:
-                    time.sleep(60)
+                    time.sleep(seconds)
+                    raise KeyboardInterrupt
+                # Once more if the first is lost: callbacks of the garbage collector swallow an interrupt.
+                signal.setitimer(signal.ITIMER_REAL, seconds, 30.0)
 
         previous = signal.signal(signal.SIGALRM, signal.default_int_handler)
         try:
             with pytest.raises(KeyboardInterrupt):
-                interrupt_after(random.uniform(0.01, 0.05))
+                interrupt_after(random.uniform(0.0, 0.05))
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, previous)
         for future in futures:
-            if not future.cancelled():
-                assert isinstance(future.exception(), RuntimeError)
-                assert not isinstance(future.exception(), KernelError)
-        assert not native._COMPILER_PIPES
+            assert future.cancelled() or isinstance(future.exception(), KeyboardInterrupt)
+        wait_for(lambda: not native._COMPILER_PIPES)
+
+
+def test_no_other_engine_compiles_after_an_interrupt(cache_folder, recwarn):
+    """In a program that is to end, it would compile for minutes, and report a bug of crazysim."""
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    clock = {"increment_steps": sim.step_pipeline["increment_steps"]}
+    was_interrupted = threading.Event()
+    was_interrupted.set()
+    with ThreadPoolExecutor(1, initializer=setattr, initargs=(native._THREAD, "interrupted", was_interrupted)) as pool:
+        future = pool.submit(lambda: Step(clock, "auto").plan(sim.data))
+        assert isinstance(future.exception(), KeyboardInterrupt)
+    assert not recwarn
 
 
 @pytest.mark.long("three processes import JAX")

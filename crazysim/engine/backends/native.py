@@ -287,8 +287,8 @@ def _check_settings(work_folder: Path) -> None:
 def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
     """Provide threads that compile. If the ``with`` block is interrupted, their compilers are killed.
 
-    If a compiler was killed, the compilation raises ``RuntimeError``. A ``KernelError`` would make another engine
-    compile in its place.
+    If a compiler was killed, the compilation raises ``KeyboardInterrupt``, too. After an ``Exception`` another engine
+    would compile in its place.
 
     Args:
         n: Number of threads; None for the default of ``ThreadPoolExecutor``.
@@ -333,7 +333,7 @@ def _run_compiler(
             try:
                 stdout, stderr = process.communicate(timeout=seconds)
                 if write_end.closed:
-                    raise RuntimeError(f"{words[0]} was interrupted")
+                    raise KeyboardInterrupt
             except subprocess.TimeoutExpired:
                 raise KernelError(
                     f"{words[0]} took longer than {seconds:g} s; set CRAZYSIM_COMPILE_TIMEOUT to a larger number of "
