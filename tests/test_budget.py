@@ -1,4 +1,4 @@
-"""The size of the package: a number of statements for each folder, which only goes down."""
+"""The size of the package: a number of statements for each folder, which rises only with its reason in the commit."""
 
 import ast
 from collections import Counter

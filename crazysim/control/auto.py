@@ -141,7 +141,7 @@ def quat_error(quat: Array) -> Array:
     """Return the error between a body and a desired attitude as tilt and yaw error, body frame, rad. (..., 3)
 
     The tilt turns the thrust the shortest way; the yaw is the remaining rotation about the thrust (Brescianini and
-    D'Andrea 2018). The length of each error is ``2 sin(angle / 2)``, about the angle where it is small, and 2 at 180
+    D'Andrea 2020). The length of each error is ``2 sin(angle / 2)``, about the angle where it is small, and 2 at 180
     degrees. The first two entries are the tilt error, the third entry is the yaw error.
 
     Args:

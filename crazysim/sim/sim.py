@@ -621,7 +621,7 @@ class Sim:
 
     @locked
     def sync(self, world: int | None = None) -> None:
-        """Bring the scene up to date, if anything has changed since the last sync.
+        """Bring the scene up to date: all worlds if anything has changed since the last sync, or one.
 
         Args:
             world: World that is written into ``mj_data``, without a sync of other worlds; None for a sync of all worlds

@@ -55,7 +55,7 @@ class Recipe:
 _SHORT_ROLLOUTS = {"n_steps": 32, "minibatches": 8, "discount": 0.98, "gae_lambda": 0.95, "entropy": 0.0}
 """Hyperparameters of tasks in which rewards follow their actions at once."""
 _LONG_ROLLOUTS = {"hidden": (128, 128), "gae_lambda": 0.95, "entropy": 0.0}
-"""Hyperparameters of tasks in which rewards follow seconds after the actions that earn them."""
+"""Hyperparameters of tasks in which rewards follow seconds after the actions, found before the present defaults."""
 _CAMERA_POLICY = {**_LONG_ROLLOUTS, "entropy": 0.003, "convolution": (8, 16), "critic": "privileged"}
 """Hyperparameters with which PPO learns to fly from camera images."""
 

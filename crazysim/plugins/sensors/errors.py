@@ -2,7 +2,7 @@
 
 A sensor declares them by channel, with the names of its numbers and states::
 
-    chains: ClassVar = {"pos": Chain(GaussMarkov("drift", "drift_error", "drift_time"), White("noise"))}
+    chains: ClassVar = {"pos": [GaussMarkov("drift", "drift_error", "drift_time"), White("noise")]}
 """
 
 from __future__ import annotations
