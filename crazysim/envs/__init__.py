@@ -15,7 +15,8 @@ from crazysim.envs.single import DroneSingleEnv
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.goals import state_of
+from crazysim.envs.tasks.course import HoopTask, VisitTask
+from crazysim.envs.tasks.goals import ProgressTask, state_of
 from crazysim.envs.vector import DroneVectorEnv
 from crazysim.envs.wrappers import (
     ActionDelay,
@@ -56,13 +57,16 @@ __all__ = [
     "EnvState",
     "EpisodeStatistics",
     "FrameStack",
+    "HoopTask",
     "Normalize",
     "ObservationNoise",
     "Observe",
     "PrivilegedObservation",
+    "ProgressTask",
     "RandomizeWith",
     "RewardTerms",
     "Task",
+    "VisitTask",
     "Wrapper",
     "actions_of",
     "draw",

@@ -272,6 +272,14 @@ class Env(ABC):
         """
         return self._evaluate_task(self.task.target, state)
 
+    def rings(self, state: EnvState) -> Array | None:
+        """Return rings to draw in images: middle, m, axis, and radius, m; None if the task has none.
+
+        Returns:
+            (n_worlds, n_rings, 7)
+        """
+        return self._evaluate_task(self.task.rings, state)
+
     def subjects(self, state: EnvState) -> Array | None:
         """Return points that films keep in view besides drones and marks, m; None if the task has none.
 

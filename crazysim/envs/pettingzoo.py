@@ -44,7 +44,7 @@ class DroneParallelEnv(ParallelEnv):
             "expected an environment without AutoReset, got one with it. Call reset() after an episode.",
         )
         self.env, self.sim, self.render_mode = env, env.sim, render_mode
-        self._renderer = Renderer(env.sim, render_mode, size=render_size)
+        self._renderer = Renderer(env, render_mode, size=render_size)
         self.metadata = {
             "name": f"crazysim/{env.task.name}",
             "render_modes": list(RENDER_MODES),

@@ -52,7 +52,7 @@ class DroneVecEnv(VecEnv):
         render_size: tuple[int, int] = (640, 480),
     ):
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
-        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env, render_mode, render_worlds, render_size)
         self._reset_fn, self._step_fn = jax.jit(self._reset_state), jax.jit(self._step_state)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None

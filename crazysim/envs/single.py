@@ -79,11 +79,14 @@ def _squeeze_world(tree: Any) -> Any:
     return jax.tree.map(lambda x: x[0], tree)
 
 
-def make_single(task: str, render_mode: str | None = None, **options: Any) -> DroneSingleEnv:
+def make_single(
+    task: str, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **options: Any
+) -> DroneSingleEnv:
     """Return one world of a task, for ``gymnasium.make``.
 
     Args:
         task: One of ``crazysim.envs.TASKS``.
+        render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
     """
-    return DroneSingleEnv(make(task, options.pop("n_worlds", 1), **options), render_mode)
+    return DroneSingleEnv(make(task, options.pop("n_worlds", 1), **options), render_mode, render_size)

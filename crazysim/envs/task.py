@@ -174,8 +174,20 @@ class Task:
     def target(self, data: SimData) -> Array | None:
         """Return the target position of each drone, or several marks per drone, to draw in images, m; None if none.
 
+        By default it is the state ``goal``, if the task has one that is declared ``state((3,))``.
+
         Returns:
             (n_drones, 3) or (n_drones, n_marks, 3)
+        """
+        goal = getattr(self.Record, "__dataclass_fields__", {}).get("goal")
+        return None if goal is None or goal.metadata["shape"] != (3,) else self.read(data).goal
+
+    def rings(self, data: SimData) -> Array | None:
+        """Return rings to draw in images, such as hoops, as middle, m, unit vector along the axis, and radius, m; None
+        for no rings.
+
+        Returns:
+            (n_rings, 7)
         """
         return None
 
@@ -229,18 +241,19 @@ def _move_states_to_record(cls: type[Task]) -> None:
             name in hints, f"expected an annotation of state {name!r}, got none. Use {name}: jax.Array = state(...)."
         )
         require(
-            not hasattr(cls.__base__, name),
+            not any(hasattr(base, name) for base in cls.__bases__),
             f"expected a state of another name than {name!r}, which is a method or a setting of a task. Rename it.",
         )
     plain = {f.name: f.type for f in dataclasses.fields(cls) if f.name in vars(cls)}  # such as ``seconds = 8.0``
     cls.__annotations__ = {name: hint for name, hint in (plain | hints).items() if name not in states}
-    if not states:
+    records = tuple(dict.fromkeys(base.Record for base in cls.__bases__ if getattr(base, "Record", None)))
+    if not states and len(records) < 2:
         return
     for name in states:
         setattr(cls, name, _State(name))
     namespace = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.Record"}  # where pickles look
     hints = {"__annotations__": {name: hints[name] for name in states}}
-    cls.Record = type("Record", (cls.Record or PyTree,), {**namespace, **hints, **states})
+    cls.Record = type("Record", records or (PyTree,), {**namespace, **hints, **states})
 
 
 def _initial_states(sim: Sim, record: type[PyTree], initial: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
+import inspect
 from collections.abc import Iterator, Mapping
+from types import CodeType
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +28,8 @@ from crazysim.sim.sim import Sim
 
 REQUIRED_METHODS = ("spawn", "observe", "rewards", "terminated", "error")
 """Methods that every task defines."""
+HOOKS = {name for name, x in vars(Task).items() if inspect.isfunction(x)} - {"read", "write"} | {"demonstrate"}
+"""Methods of tasks that the environment or a training calls."""
 
 
 def require_installed(sim: Sim, task: object) -> None:
@@ -111,6 +116,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     """
     # Methods that every task defines.
     title = f"task {task.name or type(task).__name__!r}"
+    _refuse_misspelt_methods(type(task), title)
     undefined = [name for name in REQUIRED_METHODS if getattr(type(task), name) is getattr(Task, name)]
     require(
         not undefined,
@@ -163,6 +169,26 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         f"{title}: expected terminated of type bool and shape ({batch_name.removesuffix(', ')}), got "
         f"{_describe(terminated)}. It is one value per world: use jnp.any or jnp.all over the drones.",
     )
+
+
+def _refuse_misspelt_methods(cls: type[Task], title: str) -> None:
+    # Of the classes outside of the package; a method that other methods use is no misspelt one.
+    bases = cls.__mro__[: cls.__mro__.index(Task)]
+    functions = [(base, name, getattr(x, "__func__", x)) for base in bases for name, x in vars(base).items()]
+    functions = [(base, name, fn) for base, name, fn in functions if inspect.isfunction(fn)]
+    used_names = {used for _, _, fn in functions for used in _names_of(fn.__code__)}
+    own_names = {name for base, name, _ in functions if not base.__module__.startswith("crazysim.")}
+    for name in sorted(own_names - used_names - HOOKS):
+        similar = difflib.get_close_matches(name, HOOKS - own_names, 1, 0.8)
+        require(
+            not similar or name.startswith("_"),
+            f"{title}: expected methods that something calls, got {name!r}, which nothing calls. Use the name "
+            f"{''.join(similar)!r} if you mean that method, or else begin the name with an underscore.",
+        )
+
+
+def _names_of(code: CodeType) -> set[str]:
+    return set(code.co_names).union(*(_names_of(x) for x in code.co_consts if isinstance(x, CodeType)))
 
 
 @contextlib.contextmanager

@@ -50,7 +50,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         mode = enum_member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
-        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env, render_mode, render_worlds, render_size)
         self.metadata = {
             "autoreset_mode": mode,
             "render_modes": list(RENDER_MODES),

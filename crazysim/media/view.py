@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +27,11 @@ MAX_PIXELS = 16_384
 """Largest width and height of an image."""
 
 RING_POINTS, RING_LINE_WIDTH = 25, 2.0
-"""Number of points of a ring around a drone, and width of its line, pixels."""
+"""Number of points of a ring, and width of the line of a ring around a drone, pixels."""
+MARK_COLOR, MARK_WIDTH = (0.1, 0.8, 0.3, 0.6), 8
+"""Colour, RGBA, of marks, and their width in images of the free camera, pixels."""
+HOOP_COLOR, HOOP_THICKNESS = (0.95, 0.6, 0.1, 1.0), 0.02
+"""Colour, RGBA, of hoops, and radius of their rim, m."""
 MIN_VIEW_RADIUS = 0.25
 """Smallest radius around points that a camera holds in view, m; a Crazyflie is then a sixth of the image's height."""
 DISTANCE_MARGIN = 1.25
@@ -73,6 +78,12 @@ class View:
     top_view: bool = False
     """True to draw a map from above at the bottom left of each world that has obstacles, with the drones' paths since
     the last reset."""
+    marks: Callable[[Sim, int], ArrayLike] | None = None
+    """Function that returns points of a world to mark, ``marks(sim, world)``, m (n, 3), or None. Marks have the same
+    size in all images; points that are not finite have none."""
+    hoops: Callable[[Sim, int], ArrayLike] | None = None
+    """Function that returns hoops of a world to draw, ``hoops(sim, world)``, or None: middle, m, unit vector along the
+    axis, and radius, m. (n, 7)"""
     ring_width: int = setting(default=0, low=0)
     """Width of a ring around every drone that the free camera shows smaller than that, pixels; 0 for no rings."""
     columns: int | None = None
@@ -152,10 +163,7 @@ class View:
         try:
             for k, world in enumerate(self.worlds):
                 sim.overlays.restore(saved_overlays)
-                self._draw(sim, k, time[k])
-                config = self._cam_config(sim, k, time[k], pos[k])
-                if self.ring_width and self.camera == -1:
-                    self._draw_rings(sim, pos[k], config)
+                config = self._draw(sim, k, time[k], pos[k])
                 tile = image[self.tile(k)]
                 tile[:] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
                 if self._paths is not None:
@@ -175,10 +183,8 @@ class View:
             RenderError: If there is no screen.
         """
         time, pos = self._read_worlds(sim)
-        self._draw(sim, 0, time[0])
-        sim.render(
-            "human", self.worlds[0], self.camera, self._cam_config(sim, 0, time[0], pos[0]), self.width, self.height
-        )
+        config = self._draw(sim, 0, time[0], pos[0])
+        sim.render("human", self.worlds[0], self.camera, config, self.width, self.height)
 
     def _read_worlds(self, sim: Sim) -> tuple[NDArray, NDArray]:
         worlds = world_indices(sim, self.worlds)
@@ -196,7 +202,13 @@ class View:
             self._paths.add(time, pos)
         return time, pos
 
-    def _draw(self, sim: Sim, k: int, time: float) -> None:
+    def _draw(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
+        config = self._cam_config(sim, k, time, pos)
+        if self.hoops is not None:
+            for hoop in np.asarray(self.hoops(sim, self.worlds[k]), float).reshape(-1, 7):
+                _draw_hoop(sim, hoop)
+        if self.camera == -1:
+            self._draw_rings_and_marks(sim, k, pos, config)
         if self._trail is not None:
             self._trail.draw(sim.overlays, k, self.rgba)
         if self.setpoints:
@@ -205,6 +217,7 @@ class View:
             self.draw(sim, self.worlds[k])
         if self.text is not None:
             draw_text(sim, _format_text(self.text, self.worlds[k], time))
+        return config
 
     def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
         config = self.cam_config(time) if callable(self.cam_config) else self.cam_config
@@ -227,21 +240,26 @@ class View:
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config
 
-    def _draw_rings(self, sim: Sim, pos: NDArray, config: Mapping[str, Any]) -> None:
+    def _draw_rings_and_marks(self, sim: Sim, k: int, pos: NDArray, config: Mapping[str, Any]) -> None:
         model, camera = sim.mj_model, mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(model, camera)
         lookat, distance = np.asarray(config.get("lookat", camera.lookat)), config.get("distance", camera.distance)
         azimuth, elevation = (np.radians(config.get(x, getattr(camera, x))) for x in ("azimuth", "elevation"))
         right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         ahead = np.array([*(np.cos(elevation) * np.array([-right[1], right[0]])), np.sin(elevation)])
+        eye, pixel = lookat - distance * ahead, 2 * np.tan(np.radians(model.vis.global_.fovy) / 2) / self.tile_size[1]
+        if self.marks is not None:
+            for point in np.asarray(self.marks(sim, self.worlds[k]), float).reshape(-1, 3):
+                if np.isfinite(point).all() and (point - eye) @ ahead > 0:
+                    sim.overlays.points(point[None], MARK_COLOR, MARK_WIDTH / 2 * pixel * float((point - eye) @ ahead))
         angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
         circle = np.cos(angle) * right + np.sin(angle) * np.cross(right, ahead)
-        depth = (pos - lookat) @ ahead + distance
-        pixel_size = 2 * depth * np.tan(np.radians(model.vis.global_.fovy) / 2) / self.tile_size[1]
         for drone, drone_color in enumerate(choose_drone_colors(sim.n_drones, self.rgba)):
-            radius = pixel_size[drone] * self.ring_width / 2
+            radius = self.ring_width / 2 * pixel * ((pos[drone] - eye) @ ahead)
             if radius > model.geom(f"col_sphere:{drone}").size[0] and np.isfinite(pos[drone]).all():
-                sim.overlays.line(pos[drone] + radius * circle, drone_color, RING_LINE_WIDTH, RING_LINE_WIDTH)
+                # Halfway to the camera, where it has the same place in the image and the floor does not hide it.
+                ring = (eye + pos[drone] + radius * circle) / 2
+                sim.overlays.line(ring, drone_color, RING_LINE_WIDTH, RING_LINE_WIDTH)
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
         last_time, value = self._aim.get(k, (np.inf, aim))
@@ -250,6 +268,15 @@ class View:
             value = value + weight * (aim - value)
         self._aim[k] = (time, value)
         return value
+
+
+def _draw_hoop(sim: Sim, hoop: NDArray) -> None:
+    axis, angle = hoop[3:6], np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    rim = hoop[:3] + hoop[6] * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side))
+    for start, end in itertools.pairwise(rim):
+        sim.overlays.capsule(start, end, HOOP_THICKNESS, HOOP_COLOR, cylinder=False)
 
 
 def _draw_inset(tile: NDArray, picture: NDArray | None) -> None:

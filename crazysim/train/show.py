@@ -15,22 +15,19 @@ from jax import Array
 from crazysim.envs.env import Env
 from crazysim.envs.phases import select_states
 from crazysim.envs.random import check_key
+from crazysim.envs.rendering import view_of
 from crazysim.envs.state import EnvState, Obs, terms_of
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
-from crazysim.sim.visualize import draw_points, draw_text
+from crazysim.sim.visualize import draw_text
 from crazysim.storage import MAX_TEXT_BYTES, as_path, open_file, wrap_read_errors, write_figure
 from crazysim.train.evaluation import act, as_tree, fly_episodes, held_out_key, initial_memory
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE_FILE
 
-TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
-"""Colour, RGBA, and smallest radius, m, of the mark at a drone's target."""
-RING_WIDTH = 25
-"""Least width of a drone or the ring around it in films, pixels."""
 DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))
 """Colours of depths from far to near, RGB."""
 SUCCESS_LIMITS = (-2, 102)
@@ -267,19 +264,6 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     sim, freq = env.sim, env.base.freq
     frame_steps = max(freq // 25, 1)
 
-    def read_world_points(read_points: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
-        positions = read_points(state)
-        return np.zeros((0, 3)) if positions is None else np.asarray(positions[world]).reshape(-1, 3)
-
-    def points_in_view(_: Sim, world: int) -> np.ndarray:
-        return np.concatenate([read_world_points(targets, world), read_world_points(subjects, world)])
-
-    def draw_target(sim: Sim, world: int) -> None:
-        target_pos = read_world_points(targets, world)
-        if len(target_pos):
-            distance = np.abs(target_pos[:, None] - np.asarray(sim.data.states.pos[world])).max()
-            draw_points(sim, target_pos, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(distance)))
-
     formats = env.image_formats()
     depths = [name for name, x in formats.items() if x["unit"] == "m"]
     masks = [name for name, x in formats.items() if x["unit"] == "1" and x.get("output") == "segmentation"]
@@ -291,7 +275,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
             return color_depth(pixels, image["far"]) if name in depths else color_depth(1 - pixels, 1.0)
         return None
 
-    targets, subjects, find_success = jax.jit(env.target), jax.jit(env.subjects), jax.jit(env.succeeded)
+    find_success = jax.jit(env.succeeded)
 
     @jax.jit
     def step(state: EnvState, memory: Any) -> tuple[EnvState, Any]:
@@ -307,8 +291,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
             return ": success"
         return ": crashed" if is_terminated else ": late"
 
-    def draw_overlays(sim: Sim, world: int) -> None:
-        draw_target(sim, world)
+    def draw_time(sim: Sim, world: int) -> None:
         draw_text(sim, f"{int(state.data.core.steps[world, 0]) / sim.freq:.1f} s{find_outcome(world)}")
 
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
@@ -316,22 +299,19 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     # Steps for which the error of all drones has been below the tolerance, and those that a success takes.
     n_steady_steps = np.zeros(sim.n_worlds, int)
     n_hold_steps = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    camera = dict(env.task.camera(sim.n_drones) or {"elevation": -20})
     rows, columns = View(worlds=range(n_shown)).grid
     width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
-    view = View(
+    view = view_of(
+        env,
+        lambda: state,
         worlds=range(n_shown),
         width=width,
         height=height,
         trail=1.5,
-        draw=draw_overlays,
-        cam_config=camera,
-        follow=camera.pop("follow", None),
+        lag=0.6,
+        draw=draw_time,
         inset=draw_image,
         top_view=bool(depths + masks),
-        hold=None if "distance" in camera else points_in_view,
-        lag=0.6,
-        ring_width=RING_WIDTH,
     )
     n_frames = (env.max_steps + freq) // frame_steps + 1
     with Film(path, view, fps=freq / frame_steps, progress=progress, total=n_frames) as recording:

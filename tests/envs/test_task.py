@@ -393,6 +393,26 @@ def test_law_09_missing_methods_are_named(two_drones):
         Incomplete().observe(two_drones.data)
 
 
+def test_methods_that_nothing_calls_and_whose_names_are_nearly_those_of_others_are_errors():
+    class Misspelt(Hover):
+        def before_stpe(self, data):
+            return data
+
+    class Helped(Hover):
+        def rewards(self, data, action, last_action):
+            return {name: self.inform(x) for name, x in super().rewards(data, action, last_action).items()}
+
+        def inform(self, x):
+            return x
+
+        def _targets(self):
+            return None
+
+    with pytest.raises(ConfigError, match=r"got 'before_stpe', .*Use the name 'before_step'"):
+        make(Misspelt(), engine="interpret")
+    make(Helped(), engine="interpret")
+
+
 def test_plugins_that_are_added_to_the_simulation_of_an_environment_are_refused():
     env = make("hover", 2)
     env.sim.add(Wind((1.0, 0.0, 0.0)))

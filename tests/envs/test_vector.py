@@ -1,8 +1,6 @@
 """Tasks as Gymnasium's vector environments: modes of resets, seeds, wrong input, pictures, NumPy users."""
 
 import itertools
-import sys
-import types
 
 import gymnasium
 import jax
@@ -11,10 +9,12 @@ import numpy as np
 import pytest
 from cases import trees_equal
 from gymnasium.utils.env_checker import check_env
+from pictures import HEIGHT, WIDTH, has_colour, read_frames
 
 from crazysim import ConfigError
-from crazysim.envs import AutoReset, DroneVectorEnv, make
+from crazysim.envs import AutoReset, DroneVectorEnv, HoopTask, flying, make
 from crazysim.envs.single import DroneSingleEnv
+from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.vector import make_vector
 
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -255,34 +255,56 @@ def test_pictures_show_the_drone_as_it_is():
 
 
 @pytest.mark.usefixtures("opengl")
+def test_pictures_show_what_the_task_shows_in_films():
+    """Its camera sees its hoops and its goal, and a drone that is small has a ring of 25 pixels."""
+
+    class Hooped(HoopTask, Hover):
+        name = "hooped"
+        n_waypoints = 1
+
+        def camera(self, n_drones):
+            return {"lookat": (0.0, 0.0, 1.0), "distance": 8.0, "azimuth": 0, "elevation": 0}
+
+        def spawn(self, data, key):
+            n = data.core.n_drones
+            data = flying(data, jnp.array([0.0, 1.5, 1.0]))
+            return self.set_course(data, jnp.tile(jnp.array([0.0, 0.0, 1.0]), (n, 1, 1)), jnp.array([0.0, -1.5, 1.0]))
+
+    env = DroneVectorEnv(make(Hooped()), render_mode="rgb_array", render_size=(WIDTH, HEIGHT))
+    env.reset(seed=0)
+    (picture,) = env.render()
+    # Across the view are y, to the left, and z; the hoop faces the camera.
+    scale = 0.5 * HEIGHT / np.tan(np.radians(50 / 2)) / 8.0
+    hoop = np.nonzero((np.ptp(picture.astype(int), axis=-1) > 60) & has_colour(picture, [1, 1, 0]))
+    goal = np.nonzero(has_colour(picture, [0, 1, 0]))
+    ring = np.nonzero(has_colour(picture, [1, 0, 0]) & (np.arange(WIDTH) < WIDTH / 2 - 0.7 * scale))
+    assert [np.ptp(x) for x in hoop] == pytest.approx([scale, scale], abs=2)
+    np.testing.assert_allclose([x.mean() for x in goal], [HEIGHT / 2, WIDTH / 2 + 1.5 * scale], atol=2)
+    np.testing.assert_allclose([x.mean() for x in ring], [HEIGHT / 2, WIDTH / 2 - 1.5 * scale], atol=2)
+    assert [np.ptp(x) for x in ring] == pytest.approx([25, 25], abs=3)
+    env.close()
+
+
+@pytest.mark.usefixtures("opengl")
 @pytest.mark.skipif(not hasattr(gymnasium.wrappers.vector, "RecordVideo"), reason="a newer Gymnasium has it")
-def test_gymnasiums_recorder_films_all_worlds_and_render_worlds_chooses_some(tmp_path, monkeypatch):
-    """The recorder writes films with MoviePy, which the test replaces to get the frames."""
-    films = []
-
-    class Clip:
-        def __init__(self, frames, fps):
-            films.append((np.stack(frames), fps))
-
-        def write_videofile(self, path, logger):
-            pass
-
-    names = ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip")
-    for name in names:
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    sys.modules[names[-1]].ImageSequenceClip = Clip
-    env = gymnasium.make_vec(
-        ID, num_envs=4, render_mode="rgb_array", render_size=(64, 48), max_episode_steps=3, numpy=True
-    )
-    film = gymnasium.wrappers.vector.RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda k: k == 0)
+def test_gymnasiums_recorders_film_one_world_and_all_and_render_worlds_chooses_some(tmp_path):
+    pytest.importorskip("moviepy")
+    options = {"render_mode": "rgb_array", "render_size": (64, 48)}
+    env = gymnasium.make_vec(ID, num_envs=4, max_episode_steps=3, numpy=True, **options)
+    film = gymnasium.wrappers.vector.RecordVideo(env, str(tmp_path / "all"), episode_trigger=lambda k: k == 0)
     film.reset(seed=0)
     for _ in range(4):
         film.step(zeros(film))
     film.close()
-    ((frames, fps),) = films
-    assert (frames.shape, fps) == ((4, 2 * 48, 2 * 64, 3), 50)
-    assert len(np.unique(frames.reshape(4, 2, 48, 2, 64, 3)[0].swapaxes(1, 2).reshape(4, -1), axis=0)) == 4
-    env = gymnasium.make_vec(ID, num_envs=4, render_mode="rgb_array", render_worlds=[3], render_size=(64, 48))
+    frames = read_frames(tmp_path / "all" / "rl-video-episode-0.mp4", 2 * 48, 2 * 64)
+    assert len(frames) >= 4
+    assert len(np.unique(frames[0].reshape(2, 48, 2, 64, 3).swapaxes(1, 2).reshape(4, -1), axis=0)) == 4
+    film = gymnasium.wrappers.RecordVideo(gymnasium.make(ID, **options), str(tmp_path / "one"))
+    film.reset(seed=0)
+    film.step(np.zeros(4))
+    film.close()
+    assert len(read_frames(tmp_path / "one" / "rl-video-episode-0.mp4", 48, 64)) >= 2
+    env = gymnasium.make_vec(ID, num_envs=4, render_worlds=[3], **options)
     env.reset(seed=0)
     (picture,) = env.render()
     assert picture.shape == (48, 64, 3)

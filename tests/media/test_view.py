@@ -277,6 +277,29 @@ def test_small_drones_have_rings_of_a_width(sim):
             np.testing.assert_allclose([rows.mean(), columns.mean()], [HEIGHT / 2, WIDTH / 2], atol=1.5)
 
 
+def test_rings_of_drones_on_the_floor_are_whole(sim):
+    place(sim, POSITIONS * [1, 1, 0], 0.0)
+    config = {"lookat": POSITIONS[0] * [1, 1, 0], "distance": 8.0, "azimuth": 30, "elevation": -10}
+    rows, columns = np.nonzero(
+        has_colour(make_view(camera=-1, cam_config=config, ring_width=20, rgba=RED).render(sim), RED)
+    )
+    assert [np.ptp(x) + 1 for x in (rows, columns)] == pytest.approx([20, 20], abs=2)
+
+
+@pytest.mark.parametrize("distance", [1.5, 3.0])
+def test_marks_have_one_width_and_hoops_their_own_size_and_axis(sim, distance):
+    """A mark that is not finite is left out. Seen from above, a hoop around z is round, and one around x a line."""
+    place(sim, POSITIONS, 0.0)
+    config = {"lookat": [0, 0, 0.5], "distance": distance, "azimuth": 90, "elevation": -90}
+    shown = make_view(camera=-1, cam_config=config, marks=lambda *_: [[0, 0, 0.5], [np.nan] * 3])
+    assert [np.ptp(x) + 1 for x in np.nonzero(has_colour(shown.render(sim), GREEN))] == pytest.approx([8, 8], abs=1)
+    scale = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2)) / distance
+    for axis, size in (([0, 0, 1], [1, 1]), ([1, 0, 0], [1, 0])):
+        shown = make_view(camera=-1, cam_config=config, hoops=lambda *_, axis=axis: [[0, 0, 0.5, *axis, 0.3]])
+        widths = [np.ptp(x) + 1 for x in np.nonzero(has_colour(shown.render(sim), [1, 1, 0]))]
+        assert widths == pytest.approx(0.6 * scale * np.array(size), abs=0.05 * scale + 2)
+
+
 def test_a_camera_may_move_with_time(sim):
     """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
     moving = make_view(

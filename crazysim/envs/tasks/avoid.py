@@ -19,6 +19,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import (
     OutcomeTask,
+    ProgressTask,
     collision_placements,
     flight_over,
     nearest_drones,
@@ -63,7 +64,7 @@ class Field(NamedTuple):
     """Mean positions of the goals, m; mean positions of the starts have the opposite x. (n_drones, 3)"""
 
 
-class Avoid(OutcomeTask):
+class Avoid(ProgressTask, OutcomeTask):
     """Fly about 4.7 m through a field of obstacles, which have new positions in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches an obstacle,
@@ -87,8 +88,6 @@ class Avoid(OutcomeTask):
     """Distance within which a drone has reached its goal, m."""
     goal: Array = state((3,))
     """Goal of the drone, m."""
-    remaining_way_before: Array = state(())
-    """Distance from the goal before this environment step, m."""
     handles: tuple[Handle, ...] = static()
     """Handles of the poles, then of the boxes."""
 
@@ -163,10 +162,6 @@ class Avoid(OutcomeTask):
         data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
         return self.write(data, goal=goals + START_JITTER * goal_shift)
 
-    def before_step(self, data: SimData) -> SimData:
-        data = super().before_step(data)
-        return self.write(data, remaining_way_before=self.error(data))
-
     def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
         """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
 
@@ -217,7 +212,7 @@ class Avoid(OutcomeTask):
         gap = rotation.safe_norm(self.nearest_obstacles(data)[0][..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
         reward_terms = {
-            "progress": 2.0 * (record.remaining_way_before - self.error(data)),
+            "progress": 2.0 * self.progress(data),
             "closeness": -0.2 * jnp.exp(-6 * gap),
             "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
             "spin": -0.002 * terms.spin(data),
@@ -232,6 +227,3 @@ class Avoid(OutcomeTask):
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return self.write(data, goal=pos)
-
-    def target(self, data: SimData) -> Array:
-        return self.read(data).goal

@@ -206,8 +206,5 @@ class Forest(OutcomeTask):
     def error(self, data: SimData) -> Array:
         return jnp.maximum(self.length - data.states.pos[..., 0], 0.0)
 
-    def target(self, data: SimData) -> Array:
-        return self.read(data).goal
-
     def policy_camera(self) -> Camera:
         return Camera(16, 12)

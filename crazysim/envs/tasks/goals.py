@@ -49,8 +49,27 @@ class GoalTask(Task):
     def error(self, data: SimData) -> Array:
         return rotation.safe_norm(self.read(data).goal - data.states.pos)[..., 0]
 
-    def target(self, data: SimData) -> Array:
-        return self.read(data).goal
+
+class ProgressTask(Task):
+    """Base of tasks that reward progress: the way that is left before an environment step minus that after it.
+
+    The way that is left is the error, unless the class defines ``remaining_way``. A class that extends this and another
+    base names this one first.
+    """
+
+    remaining_way_before: Array = state(())
+    """Result of ``remaining_way`` before this environment step."""
+
+    def remaining_way(self, data: SimData) -> Array:
+        """Return the length of the way that is left, m. (n_drones,)"""
+        return self.error(data)
+
+    def before_step(self, data: SimData) -> SimData:
+        return self.write(super().before_step(data), remaining_way_before=self.remaining_way(data))
+
+    def progress(self, data: SimData) -> Array:
+        """Return how much shorter the way has become in this environment step, m. (n_drones,)"""
+        return self.read(data).remaining_way_before - self.remaining_way(data)
 
 
 class OutcomeTask(Task):

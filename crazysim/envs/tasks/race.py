@@ -20,7 +20,7 @@ from crazysim.engine.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.goals import OutcomeTask, collision_placements, pick_entry
+from crazysim.envs.tasks.goals import OutcomeTask, ProgressTask, collision_placements, pick_entry
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
@@ -46,7 +46,7 @@ Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
 """``rewards(data, action, last_action)``: terms by name. (n_drones,) each"""
 
 
-class Race(OutcomeTask):
+class Race(ProgressTask, OutcomeTask):
     """Race through gates among obstacles, by the rules of the drone racing project lsy_drone_racing.
 
     A drone passes a gate when it crosses the gate's plane within the opening, in the direction of the gate's x axis. A
@@ -91,8 +91,6 @@ class Race(OutcomeTask):
     """True for obstacles that the drone was near before this environment step."""
     passed_before: Array = state((), dtype=np.int32)
     """Number of gates passed before this environment step."""
-    remaining_way_before: Array = state(())
-    """Result of ``remaining_way`` before this environment step, m."""
     nominal_pos: Array | None = state(("objects", 3), scope="world", optional=True)
     """Nominal positions of gates, then of upper ends of obstacles, m; None if objects are not displaced."""
     nominal_quat: Array | None = state(("gates", 4), scope="world", optional=True)
@@ -178,8 +176,10 @@ class Race(OutcomeTask):
             gates_visited=visited_gates,
             obstacles_visited=visited_obstacles,
             passed_before=race_of(data).passed,
-            remaining_way_before=rules.remaining_way(data),
         )
+
+    def remaining_way(self, data: SimData) -> Array:
+        return rules.remaining_way(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         return observe(data, self.sensor_range)

@@ -153,9 +153,6 @@ class Swarm(Task):
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return self.write(data, goal=pos)
 
-    def target(self, data: SimData) -> Array:
-        return self.read(data).goal
-
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:
     """Return a validated formation as an array. (n_drones, 3)"""

@@ -10,10 +10,9 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import state
 from crazysim.engine.stage import Stage, stage
 from crazysim.envs import terms
-from crazysim.envs.tasks.goals import OutcomeTask, state_of
+from crazysim.envs.tasks.goals import OutcomeTask, ProgressTask, state_of
 from crazysim.scene.contact_report import ContactFn
 
 MAX_TOUCH_DOWN_SPEED = 0.5
@@ -22,7 +21,7 @@ MIN_UP_AXIS_Z = np.cos(np.pi / 9)
 """Smallest vertical component of the body z axis at touch-down, 1; it corresponds to a tilt of 20 degrees."""
 
 
-class TouchDown(OutcomeTask):
+class TouchDown(ProgressTask, OutcomeTask):
     """Base of tasks in which every drone lands on its own target, which may move.
 
     Subclasses define ``install``, ``spawn``, ``target_motion`` and ``has_left_arena``.
@@ -38,8 +37,6 @@ class TouchDown(OutcomeTask):
 
     seconds: float = 6.0
     """Length of an episode, s."""
-    remaining_way_before: Array = state(())
-    """Distance from the target before this environment step, m."""
 
     def target_motion(self, data: SimData, steps_ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's target, world frame. (..., 3) each
@@ -84,9 +81,6 @@ class TouchDown(OutcomeTask):
 
         return touch
 
-    def before_step(self, data: SimData) -> SimData:
-        return self.write(super().before_step(data), remaining_way_before=self.error(data))
-
     def observe(self, data: SimData) -> dict[str, Array]:
         return state_of(data) | self.relative_target_motion(data)
 
@@ -102,7 +96,7 @@ class TouchDown(OutcomeTask):
         record, distance = self.read(data), self.error(data)
         relative_speed = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         reward_terms = {
-            "progress": self.progress_reward * (record.remaining_way_before - distance),
+            "progress": self.progress_reward * self.progress(data),
             "speed": -0.1 * relative_speed * jnp.exp(-4 * distance),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),

@@ -9,14 +9,14 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import state
-from crazysim.envs.tasks.goals import OutcomeTask
+from crazysim.envs.tasks.goals import OutcomeTask, ProgressTask
 from crazysim.plugins.payloads import load_pos, load_vel
 
 SETTLED_SPEED = 0.2
 """Speed below which a load at its goal is at rest, m/s."""
 
 
-class BringLoad(OutcomeTask):
+class BringLoad(ProgressTask, OutcomeTask):
     """Base of tasks in which every drone brings its load to a goal and holds it there.
 
     Subclasses define ``install``, ``spawn``, ``remaining_way``, ``observe`` and
@@ -32,8 +32,6 @@ class BringLoad(OutcomeTask):
     """Time for which the load must stay at its goal, s."""
     goal: Array = state((3,))
     """Goal of the load, world frame, m."""
-    remaining_way_before: Array = state(())
-    """Result of ``remaining_way`` before this environment step, m."""
     steps_at_goal: Array = state((), dtype=np.int32)
     """Number of consecutive physics steps up to now at which the load was at its goal."""
 
@@ -49,9 +47,6 @@ class BringLoad(OutcomeTask):
         delivered = record.success | (steps >= round(self.hold * data.core.freq))
         return self.write(data, failure=crashed, steps_at_goal=steps, success=delivered)
 
-    def before_step(self, data: SimData) -> SimData:
-        return self.write(super().before_step(data), remaining_way_before=self.remaining_way(data))
-
     def at_goal(self, data: SimData) -> Array:
         """Whether a load is near its goal and at rest. (...)"""
         vel = load_vel(data)
@@ -65,6 +60,3 @@ class BringLoad(OutcomeTask):
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
         return self.write(data, goal=pos)
-
-    def target(self, data: SimData) -> Array:
-        return self.read(data).goal

@@ -150,11 +150,11 @@ class Deliver(BringLoad):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        record, load, way = self.read(data), data.plugins["load"], self.remaining_way(data)
+        record, load = self.read(data), data.plugins["load"]
         distance = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         relative_speed = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
-            "progress": 5.0 * (record.remaining_way_before - way),
+            "progress": 5.0 * self.progress(data),
             "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * distance) * (1 + jnp.exp(-2 * relative_speed))),
             "proximity": 2.0 * record.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 from hands import fly_to
 
 from crazysim import rotation, state
-from crazysim.envs import Task, draw, flying, state_of, terms
+from crazysim.envs import ProgressTask, draw, flying, state_of, terms
 
 
-class Dock(Task):
+class Dock(ProgressTask):
     """Meet a point on a carrier that flies a circle, from above, within 10 cm and slower than 0.3 m/s."""
 
     name = "dock"
@@ -20,7 +20,6 @@ class Dock(Task):
     rate: jax.Array = state(())
     docked: jax.Array = state((), dtype=bool)
     crashed: jax.Array = state((), dtype=bool)
-    way_before: jax.Array = state(())
 
     def spawn(self, data, key):
         x = draw(key, data.core.n_drones, start=3, phase=1, turn=1)
@@ -48,9 +47,6 @@ class Dock(Task):
     def error(self, data):
         return rotation.safe_norm(self.carrier(self.read(data))[0] - data.states.pos)[..., 0]
 
-    def before_step(self, data):
-        return self.write(data, way_before=self.error(data))
-
     def observe(self, data):
         pos, vel = self.carrier(self.read(data))
         return state_of(data) | {"carrier": pos - data.states.pos, "carrier_vel": vel - data.states.vel}
@@ -61,7 +57,7 @@ class Dock(Task):
 
     def rewards(self, data, action, last_action):
         return {
-            "progress": 2.0 * (self.read(data).way_before - self.error(data)),
+            "progress": 2.0 * self.progress(data),
             "docked": 10.0 * self.read(data).docked,
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "failed": -10.0 * self.failed(data),

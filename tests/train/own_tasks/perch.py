@@ -5,13 +5,13 @@ import jax.numpy as jnp
 from hands import fly_to
 
 from crazysim import rotation, state
-from crazysim.envs import Task, draw, flying, state_of, terms
+from crazysim.envs import ProgressTask, draw, flying, state_of, terms
 
 WALL = 1.45
 """x of the centre of mass at which a drone touches the wall, m."""
 
 
-class Perch(Task):
+class Perch(ProgressTask):
     """Touch the wall within 15 cm of the spot, slower than 1 m/s, and with the nose at least 12 degrees up."""
 
     name = "perch"
@@ -21,7 +21,6 @@ class Perch(Task):
     spot: jax.Array = state((3,))
     perched: jax.Array = state((), dtype=bool)
     crashed: jax.Array = state((), dtype=bool)
-    way_before: jax.Array = state(())
 
     def spawn(self, data, key):
         x = draw(key, data.core.n_drones, start=3, spot=2)
@@ -41,9 +40,6 @@ class Perch(Task):
     def error(self, data):
         return rotation.safe_norm(self.read(data).spot - data.states.pos)[..., 0]
 
-    def before_step(self, data):
-        return self.write(data, way_before=self.error(data))
-
     def observe(self, data):
         return state_of(data) | {"spot": self.read(data).spot - data.states.pos}
 
@@ -53,7 +49,7 @@ class Perch(Task):
 
     def rewards(self, data, action, last_action):
         return {
-            "progress": 2.0 * (self.read(data).way_before - self.error(data)),
+            "progress": 2.0 * self.progress(data),
             "perched": 10.0 * self.read(data).perched,
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "failed": -10.0 * self.failed(data),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from hands import fly_to
 
 from crazysim import rotation, state
-from crazysim.envs import Task, draw, flying, state_of, terms
+from crazysim.envs import ProgressTask, draw, flying, state_of, terms
 
 RADIUS, DECELERATION = 0.2, 0.6
 """Radius of the ball and the drone together, m, and deceleration of a rolling ball, m/s^2."""
@@ -13,7 +13,7 @@ CENTRE = 0.15
 """Height of the ball's centre, m."""
 
 
-class Push(Task):
+class Push(ProgressTask):
     """Push a ball that lies on the floor to within 15 cm of a goal."""
 
     name = "push"
@@ -23,7 +23,6 @@ class Push(Task):
     ball: jax.Array = state((2,))
     ball_vel: jax.Array = state((2,))
     goal: jax.Array = state((2,))
-    way_before: jax.Array = state(())
 
     def spawn(self, data, key):
         x = draw(key, data.core.n_drones, start=3, ball=2, yaw=1, far=1)
@@ -53,9 +52,6 @@ class Push(Task):
         ball = self.read(data).ball
         return jnp.concatenate([ball, jnp.full_like(ball[:, :1], CENTRE)], axis=-1) - data.states.pos
 
-    def before_step(self, data):
-        return self.write(data, way_before=self.error(data))
-
     def observe(self, data):
         task = self.read(data)
         return state_of(data) | {
@@ -70,7 +66,7 @@ class Push(Task):
 
     def rewards(self, data, action, last_action):
         return {
-            "progress": 5.0 * (self.read(data).way_before - self.error(data)),
+            "progress": 5.0 * self.progress(data),
             "near": terms.proximity(self.error(data)),
             "touch": 0.2 * terms.proximity(rotation.safe_norm(self.to_ball(data))[..., 0]),
             "action_rate": -0.02 * terms.action_rate(action, last_action),

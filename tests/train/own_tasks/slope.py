@@ -5,10 +5,10 @@ import jax.numpy as jnp
 from hands import fly_to
 
 from crazysim import rotation, state
-from crazysim.envs import Task, draw, flying, state_of, terms
+from crazysim.envs import ProgressTask, draw, flying, state_of, terms
 
 
-class Slope(Task):
+class Slope(ProgressTask):
     """Touch a slope of 10 degrees within 12 cm of its middle, slower than 0.7 m/s, and within 6 degrees of parallel."""
 
     name = "slope"
@@ -18,7 +18,6 @@ class Slope(Task):
     normal: jax.Array = state((3,))
     landed: jax.Array = state((), dtype=bool)
     crashed: jax.Array = state((), dtype=bool)
-    way_before: jax.Array = state(())
 
     def spawn(self, data, key):
         x = draw(key, data.core.n_drones, start=3, yaw=1)
@@ -45,9 +44,6 @@ class Slope(Task):
     def error(self, data):
         return rotation.safe_norm(self.above(data, self.read(data).normal)[0])[..., 0]
 
-    def before_step(self, data):
-        return self.write(data, way_before=self.error(data))
-
     def observe(self, data):
         normal = self.read(data).normal
         way, height = self.above(data, normal)
@@ -58,7 +54,7 @@ class Slope(Task):
 
     def rewards(self, data, action, last_action):
         return {
-            "progress": 2.0 * (self.read(data).way_before - self.error(data)),
+            "progress": 2.0 * self.progress(data),
             "landed": 10.0 * self.read(data).landed,
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "failed": -10.0 * self.failed(data),
