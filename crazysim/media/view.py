@@ -28,8 +28,8 @@ MAX_PIXELS = 16_384
 
 RING_POINTS, RING_LINE_WIDTH = 25, 2.0
 """Number of points of a ring, and width of the line of a ring around a drone, pixels."""
-MARK_COLOR, MARK_WIDTH = (0.1, 0.8, 0.3, 0.6), 8
-"""Colour, RGBA, of marks, and their width in images of the free camera, pixels."""
+MARK_COLOR, MARK_WIDTH = (0.1, 0.8, 0.3, 1.0), 12
+"""Colour, RGBA, of the rings that are marks, and their width in images of the free camera, pixels."""
 HOOP_COLOR, HOOP_THICKNESS = (0.95, 0.6, 0.1, 1.0), 0.02
 """Colour, RGBA, of hoops, and radius of their rim, m."""
 MIN_VIEW_RADIUS = 0.25
@@ -79,8 +79,8 @@ class View:
     """True to draw a map from above at the bottom left of each world that has obstacles, with the drones' paths since
     the last reset."""
     marks: Callable[[Sim, int], ArrayLike] | None = None
-    """Function that returns points of a world to mark, ``marks(sim, world)``, m (n, 3), or None. Marks have the same
-    size in all images; points that are not finite have none."""
+    """Function that returns points of a world to mark, ``marks(sim, world)``, m (n, 3), or None. Marks are rings of one
+    size in all images, which hide nothing; points that are not finite have none."""
     hoops: Callable[[Sim, int], ArrayLike] | None = None
     """Function that returns hoops of a world to draw, ``hoops(sim, world)``, or None: middle, m, unit vector along the
     axis, and radius, m. (n, 7)"""
@@ -248,18 +248,18 @@ class View:
         right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         ahead = np.array([*(np.cos(elevation) * np.array([-right[1], right[0]])), np.sin(elevation)])
         eye, pixel = lookat - distance * ahead, 2 * np.tan(np.radians(model.vis.global_.fovy) / 2) / self.tile_size[1]
-        if self.marks is not None:
-            for point in np.asarray(self.marks(sim, self.worlds[k]), float).reshape(-1, 3):
-                if np.isfinite(point).all() and (point - eye) @ ahead > 0:
-                    sim.overlays.points(point[None], MARK_COLOR, MARK_WIDTH / 2 * pixel * float((point - eye) @ ahead))
         angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
         circle = np.cos(angle) * right + np.sin(angle) * np.cross(right, ahead)
+        marks = np.zeros((0, 3)) if self.marks is None else np.asarray(self.marks(sim, self.worlds[k]), float)
+        rings = [(point, MARK_WIDTH, 0.0, MARK_COLOR) for point in marks.reshape(-1, 3)]
         for drone, drone_color in enumerate(choose_drone_colors(sim.n_drones, self.rgba)):
-            radius = self.ring_width / 2 * pixel * ((pos[drone] - eye) @ ahead)
-            if radius > model.geom(f"col_sphere:{drone}").size[0] and np.isfinite(pos[drone]).all():
+            rings.append((pos[drone], self.ring_width, model.geom(f"col_sphere:{drone}").size[0], drone_color))
+        for point, width, min_radius, rgba in rings:
+            radius = width / 2 * pixel * ((point - eye) @ ahead)
+            if radius > min_radius and np.isfinite(point).all():
                 # Halfway to the camera, where it has the same place in the image and the floor does not hide it.
-                ring = (eye + pos[drone] + radius * circle) / 2
-                sim.overlays.line(ring, drone_color, RING_LINE_WIDTH, RING_LINE_WIDTH)
+                ring = (eye + point + radius * circle) / 2
+                sim.overlays.line(ring, rgba, RING_LINE_WIDTH, RING_LINE_WIDTH)
 
     def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
         last_time, value = self._aim.get(k, (np.inf, aim))

@@ -292,7 +292,7 @@ def test_marks_have_one_width_and_hoops_their_own_size_and_axis(sim, distance):
     place(sim, POSITIONS, 0.0)
     config = {"lookat": [0, 0, 0.5], "distance": distance, "azimuth": 90, "elevation": -90}
     shown = make_view(camera=-1, cam_config=config, marks=lambda *_: [[0, 0, 0.5], [np.nan] * 3])
-    assert [np.ptp(x) + 1 for x in np.nonzero(has_colour(shown.render(sim), GREEN))] == pytest.approx([8, 8], abs=1)
+    assert [np.ptp(x) + 1 for x in np.nonzero(has_colour(shown.render(sim), GREEN))] == pytest.approx([12, 12], abs=2)
     scale = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2)) / distance
     for axis, size in (([0, 0, 1], [1, 1]), ([1, 0, 0], [1, 0])):
         shown = make_view(camera=-1, cam_config=config, hoops=lambda *_, axis=axis: [[0, 0, 0.5, *axis, 0.3]])
