@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sweep
-from cases import COMPILED_ENGINES
+from cases import COMPILED_ENGINES, leaf_on_host
 
 import crazysim.lab.bodies
 import crazysim.lab.estimators
@@ -108,7 +108,8 @@ def compare(name, engines):
 
 def select_worlds(data, worlds):
     leaves = zip(jax.tree.leaves_with_path(data), jax.tree.leaves(scopes(data)), strict=True)
-    return {jax.tree_util.keystr(path): x[worlds] for (path, x), scope in leaves if scope not in ("shared", "opaque")}
+    leaves = [(path, leaf_on_host(x)) for (path, x), scope in leaves if scope not in ("shared", "opaque")]
+    return {jax.tree_util.keystr(path): x[worlds] for path, x in leaves}
 
 
 def assert_bad_worlds_change_no_other(sim, step):

@@ -1,7 +1,5 @@
 """Derivatives through all effects, sensors and filters at once, against central differences."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,9 @@ import pytest
 from sweep import REQUIRED_BY, SENSORS, effects
 
 from crazysim import Battery, Downwash, GroundEffect, Latency, RangeFinder, Sim, Wind
-from crazysim.engine.pytree import scopes
-from crazysim.engine.stage import as_stages
+from crazysim.engine import Step
+from crazysim.engine.backends import interpret
+from crazysim.engine.lowering.tangents import add_tangents
 from crazysim.plugins import sensors
 from crazysim.plugins.estimators import ESKF, Kalman
 from crazysim.plugins.sensors import IMU, UWB, MotionCapture, OpticalFlow, TimeOfFlight, Triad
@@ -52,80 +51,61 @@ def create_filters_of_all_sensors():
     return [*air, *others, imu, tracked, *aids, Kalman([imu, tracked]), estimating_filter]
 
 
-def differentiable(data):
-    """Return which leaves have slopes: all floats but shared parameters, which no stage writes."""
-    pairs = zip(jax.tree.leaves(data), jax.tree.leaves(scopes(data)), strict=True)
-    return [jnp.issubdtype(jnp.result_type(x), jnp.floating) and scope != "shared" for x, scope in pairs]
+def push_forward(step, data, slopes):
+    """Return the slopes of the leaves that a step writes, by path, after ``N_STEPS`` in NumPy.
+
+    ``slopes`` are those of leaves at the start, by path.
+    """
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(data)]
+    flat = step.flatten(data)
+    program = flat.plan.program
+    tangents = add_tangents(program, [names.index(name) for name in slopes])
+    n_packed = len(program.leaves) - len(names)
+    start = [slopes.get(name, np.zeros(leaf.shape)) for name, leaf in zip(names, program.leaves, strict=False)]
+    end, _ = interpret.run_steps(tangents, [*flat.leaves, *map(jnp.asarray, start), *[None] * n_packed], N_STEPS)
+    return {names[i - len(program.leaves)]: x for i, x in zip(tangents.written_leaves, end, strict=True)}
 
 
-def push_forward(stage, has_slope):
-    def run(data, slopes):
-        leaves, tree = jax.tree.flatten(data)
-
-        def advance(numbers):
-            numbers = iter(numbers)
-            chosen = [next(numbers) if has else x for x, has in zip(leaves, has_slope, strict=True)]
-            after = jax.tree.leaves(stage(tree.unflatten(chosen)))
-            return list(itertools.compress(after, has_slope)), after
-
-        _, slopes, after = jax.jvp(advance, (list(itertools.compress(leaves, has_slope)),), (slopes,), has_aux=True)
-        return tree.unflatten(after), slopes
-
-    # Without optimisation: compiling takes longer than running.
-    return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
+SLOW = pytest.mark.slow("traces an update for each number of each sensor; the filters of the other case fuse one")
 
 
-SLOW = pytest.mark.slow("compiles an update for each number of each sensor; the filters of the other case fuse one")
-
-
-@pytest.mark.long("compiles the derivative of each stage, in float64")
+@pytest.mark.long("traces every stage, and its derivative")
 @pytest.mark.parametrize("plugins", [create_each_plugin, pytest.param(create_filters_of_all_sensors, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
-    """Derivatives of every state of the data by the states at the start, with the stages as they are written.
+    """Derivatives of every state of the data by the states at the start, in forward mode, and in NumPy.
 
-    Each stage is differentiated in forward mode; a gradient is its transpose. Differences have errors of their step
+    A gradient is the transpose, and ``tests/engine`` compares kernels with NumPy. Differences have errors of their step
     squared, and of the rounding of large numbers, such as a pressure of 1e5 Pa or a charge that hardly changes.
     """
-    sim = Sim(n_drones=2, control="state", engine="plain")
+    sim = Sim(n_drones=2, control="state", engine="interpret")
     for plugin in plugins():
         sim.add(plugin)
-    pos = jnp.array([[[0.2, 0.1, 0.3], [0.25, 0.05, 0.9]]])
-    sim.state_control(pos=np.asarray(pos) + 0.1)
-    start = {  # of one type, since others would compile the stages again
+    pos = np.array([[[0.2, 0.1, 0.3], [0.25, 0.05, 0.9]]])
+    sim.state_control(pos=pos + 0.1)
+    start = {
         "pos": pos,
-        "vel": jnp.full((1, 2, 3), 0.3, float),
-        "quat": jnp.tile(jnp.array([0.1, -0.05, 0.2, 1.0]), (1, 2, 1)),
-        "ang_vel": jnp.tile(jnp.array([0.4, -0.5, 0.6]), (1, 2, 1)),
-        "rotor_vel": jnp.full((1, 2, 4), 15_000.0, float),
+        "vel": np.full((1, 2, 3), 0.3),
+        "quat": np.tile(np.array([0.1, -0.05, 0.2, 1.0]) / np.sqrt(1.0525), (1, 2, 1)),
+        "ang_vel": np.tile([0.4, -0.5, 0.6], (1, 2, 1)),
+        "rotor_vel": np.full((1, 2, 4), 15_000.0),
     }
     rng = np.random.default_rng(1)
     sizes = {name: 100.0 if name == "rotor_vel" else 0.1 for name in start}
-    directions = {name: jnp.asarray(sizes[name] * rng.normal(size=x.shape)) for name, x in start.items()}
-    has_slope = differentiable(sim.data)
-    stages = [push_forward(stage, has_slope) for stage in as_stages(sim.step_pipeline)]
+    directions = {name: sizes[name] * rng.normal(size=x.shape) for name, x in start.items()}
+    step = Step(sim.step_pipeline, "interpret")
 
-    def start_data(x):
-        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
-        return sim.data.replace(states=sim.data.states.replace(**x | {"quat": quat}))
+    def start_data(h=0.0):
+        states = sim.data.states.replace(**{name: jnp.asarray(x + h * directions[name]) for name, x in start.items()})
+        return jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, sim.data.replace(states=states))
 
-    def fly(x):
-        data = start_data(x)
-        _, slopes = jax.jvp(
-            lambda x: list(itertools.compress(jax.tree.leaves(start_data(x)), has_slope)), (x,), (directions,)
-        )
-        for _ in range(N_STEPS):
-            for stage in stages:
-                data, slopes = stage(data, slopes)
-        leaves = itertools.compress(jax.tree.leaves_with_path(data), has_slope)
-        return {jax.tree_util.keystr(path): x for path, x in leaves}, slopes
-
-    values, slopes = fly(start)
-    ends = [fly({k: x + h * directions[k] for k, x in start.items()})[0] for h in (RELATIVE_STEP, -RELATIVE_STEP)]
+    ends = [jax.tree.leaves_with_path(step(start_data(h), N_STEPS)) for h in (0.0, RELATIVE_STEP, -RELATIVE_STEP)]
+    value, ahead, behind = ({jax.tree_util.keystr(path): x for path, x in end} for end in ends)
+    slopes = push_forward(step, start_data(), {f".states.{name}": x for name, x in directions.items()})
     compared = set()
-    for (name, value), slope in zip(values.items(), slopes, strict=True):
-        difference = np.asarray(ends[0][name] - ends[1][name]) / (2 * RELATIVE_STEP)
+    for name, slope in slopes.items():
+        difference = np.asarray(ahead[name] - behind[name]) / (2 * RELATIVE_STEP)
         size = max(np.abs(x).max(initial=0.0) for x in (np.asarray(slope), difference))
-        rounding = 1e-15 * np.abs(value).max(initial=0.0) / RELATIVE_STEP
+        rounding = 1e-15 * np.abs(value[name]).max(initial=0.0) / RELATIVE_STEP
         if size > MIN_SLOPE:
             assert np.abs(slope - difference).max() < 1e-6 * size + rounding, name
             compared.add(name)
