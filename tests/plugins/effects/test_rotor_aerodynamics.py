@@ -28,12 +28,17 @@ def hover(n_worlds=1, drone="cf21B_500", **settings):
 
 def wrench(sim, plugin, **states):
     """Return force, N, and torque, N m, that the plugin adds to each drone, world frame. (n_worlds, 3) each"""
-    return wrench_of(plugin.stage(plugin.influence)(with_states(sim.data, **states)).states)
+    return compile_wrench(sim, plugin)(**states)
 
 
-def wrench_of(states):
-    """Return the external force and torque in states. (n_worlds, 3) each"""
-    return np.asarray(states.force, float)[:, 0], np.asarray(states.torque, float)[:, 0]
+def compile_wrench(sim, plugin):
+    influence = jax.jit(plugin.stage(plugin.influence))
+
+    def wrench(**states):
+        after = influence(with_states(sim.data, **states)).states
+        return np.asarray(after.force, float)[:, 0], np.asarray(after.torque, float)[:, 0]
+
+    return wrench
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +48,7 @@ def quad():
 
 @pytest.fixture(scope="module")
 def compiled_wrench(quad):
-    sim, plugin = quad
-    influence = jax.jit(plugin.stage(plugin.influence))
-    return lambda **states: wrench_of(influence(with_states(sim.data, **states)).states)
+    return compile_wrench(*quad)
 
 
 @functools.cache
@@ -97,20 +100,20 @@ def test_the_thrust_by_hand():
 
 def test_a_ceiling_gives_thrust_by_mass_momentum_and_energy():
     """The far wake solves ``rho A v v_w = T - rho A v^2 (R / d)^2 / 16`` and ``T = rho A v_w^2 / 2`` at v = 1."""
+    ceiling_factor = jax.jit(inflow.ceiling_factor)
     for gap in (0.1 * R, R, 5 * R):
         wake = max(np.roots([0.5, -1.0, -((R / gap) ** 2) / 16]))
-        result = float(inflow.ceiling_factor(np.float64(gap), np.float64(R)))
+        result = float(ceiling_factor(np.float64(gap), np.float64(R)))
         np.testing.assert_allclose(result, wake / 2, rtol=1e-5)
-    assert inflow.ceiling_factor(np.float64(-1.0), R) == 1.0, "a rotor above it is in free air"
+    assert ceiling_factor(np.float64(-1.0), np.float64(R)) == 1.0, "a rotor above it is in free air"
 
 
-def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
+def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(compiled_wrench):
     """The added wrench is zero in hover, and of second order for small velocities along the body's axes."""
-    sim, plugin = quad
-    force, torque = wrench(sim, plugin)
+    force, torque = compiled_wrench()
     np.testing.assert_allclose(force, 0.0, atol=1e-6)
     np.testing.assert_allclose(torque, 0.0, atol=1e-8)
-    force, torque = wrench(sim, plugin, vel=0.02 * np.eye(3)[:, None])
+    force, torque = compiled_wrench(vel=0.02 * np.eye(3)[:, None])
     # second order: 0.02 m/s over an induced velocity of 4.3 m/s, and rounding of float32 at 0.4 N
     np.testing.assert_allclose(force, 0.0, atol=0.02 * DRAG_Z * 0.01)
     np.testing.assert_allclose(
@@ -118,11 +121,10 @@ def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
     )
 
 
-def test_rotor_drag_grows_with_the_speed_of_the_rotors(quad):
+def test_rotor_drag_grows_with_the_speed_of_the_rotors(quad, compiled_wrench):
     """At twice the hover speed the drag is twice the airframe's: D v is added to that of the dynamics."""
-    sim, plugin = quad
-    faster = 2 * hover_rotor_state(sim.data)
-    force, _ = wrench(sim, plugin, vel=[0.5, 0, 0], rotor_vel=faster)
+    faster = 2 * hover_rotor_state(quad[0].data)
+    force, _ = compiled_wrench(vel=[0.5, 0, 0], rotor_vel=faster)
     np.testing.assert_allclose(force[:, :2], np.broadcast_to([-0.5 * DRAG_XY, 0], (3, 2)), rtol=1e-3, atol=1e-6)
 
 

@@ -26,8 +26,12 @@ def half_forest():
     return build(difficulty=0.5)
 
 
+def positions(sim, forest):
+    return np.asarray(jax.jit(forest.poses)(sim.data)[0])
+
+
 def standing_trees(sim, forest):
-    pos = np.asarray(forest.poses(sim.data)[0])
+    pos = positions(sim, forest)
     radii = np.concatenate([np.full(len(m.pos), m.options["radius"]) for m in forest.models()])
     return [(p[p[:, 2] == 0], radii[p[:, 2] == 0]) for p in pos]
 
@@ -42,7 +46,7 @@ def test_trees_stand_in_their_cells_at_the_requested_density():
     assert len(np.unique(radii)) == 8
     middle = np.concatenate([m.pos for m in forest.models()])[:, :2]
     np.testing.assert_allclose(middle.mean(axis=0), SMALL_FOREST["center"])
-    offset = np.asarray(forest.poses(sim.data)[0])[..., :2] - middle
+    offset = positions(sim, forest)[..., :2] - middle
     reach = (4.0 - 0.6) / 2 - radii
     assert np.all(np.abs(offset[..., 0]) <= reach + 1e-5)
     assert np.all(np.abs(offset[..., 1]) <= reach + 2 + 1e-5)
@@ -56,9 +60,8 @@ def test_clearance_points_away_from_the_nearest_tree(half_forest):
     sim, forest = half_forest
     trees, radii = standing_trees(sim, forest)[1]
     point = trees[0] + [radii[0] + 0.2, 0, 1.0]
-    value, slope = jax.value_and_grad(lambda pos: forest.clearance(sim.data, pos)[1, 0])(
-        jnp.broadcast_to(jnp.float32(point), (3, 2, 3))
-    )
+    slope_of = jax.jit(jax.value_and_grad(lambda pos: forest.clearance(sim.data, pos)[1, 0]))
+    value, slope = slope_of(jnp.broadcast_to(jnp.float32(point), (3, 2, 3)))
     assert value == pytest.approx(0.2, abs=1e-5)
     np.testing.assert_allclose(slope[1, 0], [1, 0, 0], atol=1e-5)
 
@@ -87,7 +90,7 @@ def test_difficulty_is_the_fraction_of_trees_that_stand():
     difficulty = np.asarray(forest.read(sim.data).difficulty)[:, 0]
     assert difficulty.min() < 0.22
     assert difficulty.max() > 0.58
-    fraction = np.mean(np.asarray(forest.poses(sim.data)[0])[..., 2] == 0, axis=1)
+    fraction = np.mean(positions(sim, forest)[..., 2] == 0, axis=1)
     np.testing.assert_allclose(np.mean(fraction), 0.4, atol=0.03)
     assert np.corrcoef(fraction, difficulty)[0, 1] > 0.6
     stage_before = sim.step_pipeline["forest_begin"]
@@ -95,7 +98,7 @@ def test_difficulty_is_the_fraction_of_trees_that_stand():
     assert sim.step_pipeline["forest_begin"] is stage_before  # no stage was built
     sim.reset()
     assert not any(len(trees) for trees, _ in standing_trees(sim, forest))
-    assert np.all(np.asarray(forest.clearance(sim.data, sim.data.states.pos)) == forest.cell)
+    assert np.all(np.asarray(jax.jit(forest.clearance)(sim.data, sim.data.states.pos)) == forest.cell)
 
 
 def test_free_discs_have_no_trees(half_forest):

@@ -1,5 +1,7 @@
 """Pillars, clutter, gates and rooms: distances, layouts, free paths, motion, and wrong input."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,15 @@ def build(plugin, n_worlds=3, n_drones=2):
     return sim
 
 
+@functools.cache
+def shared_build(name):
+    return build(KINDS[name])
+
+
+def poses_of(plugin, data):
+    return map(np.asarray, jax.jit(plugin.poses)(data))  # compiled: one program instead of one for each operation
+
+
 def data_at(sim, seconds):
     core = sim.data.core
     return sim.data.replace(core=core.replace(steps=core.steps + round(seconds * sim.freq)))
@@ -33,14 +44,13 @@ def data_at(sim, seconds):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_clearance_is_the_distance_of_the_contact_report(name):
-    plugin = KINDS[name]
-    sim = build(plugin)
+    plugin, sim = KINDS[name], shared_build(name)
     ball = sim.scene.collision_model.drones[0].geoms[0]
     contacts, clearance = jax.jit(sim.scene.contact_fn(floor=False, drones=False)), jax.jit(plugin.clearance)
     rng, data, result, expected = np.random.default_rng(0), data_at(sim, 7.3), [], []
-    pos = plugin.poses(data)[0]
+    pos, _ = poses_of(plugin, data)
     for _ in range(100):
-        near = np.asarray(pos)[:, rng.integers(pos.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
+        near = pos[:, rng.integers(pos.shape[1], size=2)] * [1, 1, 0] + [0, 0, 1.5]
         data = with_states(data, pos=near + rng.normal(0, 0.7, (3, 2, 3)))
         result.append(clearance(data, data.states.pos + np.float32(ball.pos)))
         expected.append(contacts(data).object_distance.min(axis=-1) + ball.shape.size[0])
@@ -52,12 +62,12 @@ def test_clearance_is_the_distance_of_the_contact_report(name):
 @pytest.mark.parametrize("name", KINDS)
 def test_law_10_a_layout_depends_on_world_and_episode(name):
     plugin = KINDS[name]
-    sim, larger_sim = build(plugin), build(plugin, 4, 1)
-    first, all_worlds = (np.concatenate(plugin.poses(s.data), axis=-1) for s in (sim, larger_sim))
+    sim, larger_sim = shared_build(name), build(plugin, 4, 1)
+    first, all_worlds = (np.concatenate([*poses_of(plugin, s.data)], axis=-1) for s in (sim, larger_sim))
     np.testing.assert_array_equal(first, all_worlds[:3])
     assert len({x.tobytes() for x in all_worlds}) == 4
     larger_sim.reset(np.array([False, True, False, False]))
-    changed = np.any(np.concatenate(plugin.poses(larger_sim.data), axis=-1) != all_worlds, axis=(1, 2))
+    changed = np.any(np.concatenate([*poses_of(plugin, larger_sim.data)], axis=-1) != all_worlds, axis=(1, 2))
     np.testing.assert_array_equal(changed, [False, True, False, False])
 
 
@@ -79,13 +89,13 @@ def test_moving_obstacles_stay_in_their_regions_below_their_speed(plugin):
         assert shift.max() <= reach + 1e-5
         assert shift.max() > 0.8 * reach
     sim.step(50)
-    np.testing.assert_allclose(plugin.poses(sim.data)[0], path[5], atol=1e-5)  # 0.1 s
+    np.testing.assert_allclose(poses(sim.data)[0], path[5], atol=1e-5)  # 0.1 s
 
 
 def test_boxes_and_balls_keep_their_distance():
     plugin = Clutter(density=1.0, size=(4.0, 3.0, 2.0), sizes=(0.1, 0.25), gap=0.3, free=np.zeros((0, 3)))
     sim = build(plugin, 20)
-    pos = np.asarray(plugin.poses(sim.data)[0])
+    pos, _ = poses_of(plugin, sim.data)
     models = plugin.models()
     radius = np.concatenate([np.full(len(m.pos), np.linalg.norm(m.shapes[0][0].size)) for m in models])
     assert pos.shape == (20, 24, 3)
@@ -96,10 +106,10 @@ def test_boxes_and_balls_keep_their_distance():
 
 def test_difficulty_moves_gates_off_their_line():
     easy, hard = (Gates(difficulty=x) for x in (0.0, 1.0))
-    pos, quat = (np.asarray(x) for x in easy.poses(build(easy).data))
+    pos, quat = poses_of(easy, build(easy).data)
     np.testing.assert_allclose(pos, np.broadcast_to([[3 + 4 * k, 0, 1.5] for k in range(6)], (3, 6, 3)), atol=1e-6)
     np.testing.assert_array_equal(quat[..., 3], 1)
-    moved, turned = (np.asarray(x) for x in hard.poses(build(hard, 200).data))
+    moved, turned = poses_of(hard, build(hard, 200).data)
     np.testing.assert_allclose(np.abs(moved - pos[0]).max(axis=(0, 1)), [0.5, 2.0, 0.5], rtol=0.02)
     assert 2 * np.arcsin(np.abs(turned[..., 2]).max()) == pytest.approx(0.6, rel=0.02)
 
@@ -133,10 +143,10 @@ def test_doors_have_the_stated_width_wherever_they_are(plugin):
     (n_x, n_y), room = plugin.count, plugin.room
     walls = [(room * (i + 1), room * (j + 0.5), 0) for i in range(n_x - 1) for j in range(n_y)]
     walls += [(room * (i + 0.5), room * (j + 1), 1) for i in range(n_x) for j in range(n_y - 1)]
-    t = np.linspace(-room / 2, room / 2, 2001)
+    t, clearance = np.linspace(-room / 2, room / 2, 2001), jax.jit(plugin.clearance)
     for x, y, is_along_x in walls:
         line = np.stack([x + t * is_along_x, y + t * (1 - is_along_x), t * 0 + 1], axis=-1)
         line -= [n_x * room / 2, n_y * room / 2, 0]
         points = jnp.broadcast_to(np.float32(line), (64, *line.shape))
-        is_open = np.asarray(jax.jit(plugin.clearance)(sim.data, points)) > 0
+        is_open = np.asarray(clearance(sim.data, points)) > 0
         np.testing.assert_allclose(is_open.sum(axis=1) * (t[1] - t[0]), plugin.door, atol=2 * (t[1] - t[0]))
