@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from sweep import REQUIRED_BY, SENSORS, effects
+from tangents import push_forward
 
 from crazysim import Battery, Downwash, GroundEffect, Latency, RangeFinder, Sim, Wind
 from crazysim.engine import Step
-from crazysim.engine.backends import interpret
-from crazysim.engine.lowering.tangents import add_tangents
 from crazysim.plugins import sensors
 from crazysim.plugins.estimators import ESKF, Kalman
 from crazysim.plugins.sensors import IMU, UWB, MotionCapture, OpticalFlow, TimeOfFlight, Triad
@@ -51,31 +50,16 @@ def create_filters_of_all_sensors():
     return [*air, *others, imu, tracked, *aids, Kalman([imu, tracked]), estimating_filter]
 
 
-def push_forward(step, data, slopes):
-    """Return the slopes of the leaves that a step writes, by path, after ``N_STEPS`` in NumPy.
-
-    ``slopes`` are those of leaves at the start, by path.
-    """
-    names = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(data)]
-    flat = step.flatten(data)
-    program = flat.plan.program
-    tangents = add_tangents(program, [names.index(name) for name in slopes])
-    n_packed = len(program.leaves) - len(names)
-    start = [slopes.get(name, np.zeros(leaf.shape)) for name, leaf in zip(names, program.leaves, strict=False)]
-    end, _ = interpret.run_steps(tangents, [*flat.leaves, *map(jnp.asarray, start), *[None] * n_packed], N_STEPS)
-    return {names[i - len(program.leaves)]: x for i, x in zip(tangents.written_leaves, end, strict=True)}
-
-
 SLOW = pytest.mark.slow("traces an update for each number of each sensor; the filters of the other case fuse one")
 
 
 @pytest.mark.long("traces every stage, and its derivative")
 @pytest.mark.parametrize("plugins", [create_each_plugin, pytest.param(create_filters_of_all_sensors, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
-    """Derivatives of every state of the data by the states at the start, in forward mode, and in NumPy.
+    """Derivatives of every state of the data by the states at the start, in forward mode; a gradient is the transpose.
 
-    A gradient is the transpose, and ``tests/engine`` compares kernels with NumPy. Differences have errors of their step
-    squared, and of the rounding of large numbers, such as a pressure of 1e5 Pa or a charge that hardly changes.
+    Differences have errors of their step squared, and of the rounding of large numbers, such as a pressure of 1e5 Pa or
+    a charge that hardly changes.
     """
     sim = Sim(n_drones=2, control="state", engine="interpret")
     for plugin in plugins():
@@ -100,11 +84,11 @@ def test_law_08_slopes_are_central_differences(plugins, x64):
 
     ends = [jax.tree.leaves_with_path(step(start_data(h), N_STEPS)) for h in (0.0, RELATIVE_STEP, -RELATIVE_STEP)]
     value, ahead, behind = ({jax.tree_util.keystr(path): x for path, x in end} for end in ends)
-    slopes = push_forward(step, start_data(), {f".states.{name}": x for name, x in directions.items()})
+    slopes = push_forward(step, start_data(), {f".states.{name}": x for name, x in directions.items()}, N_STEPS)
     compared = set()
     for name, slope in slopes.items():
         difference = np.asarray(ahead[name] - behind[name]) / (2 * RELATIVE_STEP)
-        size = max(np.abs(x).max(initial=0.0) for x in (np.asarray(slope), difference))
+        size = max(np.abs(x).max(initial=0.0) for x in (slope, difference))
         rounding = 1e-15 * np.abs(value[name]).max(initial=0.0) / RELATIVE_STEP
         if size > MIN_SLOPE:
             assert np.abs(slope - difference).max() < 1e-6 * size + rounding, name

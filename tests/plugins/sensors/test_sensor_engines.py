@@ -1,4 +1,4 @@
-"""Every sensor: changing measurements, ages, documented shapes, and gradients through rounding."""
+"""Every sensor: changing measurements, ages, documented shapes, and slopes through rounding."""
 
 import dataclasses
 
@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import build_stagewise_step, count_documented_arrays, hover_rotor_state, with_states
+from cases import count_documented_arrays, hover_rotor_state, with_states
 from sweep import REQUIRED_BY, SENSORS
+from tangents import push_forward
 
 from crazysim import Sim
 from crazysim.plugins import sensors
@@ -60,12 +61,13 @@ def measurements(sim, data):
 
 @pytest.fixture(scope="module")
 def sim():
-    sim = build(3, SENSORS)
+    sim = build(3, SENSORS, engine="interpret")
     for sensor in (Camera(2, 1), Lidar((0.0,), (0.0,))):
         sim.add(sensor)
     return sim
 
 
+@pytest.mark.long("traces all sensors, and compiles the images of two")
 def test_the_age_of_every_sensor_is_infinite_until_it_has_measured(sim):
     names = {x for x in sensors.__all__ if "freq" in {field.name for field in fields_of(getattr(sensors, x))}}
     all_sensors = [x for x in sim.plugins.values() if type(x).__name__ in names]
@@ -104,18 +106,13 @@ def test_every_sensor_measures_something(sim):
         assert changed.all() or name == "lighthouse.visible", name
 
 
-def test_gradients_pass_through_rounding(x64):
-    """The gradient of a rounded measurement is that before rounding, and finite."""
-    sim = build(1, [])
-    rounding_sensors = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
-    step = build_stagewise_step(sim)
-
-    @jax.jit
-    @jax.jacrev
-    def gradients(rotor_vel):
-        end = step(sim.data.replace(states=sim.data.states.replace(rotor_vel=rotor_vel)), 3)
-        return jnp.stack([jnp.sum(jnp.square(sensor.read(end).samples.value)) for sensor in rounding_sensors])
-
-    result = np.asarray(gradients(jnp.asarray(sim.data.states.rotor_vel)))
-    assert np.isfinite(result).all()
-    assert np.abs(result).min() > 1e-9
+def test_slopes_pass_through_rounding(x64):
+    """The slope of a rounded measurement is that before rounding, and finite; a gradient is its transpose."""
+    sim = build(1, [], engine="interpret")
+    sensors_that_round = [sim.add(make()) for make in (IMU.bmi088, lambda: sensors.RotorSpeeds.telemetry(6))]
+    data = jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, sim.data)
+    slopes = push_forward(sim.step_fn, data, {".states.rotor_vel": 1.0}, 3)
+    for sensor in sensors_that_round:
+        slope = slopes[f".plugins[{sensor.name!r}].samples.value"]
+        assert np.isfinite(slope).all()
+        assert np.abs(slope).max() > 1e-9
