@@ -127,6 +127,8 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.train.training": "load_policy",
     },
     "crazysim.train.export": {
+        "crazysim.lab.export.betaflight": "to_betaflight",
+        "crazysim.lab.export.cost": "cost_text",
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
         "crazysim.lab.export.rl_tools": "read_rl_tools to_rl_tools weights_to_c",

@@ -79,7 +79,11 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
     out_of_tree_help = "existing folder for an out of tree controller of the Crazyflie's firmware"
     add("--out-of-tree", type=Path, metavar="FOLDER", help=out_of_tree_help)
+    add(
+        "--betaflight", type=Path, metavar="FOLDER", help="existing folder for a header to call from Betaflight's mixer"
+    )
     add("--rl-tools", type=Path, metavar="FILE", help="policy.tar of PX4's mc_raptor to write, from a checkpoint")
+    add("--drone", metavar="NAME|FILE", help="airframe that flies a checkpoint; by default cf21B_500")
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
@@ -245,43 +249,48 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    from crazysim.train.export import read_rl_tools, to_c, to_onnx, to_out_of_tree, to_rl_tools, weights_to_c
+    from crazysim.drones import load_airframe
+    from crazysim.lab.export.rl_tools import RAPTOR_RATE
+    from crazysim.train import export as exports
     from crazysim.train.training import load_policy
 
     files = {".onnx": options.onnx, ".h": options.c, ".tar": options.rl_tools}
+    folders = ((options.out_of_tree, exports.to_out_of_tree), (options.betaflight, exports.to_betaflight))
     require(
-        any(path is not None for path in (*files.values(), options.out_of_tree)),
-        "expected a file to write, got none; use --onnx FILE, --c FILE, --out-of-tree FOLDER, or --rl-tools FILE",
+        any(path is not None for path in (*files.values(), options.out_of_tree, options.betaflight)),
+        "expected a file to write, got none; use --onnx FILE, --c FILE, --out-of-tree FOLDER, --betaflight FOLDER, or "
+        "--rl-tools FILE",
         ValueError,
     )
     for suffix, path in files.items():
         if path is not None:
             check_writable(path, (suffix,))
-    is_checkpoint = options.folder.suffix == ".tar"
-    require(
-        options.onnx is options.out_of_tree is None if is_checkpoint else options.rl_tools is None,
-        "expected --c or --rl-tools with a checkpoint of rl-tools, and neither --onnx nor --out-of-tree, got others"
-        if is_checkpoint
-        else f"expected a checkpoint of rl-tools (.tar) for --rl-tools, got {str(options.folder)!r}; mc_raptor flies "
-        f"policies of RAPTOR's shape only. Use --onnx, --c or --out-of-tree.",
-        ValueError,
-    )
-    if is_checkpoint:
-        weights = read_rl_tools(options.folder)
-        for path, write in ((options.c, weights_to_c), (options.rl_tools, to_rl_tools)):
-            if path is not None:
-                write(weights, path)
-                print(f"wrote {path}")
-        return
-    policy, config, meta = load_policy(options.folder)
-    for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
-        if path is not None:
-            write(policy, path, meta)
-            print(f"wrote {path}")
-    if options.out_of_tree is not None:
-        env = config.make_env(1)
-        for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.base.freq):
-            print(f"wrote {path}")
+    if options.folder.suffix == ".tar":
+        require(options.onnx is None, "expected a run for --onnx, got a checkpoint of rl-tools; use --c", ValueError)
+        policy, config, meta = exports.read_rl_tools(options.folder), None, None
+        write_c = partial(exports.weights_to_c, policy)
+        written = [exports.to_rl_tools(policy, options.rl_tools, options.folder.stem)] if options.rl_tools else []
+    else:
+        require(
+            options.rl_tools is options.drone is None,
+            f"expected a checkpoint of rl-tools (.tar) for --rl-tools and --drone, got {str(options.folder)!r}; a run "
+            f"has its drone, and mc_raptor flies policies of RAPTOR's shape only",
+            ValueError,
+        )
+        policy, config, meta = load_policy(options.folder)
+        write_c = partial(exports.to_c, policy, meta=meta)
+        written = [exports.to_onnx(policy, options.onnx, meta)] if options.onnx else []
+    if options.c is not None:
+        written.append(write_c(options.c))
+    for folder, write in folders:
+        if folder is not None:
+            env = None if config is None else config.make_env(1)
+            airframe = load_airframe(options.drone or "cf21B_500") if env is None else env.sim.airframes[0]
+            written += write(policy, folder, meta, airframe, RAPTOR_RATE if env is None else env.base.freq)
+    for path in written:
+        print(f"wrote {path}")
+    if options.onnx is None or len(written) > 1:
+        print(exports.cost_text(policy, meta))
 
 
 def render(options: argparse.Namespace) -> None:

@@ -10,13 +10,16 @@ from crazysim.names import lazy_getattr
 from crazysim.train.interface import describe_env
 
 if TYPE_CHECKING:
+    from crazysim.lab.export.betaflight import to_betaflight
+    from crazysim.lab.export.cost import cost_text
     from crazysim.lab.export.out_of_tree import to_out_of_tree
     from crazysim.lab.export.policies import to_c, to_onnx
     from crazysim.lab.export.rl_tools import read_rl_tools, to_rl_tools, weights_to_c
     from crazysim.lab.export.tflite import to_tflite
 
 __all__ = [
-    "describe", "read_rl_tools", "to_c", "to_onnx", "to_out_of_tree", "to_rl_tools", "to_tflite", "weights_to_c",
+    "cost_text", "describe", "read_rl_tools", "to_betaflight", "to_c", "to_onnx", "to_out_of_tree", "to_rl_tools",
+    "to_tflite", "weights_to_c",
 ]  # fmt: skip
 
 __getattr__ = lazy_getattr(__name__)

@@ -113,7 +113,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     with optional_import("ONNX files need", "onnx", "onnx"):
         import onnx
         from onnx import TensorProto, helper, numpy_helper
-    numbers = _policy_numbers(policy, meta)
+    numbers = policy_numbers(policy, meta)
     constants = {"mean": numbers.mean, "std": numbers.std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     constants["zero"] = np.float32(0.0)
     nodes = []
@@ -231,7 +231,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name),
         f"expected the name of a C function, got {name!r}; use letters, digits and underscores",
     )
-    numbers = _policy_numbers(policy, meta)
+    numbers = policy_numbers(policy, meta)
     n_obs, n_memory, n_actions = len(numbers.mean), numbers.n_memory, len(numbers.layers[-1][1])
     guard = f"CRAZYSIM_{name.upper()}_H"
     lines = [
@@ -276,7 +276,8 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     return path
 
 
-def _policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
+def policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
+    """Return the numbers of a policy with the built-in network, after checking that they fit a description."""
     require_type(policy, Policy, POLICY_REMEDY)
     described = Interface.read(meta)
     if policy.interface is not None:

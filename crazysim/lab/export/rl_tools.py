@@ -27,6 +27,8 @@ from crazysim.storage import as_path, write_file
 
 N_INPUTS, N_MEMORY, N_ACTIONS = 22, 16, 4
 """Sizes of RAPTOR."""
+RAPTOR_RATE = 100
+"""Rate of RAPTOR's training, at which its memory advances, Hz."""
 SHAPES = {
     "0/weights": (N_MEMORY, N_INPUTS),
     "0/biases": (N_MEMORY,),

@@ -18,7 +18,9 @@ from crazysim.engine.backends import native
 from crazysim.envs import make
 from crazysim.envs.actions import hover_rotor_states
 from crazysim.envs.statistics import RunningStats
+from crazysim.lab.export.betaflight import to_betaflight
 from crazysim.lab.export.out_of_tree import to_out_of_tree
+from crazysim.lab.export.rl_tools import SHAPES, evaluate
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy, init_mlp
 
@@ -232,6 +234,109 @@ def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):
     assert np.abs(np.asarray(b.pos) - start).max() > 0.05  # it went somewhere
     for name in ("pos", "quat", "vel", "ang_vel"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def weights():
+    rng = np.random.default_rng(5)
+    return {name: rng.normal(scale=0.3, size=shape).astype(np.float32) for name, shape in SHAPES.items()}
+
+
+def raptor_speeds(weights, airframe, states):
+    """Return the speeds of the airframe's rotors after consecutive states, with the quaternion as xyzw. (n, 4)
+
+    The states are position from the goal, quaternion, velocity and body rates in rad/s. (n, 13)
+    """
+    previous, inputs, actions = np.zeros(4), [], []
+    for pos, quat, vel, ang_vel in (np.split(x, [3, 7, 10]) for x in states):
+        rot = np.ravel(rotation.matrix(jnp.asarray(quat)))
+        inputs.append(np.concatenate([pos.clip(-0.5, 0.5), rot, vel.clip(-1, 1), ang_vel, previous]))
+        previous = evaluate(weights, np.array(inputs)[:, None])[-1, 0].clip(-1, 1)
+        actions.append(previous)
+    front, left = (airframe.value("rotors.position")[:, i] > 0 for i in range(2))
+    order = [np.flatnonzero((front == x) & (left == y))[0] for x, y in ((1, 0), (0, 0), (0, 1), (1, 1))]
+    speeds = np.empty((len(states), 4))
+    speeds[:, order] = (1 + np.array(actions)) / 2 * airframe.rotor_vel_limits[1].max()
+    return speeds
+
+
+def random_states(n):
+    rng = np.random.default_rng(6)
+    states = rng.normal(scale=0.6, size=(n, 13))
+    states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=-1, keepdims=True)
+    return states.astype(np.float32)
+
+
+def test_a_policy_of_raptors_shape_remembers_in_each_drone(tmp_path, weights):
+    to_out_of_tree(weights, tmp_path, None, AIRFRAME)
+    library = tmp_path / "policy.so"
+    arguments = ["-DCRAZYSIM", f"-I{CFirmware.include}", tmp_path / "controller.c", "-o", library, "-lm"]
+    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *arguments], check=True)
+    code = ctypes.CDLL(str(library))
+    code.crazysim_memory_size.restype = ctypes.c_size_t
+    memories = np.full((2, code.crazysim_memory_size()), 255, np.uint8)
+    assert memories.shape[1] == 4 * (16 + 4)
+    states, motors, goal = random_states(20).reshape(2, 10, 13), np.empty((2, 10, 4), np.float32), [0.2, -0.1, 1.0]
+    inputs = np.zeros(39, np.float32)  # struct crazysim_input
+    inputs[15:18] = goal
+    for drone in range(2):
+        code.crazysim_init(ctypes.c_void_p(memories[drone].ctypes.data))
+    for step, drone in np.ndindex(10, 2):  # both drones in turn
+        inputs[2:15], inputs[2:5] = states[drone, step], states[drone, step, :3] + goal
+        pointers = (ctypes.c_void_p(x.ctypes.data) for x in (inputs, motors[drone, step]))
+        code.crazysim_update(ctypes.c_void_p(memories[drone].ctypes.data), 0, *pointers)
+    for drone in range(2):
+        np.testing.assert_allclose(motors[drone], raptor_speeds(weights, AIRFRAME, states[drone]), rtol=1e-4, atol=0.5)
+
+
+def test_betaflight_gets_its_motors_in_its_order_and_range(tmp_path, weights):
+    """Quaternion as wxyz, gyroscope in deg/s; commands at the rate of the policy, from any rate of the loop."""
+    to_betaflight(weights, tmp_path, None, AIRFRAME)
+    source, library = tmp_path / "mixer.c", tmp_path / "mixer.so"
+    source.write_text(
+        '#include "betaflight.h"\n'
+        "bool mix(unsigned now, const float *x, float *motor);\nvoid stop(void);\n"
+        "bool mix(unsigned now, const float *x, float *motor)\n"
+        "{ return policy_motors(now, x, x + 7, x + 13, x + 3, x + 10, 100.0f, 2000.0f, motor); }\n"
+        "void stop(void) { policy_stop(); }\n"
+    )
+    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, source, "-o", library, "-lm"], check=True)
+    code, states, goal = ctypes.CDLL(str(library)), random_states(8), np.array([0.3, 0.1, 0.9], np.float32)
+    code.mix.restype = ctypes.c_bool
+
+    def mix(now, state):
+        w_first = state[[0, 1, 2, 6, 3, 4, 5, *range(7, 13)]]
+        x = np.concatenate([w_first[:3] + goal, w_first[3:10], np.degrees(w_first[10:]), goal]).astype(np.float32)
+        out = np.full(4, -1, np.float32)
+        pointers = (a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (x, out))
+        return code.mix(ctypes.c_uint(now & 0xFFFFFFFF), *pointers), out
+
+    start = 2**32 - 30_000  # the microseconds overflow in flight
+    speeds = raptor_speeds(weights, AIRFRAME, states) / AIRFRAME.rotor_vel_limits[1].max()
+    quadrants = [tuple(x > 0) for x in AIRFRAME.value("rotors.position")[:, :2]]
+    order = [quadrants.index(x) for x in ((False, False), (True, False), (False, True), (True, True))]
+    for flight in range(2):
+        for k, state in enumerate(states):
+            for microseconds in range(0, 10_000, 1_250):  # a loop of 800 Hz
+                flying, out = mix(start + 10_000 * k + microseconds, state if microseconds == 0 else states[0])
+                assert flying
+                np.testing.assert_allclose(out, 100 + 1900 * speeds[k, order], atol=0.1, err_msg=f"{flight}, {k}")
+        code.stop()
+    lost = states[0].copy()
+    lost[7] = np.nan
+    flying, out = mix(start, lost)
+    assert not flying
+    np.testing.assert_array_equal(out, -1)
+
+
+def test_betaflight_flies_a_run_that_commands_rotors(exported, tmp_path):
+    policy, _, _ = exported("rotor_vel")
+    meta = describe(make("hover", 1, control="rotor_vel"))
+    header, source = to_betaflight(policy, tmp_path, meta, AIRFRAME, 50)
+    assert "20000u" in source.read_text()
+    assert header.name == "policy.h"
+    with pytest.raises(ConfigError, match="level attitude"):
+        to_betaflight(exported("attitude")[0], tmp_path, describe(make("hover", 1)), AIRFRAME, 50)
 
 
 def test_the_example_compiles_against_the_headers(tmp_path):

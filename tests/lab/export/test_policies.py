@@ -14,7 +14,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.envs import make
 from crazysim.envs.statistics import RunningStats
-from crazysim.train.export import describe, to_c, to_onnx
+from crazysim.train.export import cost_text, describe, to_c, to_onnx
 from crazysim.train.networks import Network, Policy, gru_network, init_mlp, init_weights
 
 FLAGS = ("-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
@@ -97,6 +97,15 @@ def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, observations_and_act
     obs, actions = observations_and_actions
     path = to_c(policy, tmp_path / "policy.h", meta)
     np.testing.assert_allclose(compile_header(path, tmp_path)(obs), actions, atol=5e-6)
+
+
+def test_the_cost_counts_the_operations(meta, policy):
+    """21 observations, layers of 64, 32 and 4, and 9 numbers of memory with layers of 16 and 4."""
+    text = cost_text(policy, meta)
+    assert text.startswith(f"{21 * 64 + 64 * 32 + 32 * 4:,} multiply-adds, 0 sigmoids and 100 tanh: at most ")
+    assert f"{4 * (2 * 21 + 22 * 64 + 65 * 32 + 33 * 4):,} bytes of flash" in text
+    n = 27 * (21 + 9) + 30 * 16 + 16 * 4
+    assert cost_text(with_memory(policy, 9), meta).startswith(f"{n:,} multiply-adds, 18 sigmoids and 29 tanh: at most ")
 
 
 def test_c_with_memory_gives_the_actions_of_jax_over_episodes(tmp_path, meta, episodes):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
+from crazysim.__main__ import main
 from crazysim.lab.export.rl_tools import SHAPES, evaluate, read_rl_tools, to_rl_tools, weights_to_c
 
 READER = """
@@ -173,3 +174,24 @@ def test_wrong_weights_names_and_files_are_refused(tmp_path, weights, checkpoint
         path.write_bytes(content)
         with pytest.raises(ConfigError, match="expected a checkpoint of rl-tools"):
             read_rl_tools(path)
+
+
+def test_the_command_writes_a_checkpoint_for_every_flight_controller(tmp_path, capsys, weights):
+    policy = to_rl_tools(weights, tmp_path / "mine.tar", "mine")
+    files = ["--rl-tools", f"{tmp_path}/policy.tar", "--c", f"{tmp_path}/mine.h"]
+    assert main(["export", str(policy), *files, "--betaflight", str(tmp_path), "--out-of-tree", str(tmp_path)]) == 0
+    assert (tmp_path / "policy.tar").read_bytes() == policy.read_bytes()
+    assert "for bumblebee" not in (tmp_path / "controller.c").read_text()
+    *written, cost = capsys.readouterr().out.splitlines()
+    names = ["policy.tar", "mine.h", "policy.h", "controller.c", "policy.h", "betaflight.h"]
+    assert written == [f"wrote {tmp_path / name}" for name in names]
+    assert cost.startswith("1,952 multiply-adds, 32 sigmoids and 16 tanh: at most 164 us on a Cortex-M4")
+    assert main(["export", str(policy), "--out-of-tree", str(tmp_path), "--drone", "bumblebee"]) == 0
+    assert "for bumblebee" in (tmp_path / "controller.c").read_text()
+    for arguments, message in (
+        ([str(policy), "--onnx", "x.onnx"], "expected a run for --onnx"),
+        (["out/run", "--rl-tools", "x.tar"], "expected a checkpoint of rl-tools"),
+        (["out/run", "--c", "x.h", "--drone", "bumblebee"], "a run has its drone"),
+    ):
+        assert main(["export", *arguments]) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
