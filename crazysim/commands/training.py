@@ -250,7 +250,6 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     from crazysim.drones import load_airframe
-    from crazysim.lab.export.rl_tools import RAPTOR_RATE
     from crazysim.train import export as exports
     from crazysim.train.training import load_policy
 
@@ -286,7 +285,7 @@ def export(options: argparse.Namespace) -> None:
         if folder is not None:
             env = None if config is None else config.make_env(1)
             airframe = load_airframe(options.drone or "cf21B_500") if env is None else env.sim.airframes[0]
-            written += write(policy, folder, meta, airframe, RAPTOR_RATE if env is None else env.base.freq)
+            written += write(policy, folder, meta, airframe, *(() if env is None else (env.base.freq,)))
     for path in written:
         print(f"wrote {path}")
     if options.onnx is None or len(written) > 1:
