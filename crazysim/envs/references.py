@@ -66,7 +66,8 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
     """Execute the file or module of a reference that the user has named, and add the reference to the list.
 
     Args:
-        reference: ``FILE.py:NAME``, ``MODULE:NAME``, or ``FILE.py`` for the only task in it.
+        reference: ``FILE.py:NAME``, ``MODULE:NAME``, or ``FILE.py`` for the only task in it. A name is that of a class,
+            or the ``name`` that the class has.
         names: Names of the registered tasks. Executing the file may register more.
 
     Returns:
@@ -83,7 +84,8 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
     classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
     if not name and len(classes) == 1:
         name = next(iter(classes))
-    task_class = getattr(module, name, None) if name else None
+    own_names = {x.name: x for x in classes.values() if name not in names}  # a registered name has options, too
+    task_class = (own_names | vars(module)).get(name) if name else None
     if not _is_task(task_class) and name not in names:
         defined = ", ".join(classes) or "none"
         raise ConfigError(

@@ -176,6 +176,10 @@ def test_a_file_that_registers_is_named_by_that_name(file):
     assert envs.make("higher", n_drones=1).sim.n_drones == 1
 
 
+def test_a_class_is_found_by_its_own_name(file):
+    assert type(envs.make(f"{file}:high").task) is type(envs.make(f"{file}:High").task)
+
+
 def test_a_file_that_was_edited_is_loaded_again(file):
     assert envs.make(f"{file}:High").task.extra == 0.5
     assert type(envs.make(f"{file}:High").task) is type(envs.make(f"{file}:High").task)
