@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3425,
+    "envs": 3426,
     "geometry": 940,
     "lab": 15874,
     "media": 1080,
