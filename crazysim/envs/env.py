@@ -184,7 +184,8 @@ class Env(ABC):
         and is observed as zeros.
 
         Args:
-            action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
+            action: Action of every drone. Its command is limited to [-1, 1]; rewards see it as it is passed.
+                (n_worlds, n_drones, k)
         """
         self._check_state(state)
         with use_device_of(state.full_data.core.steps):
@@ -204,7 +205,7 @@ class Env(ABC):
 
         Args:
             flat: Result of ``flatten`` or ``advance``.
-            action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
+            action: Action of every drone, as in ``step``. (n_worlds, n_drones, k)
         """
         self.step_fn.require_own(flat)
         i = flat.plan.leaf_indices.plugins[ENV_RECORD_NAME].next_action

@@ -56,7 +56,7 @@ def make_actor(runner: OnPolicyRunner):
     return act
 
 
-def main(iterations: int = 100, starts: int = 1000, seed: int = 0) -> tuple[OnPolicyRunner, dict[str, float]]:
+def main(iterations: int = 120, starts: int = 1000, seed: int = 0) -> tuple[OnPolicyRunner, dict[str, float]]:
     """Train for some iterations, evaluate, and return the runner and the metrics."""
     torch.set_num_threads(1)  # small networks: more threads only wait for each other
     torch.manual_seed(seed)
