@@ -75,6 +75,7 @@ TASKS: dict[str, Entry] = {
     "avoid": Entry("crazysim.envs.tasks.avoid:Avoid", "crazysim/Avoid-v0"),
     "forest": Entry("crazysim.envs.tasks.forest:Forest", "crazysim/Forest-v0"),
     "transport": Entry("crazysim.lab.tasks.transport:Transport", "crazysim/Transport-v0"),
+    "any": Entry("crazysim.lab.tasks.any_airframe:AnyAirframe", "crazysim/Any-v0"),
     "swarm": Entry("crazysim.envs.tasks.swarm:Swarm", "crazysim/Swarm-v0"),
 }
 """All registered tasks, by name. Those that show a feature are in the laboratory."""
@@ -93,7 +94,7 @@ SIM_OPTIONS = tuple(name for name in inspect.signature(Sim).parameters if name n
 def make(
     task: str | Task,
     n_worlds: int = 1,
-    freq: int = 50,
+    freq: int | None = None,
     actions: Actions | None = None,
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
@@ -107,7 +108,7 @@ def make(
 
     Args:
         task: One of ``TASKS``, the reference of your class, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
-        freq: Environment steps per second, Hz.
+        freq: Environment steps per second, Hz; None for that of the task's class, 50 unless it has another.
         actions: Meaning of an action; None for the default of the command level, ``actions_of``.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states that they measure. Without sensors,
             it observes the true states, or the estimated states with the setting ``estimator`` of ``Sim``.
@@ -161,7 +162,9 @@ def make(
     for plugin in plugins:
         sim.add(plugin)
     # Environment, with images of cameras.
-    env = DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
+    env = DroneEnv(
+        sim, task, task.freq if freq is None else freq, actions, bool(sensors) or settings.get("estimator") is not None
+    )
     if camera is not None:
         for image_sensor in [camera] if isinstance(camera, ImageSensor) else check_plugin_list("camera", camera):
             env = CameraImages(env, image_sensor)  # type: ignore[arg-type]  # checked there

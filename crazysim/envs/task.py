@@ -53,6 +53,8 @@ class Task:
     """Default command level."""
     n_drones: ClassVar[int] = 1
     """Default number of drones."""
+    freq: ClassVar[int] = 50
+    """Default number of environment steps per second, Hz."""
     recipe: ClassVar[Mapping[str, Any]] = {}
     """Changes of the recipe with which ``crazysim train`` solves the task, such as ``{"discount": 0.99}``:
     hyperparameters, ``n_worlds``, ``algorithm``, ``evaluate_every``, and options of the training alone as

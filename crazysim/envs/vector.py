@@ -18,7 +18,7 @@ from crazysim.engine.cache import announce_if_slow
 from crazysim.engine.jaxcompat import require_unforked_process
 from crazysim.envs.env import Env
 from crazysim.envs.random import as_seed, read_options
-from crazysim.envs.registry import make
+from crazysim.envs.registry import entry_of, make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import NO_EPISODE, EnvState, check_actions, read_action
 from crazysim.envs.stepper import EnvStepper
@@ -224,7 +224,7 @@ def make_vector(
             f"{short_repr(options.get('seconds'))}: both are the length of an episode. Leave one out.",
         )
         options["seconds"] = positive_integer("max_episode_steps", max_episode_steps) / positive_integer(
-            "freq", options.get("freq", 50)
+            "freq", options.get("freq") or entry_of(task).task.freq
         )
     env = make(task, num_envs, **options)
     return DroneVectorEnv(env, autoreset_mode, render_mode, render_worlds, render_size, numpy)

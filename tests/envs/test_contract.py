@@ -203,7 +203,8 @@ def test_law_07_the_gradient_of_the_reward_is_finite(flight):
             state.replace(data=state.data.replace(states=states)), action, vectorize_over_worlds
         )
         data = state.data
-        s, command = data.states, getattr(data.controls, data.controls.mode.value).staged_cmd
+        s, level = data.states, getattr(data.controls, data.controls.mode.value)
+        command = getattr(level, "staged_cmd", level)  # speeds of rotors are an array
         vel = s.vel + command[..., -3:] / env.sim.freq
         data = data.replace(states=s.replace(pos=s.pos + vel / env.sim.freq, vel=vel))
         for stage in stages:

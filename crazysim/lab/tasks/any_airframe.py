@@ -1,0 +1,119 @@
+"""Fly any quadrotor: another one in every episode."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import drawn_data, state
+from crazysim.core.settings import setting
+from crazysim.envs import terms
+from crazysim.envs.actions import Actions, hover_rotor_states
+from crazysim.envs.random import draw, scale_symmetric
+from crazysim.envs.spawn import flying, random_attitude
+from crazysim.envs.tasks.goals import GoalTask
+from crazysim.lab.plugins.random_airframe import RandomAirframe
+from crazysim.plugins.effects import Latency, Randomize
+from crazysim.sim.sim import Sim
+
+MIDDLE = np.array([0.0, 0.0, 10.0])
+"""Middle of the box of goals at the start, m: high enough for drones that start upside down."""
+
+
+class AnyAirframe(GoalTask):
+    """Fly a quadrotor that the policy does not know to a point that may move, and stay there, by speeds of its rotors.
+
+    Every episode has another quadrotor (``RandomAirframe``), another delay of commands and another wind. Most drones
+    start near their goal; the others start with any attitude, at up to 3 m/s. Observations are relative to goal and
+    yaw of the goal, and include the previous action, as RAPTOR's do (arXiv 2509.11481). An action is the speed of each
+    rotor, from 0 at -1 to the largest at 1. An episode ends when a drone touches the floor, rises above 20 m, or is
+    more than 10 m from the z axis along x or y.
+    """
+
+    name = "any"
+    control = "rotor_vel"
+    freq = 100
+    film_view = {"elevation": -15}
+    half_width, height = 10.0, 20.0
+    recipe = {"memory": 16, "hidden": (32,), "iterations": 600}
+
+    drawn: bool = True
+    """Whether airframes are drawn; False for the airframe of the simulation."""
+    tumbling: float = setting(default=0.3, low=0.0, high=1.0)
+    """Fraction of starts with any attitude."""
+    speed: float = setting(default=1.0, low=0.0)
+    """Largest component of the velocity of goals, of which half move, m/s."""
+    delay: float = setting(default=0.01, low=0.0, high=1.0)
+    """Largest delay of commands, s."""
+    wind: float = setting(default=2.0, low=0.0)
+    """Largest speed of the mean wind, m/s."""
+    seconds: float = 5.0
+    """Length of an episode, s."""
+    tolerance: float = 0.2
+    """Distance below which the drone is at its goal, m."""
+    goal_vel: Array = state((3,))
+    """Velocity of the goal, world frame, m/s."""
+    goal_yaw: Array = state((1,))
+    """Yaw of the goal, rad."""
+
+    def install(self, sim: Sim) -> None:
+        n_steps, batch = int(self.delay * sim.freq), (sim.n_worlds, sim.n_drones)
+        if self.drawn:
+            sim.add(RandomAirframe())
+        sim.add(Latency(np.zeros(batch, int), max_delay=n_steps))
+        # Delays are rounded down, so that each has the same probability.
+        sim.add(Randomize(delay=(0, np.nextafter(n_steps + 1, 0)), wind=(0.0, self.wind), optional=("wind",)))
+        self.add_states(sim)
+
+    def actions(self, sim: Sim) -> Actions:
+        half = np.broadcast_to(np.asarray(sim.default_data.params.rotor_vel_max).reshape(-1)[:1] / 2, 4)
+        return Actions(half, half, sim.control)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, attitude=3, goal=3, goal_vel=3, yaw=1,
+                 tumbling=1, moving=1)  # fmt: skip
+        tumbles = x["tumbling"] < self.tumbling
+        tilt = rotation.from_rpy(scale_symmetric(x["rpy"], np.array([0.2, 0.2, np.pi])))
+        quat = jnp.where(tumbles, random_attitude(x["attitude"]), tilt)
+        speed = jnp.where(tumbles, 3.0, 0.5)
+        goal = MIDDLE + scale_symmetric(x["goal"], 1.0)
+        pos = goal + scale_symmetric(x["start"], 0.5)
+        data = flying(
+            data, pos, quat, speed * scale_symmetric(x["vel"], 1.0), speed * scale_symmetric(x["ang_vel"], 1.0)
+        )
+        rotor_vel = jnp.broadcast_to(hover_rotor_states(drawn_data(data).params), data.states.rotor_vel.shape)
+        data = data.replace(states=data.states.replace(rotor_vel=rotor_vel))
+        goal_vel = jnp.where(x["moving"] < 0.5, scale_symmetric(x["goal_vel"], self.speed), 0.0)
+        return self.write(data, goal=goal, goal_vel=goal_vel, goal_yaw=scale_symmetric(x["yaw"], np.pi))
+
+    def after_substep(self, data: SimData) -> SimData:
+        record = self.read(data)
+        return self.write(data, goal=record.goal + record.goal_vel / data.core.freq)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return what ``RaptorPolicy`` observes, in the frame of the goal. The difference is at most 1 m long."""
+        s, record = data.states, self.read(data)
+        frame = rotation.from_rpy(jnp.concatenate([0 * record.goal_yaw, 0 * record.goal_yaw, record.goal_yaw], axis=-1))
+        difference = rotation.rotate_inverse(frame, s.pos - record.goal)
+        matrix = rotation.matrix(rotation.multiply(rotation.conjugate(frame), s.quat))
+        return {
+            "difference": difference / jnp.maximum(rotation.safe_norm(difference), 1.0),
+            "rot": matrix.reshape(*matrix.shape[:-2], 9),
+            "vel": rotation.rotate_inverse(frame, s.vel - record.goal_vel),
+            "ang_vel": s.ang_vel,
+            "last_action": 2 * data.controls.rotor_vel / data.params.rotor_vel_max - 1,  # type: ignore[operator]
+        }
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        turn = self.read(data).goal_yaw[..., 0] - rotation.yaw(data.states.quat)
+        return {
+            "proximity": terms.proximity(self.error(data), coarse=1.0, fine=10.0),
+            "upright": 0.3 * rotation.z_axis(data.states.quat)[..., 2],
+            "yaw": 0.2 * jnp.cos(turn),
+            "spin": -0.005 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -20.0 * self.crashed(data),
+        }
