@@ -1,8 +1,6 @@
 """The spec of the scene: its contents, bodies that users add, and invalid edits."""
 
 import struct
-import subprocess
-import sys
 
 import jax
 import mujoco
@@ -145,29 +143,6 @@ def test_boxes_attached_from_a_string_are_touched():
     for pos, touched in ([0, 0, 0.5], [0, 0]), ([1, 0, 0.5], [1, 0]), ([2, 0, 0.62], [0, 1]), ([1.5, 0, 0.5], [0, 0]):
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.array([[pos]], np.float32)))
         assert [bool(sim.contacts(f"obstacle:{i}").any()) for i in range(2)] == touched, pos
-
-
-def test_mujoco_writes_no_log_into_the_folder_of_the_user(tmp_path):
-    """Bodies attached without a prefix, as in Crazyflow's documentation, and a file that MuJoCo cannot name."""
-    program = """
-import mujoco
-from crazysim import Sim
-sim = Sim()
-box = mujoco.MjSpec.from_string('<mujoco><worldbody><body name="box"><geom size="0.1"/></body></worldbody></mujoco>')
-sim.spec.worldbody.add_frame().attach_body(box.body("box"), "", ":0")
-sim.build_mjx()
-try:
-    Sim(xml_path="scene")
-except ValueError as error:
-    print(error)
-"""
-    (tmp_path / "scene").write_text("<mujoco/>")
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "expected a scene that MuJoCo can read" in done.stdout
-    assert done.stderr.startswith("MuJoCo: ")
-    assert "prefix" not in done.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
 def test_bodies_of_a_file_keep_their_meshes(tmp_path, scene_file):
