@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from cases import hover_rotor_state, with_states
 
 from crazysim import Battery, Plugin, RangeFinder, Sim, rotation
@@ -66,18 +65,21 @@ def test_motion_capture_differentiates_positions():
 def test_optical_flow_by_hand():
     """1 m/s ahead 0.5 m above ground is 2 rad/s; so is a pitch rate of -2 rad/s; 35 / 0.71674 pixels a radian."""
     pixels = 35 / 0.71674 / 500
-    flow = sensors.OpticalFlow(freq=None)
-    for states, expected in (
-        ({"pos": [0, 0, 0.5], "vel": [1.0, 0, 0]}, [2, 0]),
-        ({"pos": [0, 0, 2.0], "vel": [1.0, 0.4, 0]}, [0.5, 0.2]),
-        ({"ang_vel": [3.0, -2.0, 0]}, [2, 3]),
-        ({"quat": [0, np.sin(0.25), 0, np.cos(0.25)], "vel": [1.0, 0, 0]}, [np.cos(0.5) ** 2, 0]),
-        ({"quat": [1.0, 0, 0, 0], "vel": [1.0, 0, 0]}, [0, 0]),
-    ):
-        sim = build(flow, **states)
-        sim.step()
-        np.testing.assert_allclose(read(sim, "optical_flow.flow")[0, 0], pixels * np.array(expected), rtol=0.05,
-                                   atol=1e-4)  # the motion of one step # fmt: skip
+    level, pitched, turned = (0, 0, 0, 1), (0, np.sin(0.25), 0, np.cos(0.25)), (1, 0, 0, 0)
+    pos, quat, vel, ang_vel, expected = zip(
+        ((0, 0, 0.5), level, (1, 0, 0), (0, 0, 0), (2, 0)),
+        ((0, 0, 2), level, (1, 0.4, 0), (0, 0, 0), (0.5, 0.2)),
+        ((0, 0, 1), level, (0, 0, 0), (3, -2, 0), (2, 3)),
+        ((0, 0, 1), pitched, (1, 0, 0), (0, 0, 0), (np.cos(0.5) ** 2, 0)),
+        ((0, 0, 1), turned, (1, 0, 0), (0, 0, 0), (0, 0)),
+        strict=True,
+    )
+    states = {"pos": pos, "quat": quat, "vel": vel, "ang_vel": ang_vel}
+    states = {name: np.array(x, float)[:, None] for name, x in states.items()}
+    sim = build(sensors.OpticalFlow(freq=None), n_worlds=5, **states)
+    sim.step()
+    flow = read(sim, "optical_flow.flow")[:, 0]
+    np.testing.assert_allclose(flow, pixels * np.array(expected), rtol=0.05, atol=1e-4)  # the motion of one step
     sim = build(sensors.OpticalFlow(0.3, resolution=0.1), n_worlds=N)
     sim.step()
     result = read(sim, "optical_flow.flow")
@@ -85,28 +87,33 @@ def test_optical_flow_by_hand():
     np.testing.assert_allclose(result / 0.1, np.round(result / 0.1), atol=1e-4)
 
 
-@pytest.mark.parametrize("plugin, channel, expected", [
+MOUNTED = {
     # yaw 90 degrees: the body's x axis is the world's y axis, and a place 0.2 m ahead is at (0, 0.2, 1)
-    (sensors.GPS(pos=(0.2, 0, 0), freq=None), "gps.pos", [0, 0.2, 1]),
+    "gps.pos": (sensors.GPS(pos=(0.2, 0, 0), freq=None), [0, 0.2, 1]),
     # it turns about z at 2 rad/s: 0.4 m/s to the left, the world's -x; and 3 rad/s about x moves nothing ahead
-    (sensors.GPS(pos=(0.2, 0, 0), freq=None), "gps.vel", [-0.4, 0, 0]),
+    "gps.vel": (None, [-0.4, 0, 0]),
     # from (0, 0.2, 1) to (0, 2.2, 1) and (1.5, 0.2, 3)
-    (sensors.UWB([(0, 2.2, 1), (1.5, 0.2, 3)], pos=(0.2, 0, 0), freq=None), "uwb.distance", [2.0, 2.5]),
+    "uwb.distance": (sensors.UWB([(0, 2.2, 1), (1.5, 0.2, 3)], pos=(0.2, 0, 0), freq=None), [2.0, 2.5]),
     # 0.3 m below the centre of mass, 0.7 m above ground
-    (sensors.TimeOfFlight(pos=(0, 0, -0.3), far_noise=0.0, freq=None), "time_of_flight.distance", [0.7]),
+    "time_of_flight.distance": (sensors.TimeOfFlight(pos=(0, 0, -0.3), far_noise=0.0, freq=None), [0.7]),
     # 0.2 m ahead the camera moves at 0.4 m/s to the left, 0.4 rad/s; the roll adds 3 rad/s; 35 / 0.71674 / 500 pixels
-    (sensors.OpticalFlow(pos=(0.2, 0, 0), freq=None), "optical_flow.flow", [0, 3.4 * 35 / 0.71674 / 500]),
+    "ahead.flow": (sensors.OpticalFlow(pos=(0.2, 0, 0), freq=None, name="ahead"), [0, 3.4 * 35 / 0.71674 / 500]),
     # 0.5 m below, a roll rate of 3 rad/s moves it at 1.5 m/s to the left, 3 rad/s over 0.5 m of height
-    (sensors.OpticalFlow(pos=(0, 0, -0.5), freq=None), "optical_flow.flow", [0, 6 * 35 / 0.71674 / 500]),
+    "below.flow": (sensors.OpticalFlow(pos=(0, 0, -0.5), freq=None, name="below"), [0, 6 * 35 / 0.71674 / 500]),
     # north is ahead of the drone; a sensor turned by 90 degrees about x has the body's z axis as its y axis
-    (sensors.Magnetometer((0, 2e-5, -4e-5), rpy=(np.pi / 2, 0, 0)), "magnetometer.field", [2e-5, -4e-5, 0]),
-])  # fmt: skip
-def test_mounting_by_hand(plugin, channel, expected):
+    "magnetometer.field": (sensors.Magnetometer((0, 2e-5, -4e-5), rpy=(np.pi / 2, 0, 0)), [2e-5, -4e-5, 0]),
+}
+"""Sensor and expected measurement by the name of the observation."""
+
+
+def test_mounting_by_hand():
     """Yaw 90 degrees, turning at (3, 0, 2) rad/s; the motion of one step: 6 mrad, and 2 cm/s of fall."""
-    sim = build(plugin, quat=[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], ang_vel=[3.0, 0, 2.0])
+    plugins = [plugin for plugin, _ in MOUNTED.values() if plugin]
+    sim = build(*plugins, quat=[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], ang_vel=[3.0, 0, 2.0])
     sim.step()
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(read(sim, channel)[0, 0], expected, rtol=0.02, atol=0.06 * scale)
+    for name, (_, expected) in MOUNTED.items():
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(read(sim, name)[0, 0], expected, rtol=0.02, atol=0.06 * scale, err_msg=name)
 
 
 def test_time_of_flight_by_hand():
@@ -118,13 +125,14 @@ def test_time_of_flight_by_hand():
     sim.step()
     result = read(sim, "time_of_flight.distance")[:, 0, 0]
     np.testing.assert_allclose(result, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # the motion of one step, and rounding
-    for height in (0.5, 2.5, 3.5):
-        deviation = 0.01 + 0.0025 * (1 + 80 ** ((height - 2.5) / 1.5))
-        sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=N, pos=[0, 0, height])
-        sim.step()
-        distance = read(sim, "time_of_flight.distance")
-        np.testing.assert_allclose(distance.std(), deviation, rtol=std_tolerance(N) + 0.01)
-        np.testing.assert_allclose(distance.mean(), height, atol=4 * deviation / np.sqrt(N) + 1e-3)
+    heights = np.array([0.5, 2.5, 3.5])
+    pos = np.tile(heights, N)[:, None, None] * [0, 0, 1]
+    sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=3 * N, pos=pos)
+    sim.step()
+    deviation = 0.01 + 0.0025 * (1 + 80 ** ((heights - 2.5) / 1.5))
+    distance = read(sim, "time_of_flight.distance").reshape(N, 3)
+    np.testing.assert_allclose(distance.std(axis=0), deviation, rtol=std_tolerance(N) + 0.01)
+    assert np.all(np.abs(distance.mean(axis=0) - heights) < 4 * deviation / np.sqrt(N) + 1e-3)
 
 
 def test_the_standard_atmosphere():
