@@ -61,7 +61,7 @@ def test_a_bad_value_in_the_data_flags_its_world_or_vanishes():
     """What no stage writes may stay as it is, if nothing reads it: poses of objects, and parameters without use."""
     plugins = [Battery(), Wind((1.0, 0, 0)), RangeFinder(), IMU(delay=0.004), MotionCapture(freq=250), SlungLoad(0.005),
                Cars(1)]  # fmt: skip
-    sim = Sim(N_WORLDS, 2, control="attitude", plugins=plugins)
+    sim = Sim(N_WORLDS, 2, control="attitude", plugins=plugins, engine="interpret")
     data, fly = sim.data, jax.jit(lambda data: sim.step_fn(data, 2))
     clean, cases = fly(data), cases_by_world(data, BAD)
     after = fly(poison(data, {(i, world): value for world, (i, value) in cases.items()}))
