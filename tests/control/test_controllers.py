@@ -186,7 +186,7 @@ def test_a_pitch_rate_through_a_flip_disturbs_no_other_axis():
 
 
 def test_a_controller_runs_at_its_rate_and_resets_per_world():
-    sim = take_off(Spring(), 101)
+    sim = take_off(Spring(), 101, "interpret")
     np.testing.assert_array_equal(np.asarray(controller_memory(sim).n_ticks)[..., 0], 21.0)
     sim.reset(np.array([True, False, True]))
     np.testing.assert_array_equal(np.asarray(controller_memory(sim).n_ticks)[:, 0, 0], [0, 21, 0])
@@ -287,8 +287,8 @@ def test_a_switch_function_exchanges_controllers_in_flight():
 
 def test_a_switch_chooses_a_controller_for_each_drone():
     index = np.array([[0, 1], [1, 0], [0, 0]])
-    switched_sim = take_off(["pid", "mellinger"], 300, switch=index)
-    separate_sims = [take_off(name, 300) for name in ("pid", "mellinger")]
+    switched_sim = take_off(["pid", "mellinger"], 300, "interpret", switch=index)
+    separate_sims = [take_off(name, 300, "interpret") for name in ("pid", "mellinger")]
     expected = np.where(index[..., None] == 0, *(np.asarray(sim.data.states.pos) for sim in separate_sims))
     np.testing.assert_allclose(switched_sim.data.states.pos, expected, atol=1e-5)
     np.testing.assert_array_equal(np.asarray(controller_memory(switched_sim).active)[..., 0], index)
