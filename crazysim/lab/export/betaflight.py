@@ -52,20 +52,22 @@ def to_betaflight(
         f"expected a policy that commands rotor speeds, got one of level {controller.level.value}. Train with "
         f"--set control=rotor_vel.",
     )
-    text = BETAFLIGHT_SOURCE.format(
-        version=crazysim.__version__,
-        airframe=airframe.name,
-        freq=freq,
-        period=round(1e6 / freq),
-        header=HEADER_FILE,
-        function="\n".join(command_lines(controller)),
-        memory="static struct policy_memory policy_own_memory;\n" if controller.has_memory else "",
-        start="if (!policy_flying) policy_start(&policy_own_memory);\n        " if controller.has_memory else "",
-        argument="&policy_own_memory, " if controller.has_memory else "",
-        order=", ".join(map(str, rotor_order(airframe, MOTORS))),
-        max_speed=float_literal(np.max(airframe.rotor_vel_limits[1])),
+    write_file(
+        source,
+        BETAFLIGHT_SOURCE.format(
+            version=crazysim.__version__,
+            airframe=airframe.name,
+            freq=freq,
+            period=round(1e6 / freq),
+            header=HEADER_FILE,
+            function="\n".join(command_lines(controller)),
+            memory="static struct policy_memory policy_own_memory;\n" if controller.has_memory else "",
+            start="if (!policy_flying) policy_start(&policy_own_memory);\n        " if controller.has_memory else "",
+            argument="&policy_own_memory, " if controller.has_memory else "",
+            order=", ".join(map(str, rotor_order(airframe, MOTORS))),
+            max_speed=float_literal(np.max(airframe.rotor_vel_limits[1])),
+        ),
     )
-    write_file(source, text)
     return header, source
 
 

@@ -17,7 +17,7 @@ import crazysim
 from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
-from crazysim.errors import require, require_type
+from crazysim.errors import expect, require, require_type
 from crazysim.lab.export.policies import POLICY_REMEDY, float_literal, to_c
 from crazysim.lab.export.rl_tools import RAPTOR_RATE, weights_to_c
 from crazysim.storage import as_path, write_file
@@ -45,8 +45,8 @@ RAPTOR_FIELDS = {
     "previous_action": ("memory->previous[{i}]", 4),
 }
 """The same for a policy of RAPTOR's shape, in its order and with the limits of ``mc_raptor``."""
-RAPTOR_ROTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
-"""Signs of x (forward) and y (left) of RAPTOR's rotors."""
+RAPTOR_ROTORS, RAPTOR_YAW_TORQUE_SIGNS = ((1, -1), (-1, -1), (-1, 1), (1, 1)), [-1, 1, -1, 1]
+"""Signs of x (forward) and y (left) of RAPTOR's rotors, and of the torques about z that they exert on the body."""
 
 
 class Controller(NamedTuple):
@@ -98,7 +98,7 @@ def to_out_of_tree(
     return header, source
 
 
-def write_header(policy: Any, path: Path, meta: Mapping[str, Any] | None, airframe: Airframe, freq: int) -> Controller:
+def write_header(policy: Any, path: Path, meta: Any, airframe: Airframe, freq: int) -> Controller:
     """Write the policy as a C header, and return what its caller needs to know.
 
     Raises:
@@ -109,10 +109,15 @@ def write_header(policy: Any, path: Path, meta: Mapping[str, Any] | None, airfra
     require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")
     if isinstance(policy, Mapping):
         order = rotor_order(airframe, RAPTOR_ROTORS)
+        expect(
+            (signs := airframe.value("rotors.yaw_torque_sign")[order].tolist()) == RAPTOR_YAW_TORQUE_SIGNS,
+            f"rotors of {airframe.name!r} whose drag turns the body by {RAPTOR_YAW_TORQUE_SIGNS} about z, as RAPTOR's",
+            signs,
+            "Swap the propellers of each side.",
+        )
         weights_to_c(policy, path)
         half = float(np.max(airframe.rotor_vel_limits[1])) / 2
         return Controller(RAPTOR_FIELDS, Control.rotor_vel, [(half, half)] * 4, order, True, freq)
-    meta = {} if meta is None else meta
     interface = Interface.read(meta)
     require(
         interface.freq in (None, freq),
@@ -168,7 +173,8 @@ static void policy_start(struct policy_memory *memory)
 }}
 """
     if fields is RAPTOR_FIELDS:
-        yield "static float limited(float x, float limit) { return x < -limit ? -limit : (x > limit ? limit : x); }\n"
+        yield "static float limited(float x, float limit) \n"
+        yield "{ return !isfinite(x) || (-limit < x && x < limit) ? x : (x < 0 ? -limit : limit); }\n"
     memory = "struct policy_memory *memory, " if controller.has_memory else ""
     yield f"""/* Writes the {controller.level.value} command of the policy.
  *

@@ -322,11 +322,12 @@ def test_betaflight_gets_its_motors_in_its_order_and_range(tmp_path, weights):
                 assert flying
                 np.testing.assert_allclose(out, 100 + 1900 * speeds[k, order], atol=0.1, err_msg=f"{flight}, {k}")
         code.stop()
-    lost = states[0].copy()
-    lost[7] = np.nan
-    flying, out = mix(start, lost)
-    assert not flying
-    np.testing.assert_array_equal(out, -1)
+    for i, value in ((7, np.nan), (0, np.inf), (8, -np.inf)):
+        lost = states[0].copy()
+        lost[i] = value
+        flying, out = mix(start, lost)
+        assert not flying
+        np.testing.assert_array_equal(out, -1)
 
 
 def test_betaflight_flies_a_run_that_commands_rotors(exported, tmp_path):
@@ -337,6 +338,13 @@ def test_betaflight_flies_a_run_that_commands_rotors(exported, tmp_path):
     assert header.name == "policy.h"
     with pytest.raises(ConfigError, match="level attitude"):
         to_betaflight(exported("attitude")[0], tmp_path, describe(make("hover", 1)), AIRFRAME, 50)
+
+
+def test_rotors_that_turn_the_other_way_are_refused(tmp_path, weights):
+    signs = AIRFRAME.value("rotors.yaw_torque_sign")
+    reversed_airframe = load_airframe({"base": "cf21B_500", "rotors": {"yaw_torque_sign": (-signs).tolist()}})
+    with pytest.raises(ConfigError, match="Swap the propellers"):
+        to_betaflight(weights, tmp_path, None, reversed_airframe)
 
 
 def test_the_example_compiles_against_the_headers(tmp_path):
