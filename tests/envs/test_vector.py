@@ -231,7 +231,7 @@ def test_a_step_before_the_first_reset_is_an_error():
 
 @pytest.mark.usefixtures("opengl")
 def test_pictures_show_the_drone_as_it_is():
-    env = gymnasium.make_vec(ID, num_envs=3, render_mode="rgb_array", max_episode_steps=7)
+    env = gymnasium.make_vec(ID, num_envs=3, render_mode="rgb_array", max_episode_steps=7, engine="interpret")
     assert env.metadata["render_fps"] == 50
     assert env.unwrapped.env.max_steps == 7
     env.reset(seed=0)
@@ -289,7 +289,7 @@ def test_pictures_show_what_the_task_shows_in_films():
 @pytest.mark.skipif(not hasattr(gymnasium.wrappers.vector, "RecordVideo"), reason="a newer Gymnasium has it")
 def test_gymnasiums_recorders_film_one_world_and_all_and_render_worlds_chooses_some(tmp_path):
     pytest.importorskip("moviepy")
-    options = {"render_mode": "rgb_array", "render_size": (64, 48)}
+    options = {"render_mode": "rgb_array", "render_size": (64, 48), "engine": "interpret"}
     env = gymnasium.make_vec(ID, num_envs=4, max_episode_steps=3, numpy=True, **options)
     film = gymnasium.wrappers.vector.RecordVideo(env, str(tmp_path / "all"), episode_trigger=lambda k: k == 0)
     film.reset(seed=0)
@@ -328,7 +328,7 @@ def test_gymnasiums_wrappers_return_numpy_arrays(envs):
 
 
 def test_numpy_results_may_be_written_to_as_wrappers_of_rewards_do():
-    vec = gymnasium.make_vec(ID, num_envs=2, numpy=True, seconds=1.0)
+    vec = gymnasium.make_vec(ID, num_envs=2, numpy=True, engine="interpret")
     env = gymnasium.wrappers.vector.ClipReward(vec, -0.01, 0.01)
     obs, info = env.reset(seed=0)
     results = env.step(env.action_space.sample())
@@ -372,7 +372,7 @@ def test_one_world_is_an_environment_that_gymnasium_accepts():
 
 
 def test_several_drones_have_an_axis_and_share_their_mean_reward():
-    env = make_vector("hover", 3, n_drones=2)
+    env = make_vector("hover", 3, n_drones=2, engine="interpret")
     assert env.single_action_space.shape == (2, 4)
     assert env.single_observation_space["pos"].shape == (2, 3)
     obs, _ = env.reset(seed=0)
