@@ -16,7 +16,7 @@ N_WORLDS, N_STEPS = 3, 5
 
 @pytest.fixture(scope="module")
 def drone_env():
-    return make("hover", N_WORLDS, n_drones=2, seconds=N_STEPS / 50)
+    return make("hover", N_WORLDS, n_drones=2, seconds=N_STEPS / 50, engine="interpret")
 
 
 @pytest.fixture(scope="module")

@@ -169,7 +169,7 @@ class CountingTwice(Counting):
 
 
 def test_declared_states_count_every_physics_step_and_begin_at_zero_in_every_episode(two_drones):
-    env = AutoReset(make(CountingTwice(), n_worlds=3, n_drones=2))
+    env = AutoReset(make(CountingTwice(), n_worlds=3, n_drones=2, engine="interpret"))
     reset_state = jax.jit(env.reset)(jax.random.key(0))
     record = reset_state.data.plugins["task"]
     assert record.n_counted.dtype == jnp.int32
@@ -212,7 +212,7 @@ def test_states_are_read_from_data_and_added_by_the_task_that_declares_them(two_
 
 @pytest.fixture(scope="module")
 def two_drones():
-    return Sim(n_worlds=3, n_drones=2, control="attitude")
+    return Sim(n_worlds=3, n_drones=2, control="attitude", engine="interpret")
 
 
 WRONG_METHODS = {

@@ -15,7 +15,7 @@ N_WORLDS = 2048
 @pytest.fixture(scope="module")
 def start_state():
     """Return an environment of two drones in every world, its state at the start of episodes, and its step."""
-    sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude")
+    sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude", engine="interpret")
     task = Avoid()
     task.install(sim)
     env = DroneEnv(sim, task)

@@ -33,7 +33,7 @@ CASES = {
 
 
 def make_env(n_worlds, n_drones=1, **options):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", engine="interpret")
     task = Land(**options)
     task.install(sim)
     return DroneEnv(sim, task)

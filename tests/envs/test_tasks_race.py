@@ -265,7 +265,7 @@ def test_the_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
 
 
 def test_practice_begins_episodes_behind_gates():
-    env = make("race", 400, practice=True)
+    env = make("race", 400, practice=True, engine="interpret")
     data = jax.jit(lambda key: env.reset(key).data)(jax.random.key(0))
     passed = np.asarray(rules.race_of(data).passed)[:, 0]
     assert np.bincount(passed, minlength=4).min() > 60, "each gate as often as the others"
@@ -281,7 +281,7 @@ def test_practice_begins_episodes_behind_gates():
 
 
 def test_practice_places_drones_of_a_world_behind_different_gates():
-    env = make("multi_race", 200, practice=True, n_drones=3)
+    env = make("multi_race", 200, practice=True, n_drones=3, engine="interpret")
     data = jax.jit(lambda key: env.reset(key).data)(jax.random.key(0))
     passed = np.asarray(rules.race_of(data).passed)
     assert np.bincount(passed[:, 0], minlength=4).min() > 30, "each gate as often as the others"

@@ -23,7 +23,7 @@ def start_state():
 
 
 def test_policies_observe_an_image_and_no_positions_but_the_height():
-    env = make("race_by_camera", 2)
+    env = make("race_by_camera", 2, engine="interpret")
     obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
     assert {name: x.shape[-1] for name, x in obs.items()} == SIZES | {"depth": 32 * 24}
     teacher = make("race_by_camera", 2, camera=(), gates_observed=True)
@@ -85,7 +85,7 @@ def test_looking_away_from_the_next_gate_costs(start_state):
 
 
 def test_the_frame_of_the_next_gate_is_in_the_image():
-    env = make("race_by_camera", 1)
+    env = make("race_by_camera", 1, engine="interpret")
     state = jax.jit(env.reset)(jax.random.key(0))
     depth = np.asarray(state.obs["depth"]).reshape(24, 32)
     distance = np.linalg.norm(np.asarray(TRACK.gates_pos[0]) - np.asarray(state.data.states.pos)[0, 0])

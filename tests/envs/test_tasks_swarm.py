@@ -16,7 +16,7 @@ N_WORLDS, N_DRONES = 2048, 4
 @pytest.fixture(scope="module")
 def start_state():
     """Return an environment, its state at the start of episodes, and its step."""
-    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude", engine="interpret")
     task = Swarm()
     task.install(sim)
     env = DroneEnv(sim, task)
@@ -102,7 +102,7 @@ def test_separation_is_kept_at_every_physics_step(start_state):
 
 def test_goals_can_be_a_formation():
     formation = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (0, 0, 2)]
-    sim = Sim(n_worlds=64, n_drones=N_DRONES, control="attitude")
+    sim = Sim(n_worlds=64, n_drones=N_DRONES, control="attitude", engine="interpret")
     task = Swarm(formation=formation, strict=False)
     task.install(sim)
     data = jax.jit(DroneEnv(sim, task).reset)(jax.random.key(0)).data
