@@ -46,7 +46,20 @@ def test_the_command_checks_a_task_and_writes_nothing(tmp_path, monkeypatch, cap
     status = 0  # nothing was found
     small = "n_steps=8 epochs=1 minibatches=1 hidden=[8]"
     assert (
-        main(["train", "hover", "--check", "--worlds", "4", "--set", "seconds=0.4", "--config", *small.split()])
+        main(
+            [
+                "train",
+                "hover",
+                "--check",
+                "--worlds",
+                "4",
+                "--set",
+                "seconds=0.4",
+                "engine=interpret",
+                "--config",
+                *small.split(),
+            ]
+        )
         == status
     )
     lines = capsys.readouterr().out.splitlines()
