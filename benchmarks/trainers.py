@@ -152,6 +152,7 @@ def train_rsl_rl(env: Env, config: ppo.Config, seed: int) -> TrainingResult:
 
     from crazysim.envs.rsl_rl import RslRlEnv
 
+    torch.set_num_threads(1)  # small networks: more threads only wait for each other
     torch.manual_seed(seed)
     network = {"class_name": "MLPModel", "hidden_dims": config.hidden, "activation": "tanh", "obs_normalization": True}
     settings = {
