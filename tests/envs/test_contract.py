@@ -259,8 +259,10 @@ def test_every_step_is_one_kernel_where_x64_is_enabled(x64, name):
 )
 def test_the_kernel_of_a_step_agrees_with_the_stages(name, flight):
     """Actions, physics, task and new episodes in one kernel equal the reference, at states of the random flight."""
+    n_drones = flight.env.sim.n_drones
     fused, plain = (
-        AutoReset(EpisodeStatistics(make(name, N_FLYING, engine=engine)), "SameStep") for engine in ("auto", "plain")
+        AutoReset(EpisodeStatistics(make(name, N_FLYING, n_drones=n_drones, engine=engine)), "SameStep")
+        for engine in ("auto", "plain")
     )
     assert "engine: fused\n" in fused.explain()
     n_cameras = 1 if fused.image_formats() else 0  # one camera takes all images of a task
