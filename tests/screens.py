@@ -17,12 +17,12 @@ def virtual_screen(folder):
     options = ["-displayfd", str(write_end), "-screen", "0", "1280x720x24", "-fbdir", str(folder), "-nolisten", "tcp"]
     server = subprocess.Popen(["Xvfb", *options], pass_fds=[write_end], stderr=subprocess.DEVNULL)
     os.close(write_end)
-    ready, _, _ = select.select([read_end], [], [], 30)
+    ready, _, _ = select.select([read_end], [], [], 300)
     number = os.read(read_end, 16).decode().strip() if ready else ""
     assert number, "Xvfb did not start"
     yield f":{number}", folder / "Xvfb_screen0"
     server.terminate()
-    server.wait(10)
+    server.wait(300)
     os.close(read_end)
 
 

@@ -71,7 +71,7 @@ for command in json.load(sys.stdin):
     child = os.fork()
     if not child:
         resource.setrlimit(resource.RLIMIT_AS, (used + 2**32, resource.RLIM_INFINITY))
-        signal.alarm(60)  # ends the process
+        signal.alarm(600)  # ends the process
         os.dup2(1, 2)
         try:
             status = main(command.split())
@@ -84,7 +84,7 @@ for command in json.load(sys.stdin):
         os._exit(status)
     print("status", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Run each command in a child of one process, with 4 GB of memory more than the imports take, and for 60 s at most."""
+"""Run each command in a child of one process, with 4 GB more memory than the imports take, and for 600 s at most."""
 
 
 def run(folder, commands):

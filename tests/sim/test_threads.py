@@ -123,11 +123,11 @@ def test_a_pipeline_that_is_edited_while_it_is_built_is_built_again():
     def build(stages):
         if "slow" in stages:
             building.set()
-            edited.wait(10)
+            edited.wait(300)
         return list(stages)
 
     def edit(_):
-        building.wait(10)
+        building.wait(300)
         built.stages = {"quick": run_together}
         built.fn()
         edited.set()
