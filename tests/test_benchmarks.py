@@ -196,7 +196,8 @@ def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, tra
 @pytest.mark.long("trains in a process of its own")
 def test_a_training_that_fails_stops_no_other_and_finished_ones_are_not_repeated(run, train, tmp_path, capsys):
     options = ("--seeds", "0:2", "--parallel", "2", "--out", tmp_path, "--")
-    small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "minibatches=2")
+    small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "engine=interpret",
+             "--config", "n_steps=4", "minibatches=2", "hidden=[8]")  # fmt: skip
     with pytest.raises(SystemExit, match=r"^nothing: training with seeds 0, 1 failed$"):
         run("train.py", "--tasks", "nothing", "hover", *options, *small)
     count, *lines = lines_of(capsys.readouterr().out)
