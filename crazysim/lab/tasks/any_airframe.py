@@ -22,6 +22,10 @@ from crazysim.sim.sim import Sim
 MIDDLE = np.array([0.0, 0.0, 10.0])
 """Middle of the box of goals at the start, m: high enough for drones that start upside down."""
 
+MAX_DIFFERENCE, MAX_VELOCITY = 0.5, 1.0
+"""Limits of each axis of the observed position, m, and velocity, m/s, relative to the goal (PX4 1.18,
+``src/modules/mc_raptor/mc_raptor.hpp``)."""
+
 
 class AnyAirframe(GoalTask):
     """Fly a quadrotor that the policy does not know to a point that may move, and stay there, by speeds of its rotors.
@@ -94,15 +98,16 @@ class AnyAirframe(GoalTask):
         return self.write(data, goal=record.goal + record.goal_vel / data.core.freq)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return what ``RaptorPolicy`` observes, in the frame of the goal. The difference is at most 1 m long."""
+        """Return what RAPTOR observes, in the frame of the goal, as PX4 limits it."""
         s, record = data.states, self.read(data)
         frame = rotation.from_rpy(jnp.concatenate([0 * record.goal_yaw, 0 * record.goal_yaw, record.goal_yaw], axis=-1))
         difference = rotation.rotate_inverse(frame, s.pos - record.goal)
+        vel = rotation.rotate_inverse(frame, s.vel - record.goal_vel)
         matrix = rotation.matrix(rotation.multiply(rotation.conjugate(frame), s.quat))
         return {
-            "difference": difference / jnp.maximum(rotation.safe_norm(difference), 1.0),
+            "difference": rotation.clip(difference, -MAX_DIFFERENCE, MAX_DIFFERENCE),
             "rot": matrix.reshape(*matrix.shape[:-2], 9),
-            "vel": rotation.rotate_inverse(frame, s.vel - record.goal_vel),
+            "vel": rotation.clip(vel, -MAX_VELOCITY, MAX_VELOCITY),
             "ang_vel": s.ang_vel,
             "last_action": 2 * data.controls.rotor_vel / data.params.rotor_vel_max - 1,  # type: ignore[operator]
         }
