@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3427,
     "geometry": 940,
-    "lab": 15942,
+    "lab": 15944,
     "media": 1080,
     "plugins": 4875,
     "scene": 2569,
