@@ -21,7 +21,7 @@ from crazysim.train.show import read_curve
 
 N_WORLDS, ITERATIONS = 256, 10
 """Worlds of the flights, and iterations of the training."""
-HOVER, RANDOM, DEMONSTRATION = "hovering", "random actions", "the demonstration"
+HOVER, RANDOM, DEMONSTRATION = "zero actions", "random actions", "the demonstration"
 """Names of the flights."""
 
 Metrics = Mapping[str, Mapping[str, float]]
@@ -88,7 +88,7 @@ def check_flights(metrics: Metrics, task: Task) -> list[str]:
     # Hovering must fail, and the demonstration must succeed.
     if hovering["success"] > 0.5:
         findings.append(
-            f"Hovering succeeds from {hovering['success']:.0%} of the starts: start farther away, or use a smaller "
+            f"Zero actions succeed from {hovering['success']:.0%} of the starts: start farther away, or use a smaller "
             f"tolerance."
         )
     if by_hand is not None and by_hand["success"] < 0.9:

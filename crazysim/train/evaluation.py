@@ -210,7 +210,8 @@ def describe_outcome(metrics: Mapping[str, float], unit: str) -> str:
     if metrics["nonfinite"]:
         crashed += f" (of all worlds {metrics['nonfinite']:.1%} became non-finite)"
     if not math.isnan(metrics["error"]):
-        return f"mean error {metrics['error']:.4f} {unit}, {crashed}"
+        of_others = " of those that did not crash" if metrics["crashed"] else ""
+        return f"mean error {metrics['error']:.4f} {unit}{of_others}, {crashed}"
     if metrics["crashed"] == 1:
         return f"{crashed}, on average after {metrics['length']:.2f} s, so there is no mean error"
     return f"no drone with a task error, {crashed}"

@@ -166,9 +166,9 @@ def plot_episode(
         axis.set(xlabel="time in the episode, s", ylabel=y)
     has_succeeded = flight["succeeded"].all(axis=-1) if "succeeded" in flight else np.zeros_like(is_over[-1])
     figure.suptitle(
-        f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.0%} fly until the end, "
+        f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.1%} fly until the end, "
         + f"{has_succeeded.mean():.0%} succeed, " * ("succeeded" in flight)
-        + f"{(is_over[-1] & ~has_succeeded).mean():.0%} crash",
+        + f"{(is_over[-1] & ~has_succeeded).mean():.1%} crash",
         fontsize=9,
     )
     _save_figure(figure, path)

@@ -83,6 +83,14 @@ def test_hoops_are_passed_in_their_order_along_their_axes():
     np.testing.assert_allclose(rings, [[0, 0, 1, 1, 0, 0, 0.5], [1, 1, 1, 0, 1, 0, 0.5]], atol=1e-6)
 
 
+def test_a_hoop_that_becomes_the_next_behind_the_drone_is_not_missed():
+    inside_both_planes, round_it = [0.05, 1.2, 1.0], [1.0, 0.9, 1.0]
+    paths = [[[-0.1, 1.2, 1.0], inside_both_planes, x, [1.0, 1.1, 1.0]] for x in ([1.0, 1.3, 1.0], round_it)]
+    course = follow(Corner(radius=1.5), paths).plugins["task"]
+    np.testing.assert_array_equal(course.passed[:, 0], [[True, False], [True, True]])
+    assert not course.missed.any()
+
+
 def test_points_are_visited_in_any_order():
     data = follow(Four(), [[[3.0, 0.0, 1.05], [1.0, 0.05, 1.0]], [[2.0, 0.2, 1.0], [0.0, 0.0, 1.0]]])
     np.testing.assert_array_equal(data.plugins["task"].passed[:, 0], [[True, False, True, False], [False] * 4])

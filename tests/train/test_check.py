@@ -15,7 +15,7 @@ LENGTHS = {check.HOVER: 5.0, check.RANDOM: 1.0, check.DEMONSTRATION: 5.0}
 CASES = {
     "nothing": ({}, ""),
     "NaN": ({check.RANDOM: {"nonfinite": 0.5}}, "became non-finite"),
-    "the start is a success": ({check.HOVER: {"success": 0.9}}, "Hovering succeeds from 90%"),
+    "the start is a success": ({check.HOVER: {"success": 0.9}}, "Zero actions succeed from 90%"),
     "too short": ({check.DEMONSTRATION: {"success": 0.0, "error": 0.3}}, "below 0.05 for the last 1 s of 5 s"),
     "ends at the goal": ({check.DEMONSTRATION: {"success": 0.0, "crashed": 1.0}}, "define succeeded(data)"),
     "living costs": ({check.HOVER: {"reward": -20.0, "reward near": -20.0}}, "mostly by the term 'near' (1 and -20)"),

@@ -47,10 +47,11 @@ class HoopTask(Course):
     """Base of tasks in which drones fly through hoops in their order, and hover at a goal behind the last.
 
     A class sets ``n_waypoints``, the number of hoops, and defines ``spawn``, which ends with ``set_course``,
-    ``observe``, ``rewards`` and ``terminated``. A hoop counts as passed when the drone is behind its plane and was
-    within the opening after the first physics step there; otherwise the drone has ``missed`` it. Then the next hoop is
-    checked, whose plane must be ahead. The error is the length of the way through the middles of all hoops that are
-    left, to the goal. For gates with frames that drones can touch, see ``crazysim.envs.tasks.race``.
+    ``observe``, ``rewards`` and ``terminated``. A hoop counts as passed when the drone crosses its plane and was
+    within the opening after the first physics step behind it; otherwise the drone has ``missed`` it. Only the next
+    hoop is checked. If its plane is behind the drone, the drone has to come round. The error is the length of the way
+    through the middles of all hoops that are left, to the goal. For gates with frames that drones can touch, see
+    ``crazysim.envs.tasks.race``.
     """
 
     radius: float = setting(default=0.5, positive=True)
@@ -60,11 +61,14 @@ class HoopTask(Course):
     """Goal of the drone, m."""
     heading: Array = state(("waypoints", 2))
     """Unit vector along which each hoop is flown through, x and y. (n_waypoints, 2)"""
+    approached: Array = state(("waypoints",), dtype=bool)
+    """True for hoops whose plane was ahead of the drone since they were the next."""
     missed: Array = state((), dtype=bool)
     """True where the drone has flown past a hoop."""
 
     def add_states(self, sim: Sim, placements: Sequence[StagePlacement] = (), **initial: Any) -> None:
-        super().add_states(sim, placements, heading=np.zeros((self.n_waypoints, 2)), **initial)
+        heading, approached = np.zeros((self.n_waypoints, 2)), np.zeros(self.n_waypoints)
+        super().add_states(sim, placements, heading=heading, approached=approached, **initial)
 
     def set_course(self, data: SimData, hoops: Array, goal: Array, yaw: ArrayLike = 0.0) -> SimData:
         """Return the data with hoops and goals, at the start of an episode.
@@ -97,10 +101,13 @@ class HoopTask(Course):
         x, y, z = jnp.moveaxis(data.states.pos - course.waypoints, -1, 0)
         cos, sin = course.heading[..., 0], course.heading[..., 1]
         offset = jnp.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
-        is_next = np.arange(self.n_waypoints, dtype=np.int32) == jnp.sum(course.passed, dtype=jnp.int32)
-        crossed, is_inside = is_next & (offset[..., 0] > 0), self.is_inside(offset)
+        is_behind, index = offset[..., 0] > 0, np.arange(self.n_waypoints, dtype=np.int32)
+        crossed = (index == jnp.sum(course.passed, dtype=jnp.int32)) & course.approached & is_behind
+        is_inside = self.is_inside(offset)
+        passed = course.passed | (crossed & is_inside)
+        approached = course.approached | ((index == jnp.sum(passed, dtype=jnp.int32)) & ~is_behind)
         missed = course.missed | jnp.any(crossed & ~is_inside)
-        return self.write(data, passed=course.passed | (crossed & is_inside), missed=missed)
+        return self.write(data, approached=approached, passed=passed, missed=missed)
 
     def ways(self, data: SimData) -> Array:
         """Return the vectors from each drone to its hoops and its goal, m; zero for hoops that it has passed.

@@ -79,7 +79,8 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
     Its numbers are drawn independently of each other from the ranges below, each (2,): the first four uniformly in the
     logarithm. The order and the directions of rotation of the rotors, and their largest speed, are the airframe's, at
     which the drawn thrust is reached; the thrust is proportional to the square of the speed. Dynamics, controllers and
-    plugins compute with the drawn numbers; ``sim.data.params`` keeps those of the airframe.
+    plugins compute with the drawn numbers; ``sim.data.params`` keeps those of the airframe, and
+    ``sim.plugins.observations(sim.data)`` has the drawn ones by name, such as ``"airframe.mass"``.
     """
 
     mass: Param = param(default=(0.02, 8.0), core=(2,), positive=True)
@@ -153,4 +154,4 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
         return self.write(data, self.replace(is_applied=True)).replace(params=params)
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        return {"drawn": self.drawn}
+        return {name: self.drawn[..., k : k + 1] for k, name in enumerate(RANGES)}

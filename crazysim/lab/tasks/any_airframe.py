@@ -105,9 +105,9 @@ class AnyAirframe(GoalTask):
         vel = rotation.rotate_inverse(frame, s.vel - record.goal_vel)
         matrix = rotation.matrix(rotation.multiply(rotation.conjugate(frame), s.quat))
         return {
-            "difference": rotation.clip(difference, -MAX_DIFFERENCE, MAX_DIFFERENCE),
-            "rot": matrix.reshape(*matrix.shape[:-2], 9),
-            "vel": rotation.clip(vel, -MAX_VELOCITY, MAX_VELOCITY),
+            "pos_from_goal": rotation.clip(difference, -MAX_DIFFERENCE, MAX_DIFFERENCE),
+            "attitude_from_goal": matrix.reshape(*matrix.shape[:-2], 9),
+            "vel_from_goal": rotation.clip(vel, -MAX_VELOCITY, MAX_VELOCITY),
             "ang_vel": s.ang_vel,
             "last_action": 2 * data.controls.rotor_vel / data.params.rotor_vel_max - 1,  # type: ignore[operator]
         }

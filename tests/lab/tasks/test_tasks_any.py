@@ -36,11 +36,11 @@ def test_observations_are_relative_to_the_goal_its_yaw_and_its_velocity(env, sta
     yaw = np.asarray(record.goal_yaw)[:, 0, 0]
     turn = np.array([[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]] for a in yaw])
     to_frame = lambda x: np.einsum("wji,wj->wi", turn, np.asarray(x)[:, 0])  # noqa: E731
-    np.testing.assert_allclose(obs["difference"], np.clip(to_frame(s.pos - record.goal), -0.5, 0.5), atol=2e-5)
-    np.testing.assert_allclose(obs["vel"], np.clip(to_frame(s.vel - record.goal_vel), -1.0, 1.0), atol=2e-5)
+    np.testing.assert_allclose(obs["pos_from_goal"], np.clip(to_frame(s.pos - record.goal), -0.5, 0.5), atol=2e-5)
+    np.testing.assert_allclose(obs["vel_from_goal"], np.clip(to_frame(s.vel - record.goal_vel), -1.0, 1.0), atol=2e-5)
     assert (np.abs(to_frame(s.vel)) > 1).any(), "some start faster"
     rot = np.einsum("wji,wjk->wik", turn, np.asarray(rotation.matrix(s.quat))[:, 0])
-    np.testing.assert_allclose(obs["rot"].reshape(N, 3, 3), rot, atol=2e-5)
+    np.testing.assert_allclose(obs["attitude_from_goal"].reshape(N, 3, 3), rot, atol=2e-5)
     moving = np.abs(np.asarray(record.goal_vel)).max(axis=(1, 2)) > 0
     assert 0.25 < moving.mean() < 0.75
     assert sum(x.shape[-1] for x in obs.values()) == 22
