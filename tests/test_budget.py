@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 514,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3427,
+    "envs": 3432,
     "geometry": 940,
     "lab": 15944,
     "media": 1080,
