@@ -638,7 +638,7 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys, monkeyp
 
 def test_a_film_shows_the_drone_and_its_goal(uninterrupted_run, tmp_path):
     """The green target is in the image, and the image changes from the first frame to the last."""
-    from crazysim.train.show import TARGET_COLOR, film
+    from crazysim.train.show import film
 
     env = small_config().make_env(2)
     path = tmp_path / "film.gif"
@@ -646,7 +646,6 @@ def test_a_film_shows_the_drone_and_its_goal(uninterrupted_run, tmp_path):
     env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
     images = read_frames(path, 360, 480, "-vf", "scale=480:360").astype(int)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
-    assert TARGET_COLOR[1] > TARGET_COLOR[0]
     assert green.sum() > 20
     assert np.abs(images[-1] - images[0]).max() > 60
 
