@@ -1,4 +1,4 @@
-"""Many steps of an environment in one compiled call."""
+"""Many steps of an environment in one compiled call, which carries the memory of the policy from step to step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Films: images at a constant rate of simulated time, encoded as they are added."""
+"""Films: images at a constant rate of simulated time, encoded as they are added.
+
+The camera is the view's: ``envs/rendering.py`` makes the view of an environment, with the camera of its task.
+"""
 
 from __future__ import annotations
 

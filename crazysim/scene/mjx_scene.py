@@ -1,4 +1,4 @@
-"""MJX's model and data of the scene in every world, allocated when first read."""
+"""MJX's model and data of the scene in every world, allocated when first read, synced if poses have changed."""
 
 from __future__ import annotations
 
