@@ -36,6 +36,8 @@ class Drone(StrEnum):
     crazyflie = "crazyflie"
     bumblebee = "bumblebee"
     bumblebee_lab = "bumblebee_lab"
+    uzh_cpc = "uzh_cpc"
+    uzh_5inch = "uzh_5inch"
 
 
 @dataclass(frozen=True, eq=False)

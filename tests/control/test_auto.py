@@ -45,7 +45,7 @@ def airframes():
 
 def test_every_airframe_flies_as_accurately_as_documented():
     result = benchmark().fly_airframes("auto", airframes(), 2.0, 100)
-    assert len(result) == 11
+    assert len(result) == 13
     for name, row in result.items():
         assert row["hover"] < 2e-3, (name, row)
         assert row["tracking"] < 0.03, (name, row)
@@ -147,13 +147,16 @@ def test_a_setpoint_that_falls_faster_than_gravity_turns_a_drone_over():
 
 
 def test_a_far_setpoint_is_approached_without_losing_height():
-    """For a setpoint 30 m aside, the feedback limits the tilt to what the rotors can carry."""
+    """For a setpoint 30 m aside, the feedback limits the tilt to what the rotors can carry.
+
+    The speed of the approach is inverse to the velocity gain: uzh_cpc, whose rotors have no lag, takes 24 s.
+    """
     sim, _ = hovering_sim("state", 1)
     command = np.zeros((1, len(airframes()), 16), np.float32)
     command[..., :3], command[..., 12] = [30.0, 0.0, HIGH], 1.0
     sim.state_control(command)
     low = np.inf
-    for _ in range(200):
+    for _ in range(280):
         sim.step(50)
         low = min(low, float(sim.data.states.pos[..., 2].min()))
     assert low > HIGH - 0.5

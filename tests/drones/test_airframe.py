@@ -451,7 +451,7 @@ def test_another_body_inherits_no_gains(changes):
 def test_figure_of_merit_at_hover(name):
     """Ideal over actual power of a rotor at hover, ``T^1.5 / sqrt(2 rho A) / (Q w)``, as the files state it.
 
-    It is below 0.2 for the two airframes whose ratio of torque to thrust is that of a preset of AIMotionLab.
+    It is below 0.2 for the airframes whose ratio of torque to thrust is that of a preset of AIMotionLab or of CPC.
     """
     airframe = load_airframe(name)
     params = first_principles.Params.create(airframe)
@@ -465,7 +465,7 @@ def test_figure_of_merit_at_hover(name):
     merit = ideal / (torque * rotor_vel * 2 * np.pi / 60)
     text = (AIRFRAME_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
     assert f"igure of merit {merit:.2f} at hover" in text or f"a figure of merit of {merit:.2f}," in text
-    assert (merit < 0.2) == (name in ("crazyflie", "bumblebee_lab"))
+    assert (merit < 0.2) == (name in ("crazyflie", "bumblebee_lab", "uzh_cpc"))
 
 
 @pytest.mark.parametrize("name", ["cf21B_500", "cf2x_L250", "bumblebee", "hb_x500"])
