@@ -14,7 +14,7 @@ BUDGET = {
     "control": 1393,
     "core": 1577,
     "crazysim": 840,
-    "drones": 514,
+    "drones": 516,
     "dynamics": 367,
     "engine": 6785,
     "envs": 3432,
