@@ -1,8 +1,12 @@
 """Firmware in the loop: stand-ins for firmware speak its protocols and fly a drone with the data that they receive."""
 
 import json
+import os
+import shutil
 import socket
 import struct
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -100,12 +104,6 @@ def assert_at_goal(sim):
     np.testing.assert_allclose(rotation_matrix(states.quat[0, 0]), np.eye(3), atol=0.05)
 
 
-class LockstepBetaflight(Betaflight):
-    """Link that waits for each answer, so that the flight does not depend on the speed of the machine."""
-
-    lockstep = True
-
-
 def test_betaflight_receives_the_state_and_flies():
     ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
     state, rc = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
@@ -131,7 +129,9 @@ def test_betaflight_receives_the_state_and_flies():
     data = sim.data
     sim.step()  # compiles before the stand-in waits
     sim.data = data
-    with state, rc, SoftwareInTheLoop(sim, LockstepBetaflight(ports=ports, origin=origin, rc_freq=5.0)) as loop:
+    link = Betaflight(ports=ports, origin=origin, rc_freq=5.0)
+    link.lockstep = True  # the flight does not depend on the speed of the machine
+    with state, rc, SoftwareInTheLoop(sim, link) as loop:
         thread = StandInThread(serve)
         loop.links[0].channels[:] = np.arange(1000, 1016)
         loop.run(12.0)
@@ -286,6 +286,144 @@ def test_betaflight_in_real_time_and_one_that_does_not_answer(monkeypatch):
     command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._max_rotor_vel[0])[loop._orders[0]]
     assert len(sent) in (124, 125)  # the last answer may come after the end
     assert min(np.abs(command - motors).max() for motors in sent[123:]) < 1e-6
+
+
+STAND_IN = """
+#include <arpa/inet.h>
+#include <pthread.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/select.h>
+#include <time.h>
+#include <unistd.h>
+
+static double state[18];
+static struct { double time; unsigned short channels[16]; } rc;
+static int sockets[2];
+
+static void *receive(void *data)
+{
+    const int i = data == &rc, size = i ? 40 : sizeof(state);
+    char packet[sizeof(state)];
+    for (;;) {
+        fd_set set;
+        FD_ZERO(&set);
+        FD_SET(sockets[i], &set);
+        struct timeval wait = {0, 100000};
+        if (select(sockets[i] + 1, &set, NULL, NULL, &wait) != 1) continue;
+        if (recvfrom(sockets[i], packet, size, 0, NULL, NULL) != size) continue;
+        usleep(rand() % 300); /* the threads take different times in every run */
+        memcpy(data, packet, size);
+    }
+    return NULL;
+}
+
+static double seconds(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec + 1e-9 * now.tv_nsec;
+}
+
+int main(void)
+{
+    const double start = seconds();
+    struct sockaddr_in at = {.sin_family = AF_INET};
+    pthread_t threads[2];
+    srand(getpid());
+    for (int i = 0; i < 2; ++i) {
+        sockets[i] = socket(AF_INET, SOCK_DGRAM, 0);
+        at.sin_port = htons(9003 + i);
+        if (bind(sockets[i], (struct sockaddr *)&at, sizeof(at))) return 1;
+        pthread_create(&threads[i], NULL, receive, i ? (void *)&rc : (void *)state);
+    }
+    at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    at.sin_port = htons(9002);
+    for (unsigned loops = 0;; ++loops) {
+        const struct timespec pause = {0, 50000};
+        const float motors[4] = {(seconds() - start) / 100, state[0] / 100, rc.channels[2] / 1e4, loops / 1e6};
+        sendto(sockets[0], motors, sizeof(motors), 0, (struct sockaddr *)&at, sizeof(at));
+        nanosleep(&pause, NULL);
+    }
+}
+"""
+"""Program with the threads, sockets and clock of Betaflight's simulator target, whose motor commands show them."""
+
+linux_only = pytest.mark.skipif(sys.platform != "linux" or shutil.which("gcc") is None, reason="for Linux, with gcc")
+
+
+class RecordingBetaflight(Betaflight):
+    """Link that keeps the commands, the first of which it receives when the program has started."""
+
+    def receive(self, timeout):
+        command = super().receive(timeout)
+        self.__dict__.setdefault("received", []).append(command)
+        return command
+
+
+def start_betaflight(program, folder, **settings):
+    ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
+    return RecordingBetaflight(ports=ports, program=program, folder=folder, **settings)
+
+
+@linux_only
+def test_betaflight_in_lockstep_depends_on_the_packets_only(tmp_path):
+    (tmp_path / "stand_in.c").write_text(STAND_IN)
+    program = tmp_path / "stand_in"
+    subprocess.run(["gcc", "-pthread", tmp_path / "stand_in.c", "-o", program], check=True)
+
+    def fly():
+        sim = Sim(control="rotor_vel", freq=250)
+        with SoftwareInTheLoop(sim, start_betaflight(program, tmp_path, rc_freq=125.0)) as loop:
+            for k in range(50):
+                loop.links[0].channels[2] = 1000 + k
+                loop.run(1 / 250)
+        return np.array(loop.links[0].received[1:], float)
+
+    first, second = fly(), fly()
+    np.testing.assert_array_equal(first, second)
+    clock, state_time, throttle, loops = (first * [100, 100, 1e4, 1e6]).T
+    times = np.arange(50) / 250
+    # The last command of an exchange is younger than a turn of the loop, about 53 us; numbers are in float32.
+    np.testing.assert_allclose(clock, 2 + times - 30e-6, atol=60e-6)
+    np.testing.assert_allclose(state_time[1:], times[1:], atol=1e-7)  # the first answer is from before
+    np.testing.assert_allclose(throttle[1:], 1000 + np.arange(1, 50) // 2 * 2, atol=1e-3)
+    assert np.all(np.diff(loops) > 70)  # 4 ms in turns of about 53 us
+
+
+@linux_only
+def test_betaflight_that_does_not_start_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("crazysim.lab.live.sitl.betaflight.START_TIMEOUT", 0.2)
+    with pytest.raises(ConfigError, match=r"no file .*missing\. Build it with make TARGET=SITL"):
+        start_betaflight(tmp_path / "missing", tmp_path)
+    with pytest.raises(ConfigError, match=r"to start, got no packet in 0\.2 s\. Read .*betaflight\.log"):
+        start_betaflight(shutil.which("true"), tmp_path)
+
+
+@pytest.mark.skipif("CRAZYSIM_BETAFLIGHT" not in os.environ, reason="needs the path of betaflight_SITL")
+def test_betaflight_itself_arms_flies_and_repeats_its_flight(tmp_path):
+    program = os.environ["CRAZYSIM_BETAFLIGHT"]
+    (tmp_path / "settings.txt").write_text("aux 0 0 0 1700 2100 0 0\naux 1 1 1 1700 2100 0 0\nsave\n")
+    subprocess.run([program, "--config", "settings.txt"], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
+
+    def fly():
+        sim, states = Sim(drone="bumblebee", control="rotor_vel"), []
+        sim.add(IMU())
+        link = start_betaflight(program, tmp_path)
+        with SoftwareInTheLoop(sim, link) as loop:
+            loop.run(4.0)
+            link.channels[[4, 5]] = 1900
+            loop.run(1.0)
+            for channels in ((1500, 1500, 1480), (1600, 1500, 1480), (1500, 1500, 1480)):
+                link.channels[:3] = channels
+                loop.run(1.0)
+                states.append(np.concatenate([np.array(x)[0, 0] for x in (sim.data.states.pos, sim.data.states.quat)]))
+        return np.array(states)
+
+    first, second = fly(), fly()
+    np.testing.assert_array_equal(first, second)
+    assert first[-1, 2] > 5.0
+    assert first[-1, 1] < -0.3  # it rolled to the right, which is south
 
 
 def test_attitudes_in_the_axes_of_aviation():

@@ -37,7 +37,7 @@ class FirmwareLink(Closeable):
     yaw_torque_signs: ClassVar[tuple[int, ...]]
     remedy: ClassVar[str]
     """Remedy for an airframe whose rotors turn in the opposite senses, for an error message."""
-    lockstep: ClassVar[bool]
+    lockstep: bool
     """True if the firmware waits for the simulation, False if it follows another clock."""
 
     @abstractmethod
