@@ -122,7 +122,7 @@ def test_betaflight_receives_the_state_and_flies():
             degrees = 2 * received[0][14:16] - place[:2]  # the bridge mirrors positions at the first one
             east, north = (degrees - [20.0, 10.0]) * 111194.93 * np.array([np.cos(np.radians(10.0)), 1])
             pos = np.array([east, north, place[2] - 100.0])
-            motors = autopilot_commands(Betaflight, pos, vel, rotation_matrix([x, y, z, w]), TO_FRD @ gyro)
+            motors = autopilot_commands(Betaflight, pos, vel, rotation_matrix([x, y, z, w]), gyro * [1, -1, 1])
             state.sendto(np.asarray(motors, "<f4").tobytes(), ("127.0.0.1", ports[0]))
 
     sim = create_disturbed_sim(freq=250)
@@ -407,23 +407,28 @@ def test_betaflight_itself_arms_flies_and_repeats_its_flight(tmp_path):
     subprocess.run([program, "--config", "settings.txt"], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
 
     def fly():
-        sim, states = Sim(drone="bumblebee", control="rotor_vel"), []
+        sim, states = Sim(control="rotor_vel"), []
         sim.add(IMU())
         link = start_betaflight(program, tmp_path)
         with SoftwareInTheLoop(sim, link) as loop:
             loop.run(4.0)
             link.channels[[4, 5]] = 1900
             loop.run(1.0)
-            for channels in ((1500, 1500, 1480), (1600, 1500, 1480), (1500, 1500, 1480)):
-                link.channels[:3] = channels
+            for roll, yaw in ((1500, 1500), (1600, 1500), (1500, 1550), (1500, 1500)):
+                link.channels[[0, 2, 3]] = roll, 1800, yaw
                 loop.run(1.0)
-                states.append(np.concatenate([np.array(x)[0, 0] for x in (sim.data.states.pos, sim.data.states.quat)]))
+                s = sim.data.states
+                states.append(np.concatenate([np.array(x)[0, 0] for x in (s.pos, s.quat, s.ang_vel)]))
         return np.array(states)
 
     first, second = fly(), fly()
     np.testing.assert_array_equal(first, second)
-    assert first[-1, 2] > 5.0
-    assert first[-1, 1] < -0.3  # it rolled to the right, which is south
+    pos, quat, ang_vel = first[:, :3], first[:, 3:7], first[:, 7:]
+    assert pos[-1, 2] > 1.0
+    assert pos[-1, 1] < -0.3  # it rolled to the right, which is south
+    assert ang_vel[2, 2] < -0.1  # it turns to the right
+    assert abs(ang_vel[3, 2]) < 0.1 * abs(ang_vel[2, 2])  # and stops
+    assert rotation_matrix(quat[-1])[2, 2] > 0.99
 
 
 def test_attitudes_in_the_axes_of_aviation():

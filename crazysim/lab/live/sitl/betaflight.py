@@ -126,7 +126,8 @@ class Betaflight(FirmwareLink):
         self._channels = _read_pulses(values).astype(np.float64)
 
     def send(self, measured: Measurements) -> None:
-        gyro, (x, y, z, w) = to_frd(measured.gyro), measured.quat
+        # Its gyroscope turns about x forward, y left and z up; it negates the second rate of the packet.
+        gyro, (x, y, z, w) = measured.gyro * [1, -1, 1], measured.quat
         latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
@@ -135,7 +136,7 @@ class Betaflight(FirmwareLink):
             latitude, longitude = (2 * x - y for x, y in zip(self._start_position, (latitude, longitude), strict=True))
         else:
             quat = COS_45_DEGREES * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
-            gyro = gyro * [1, 1, -1]
+            gyro = gyro * [1, 1, -1]  # without the bridge also the third
         geodetic_position = (longitude, latitude, altitude)
         state = (
             *gyro,
