@@ -314,8 +314,6 @@ FIGURES: dict[str, Figure] = {
     "validation-idsia": Figure("validation.py idsia"),
     "validation-nanobench": Figure("validation.py nanobench"),
     "validation-filter": Figure("validation.py filter"),
-    "validation-raptor": Figure("validation.py raptor"),
-    "validation-l2f": Figure("validation.py l2f"),
     "validation-sim2sim": Figure("validation.py sim2sim"),
 }
 

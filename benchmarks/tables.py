@@ -446,28 +446,6 @@ def predictions(lines: list[Line]) -> str:
     )
 
 
-def latencies(lines: list[Line]) -> str:
-    """Return the longest latency with which RAPTOR holds all drones, and the share with each latency."""
-    return pivot(
-        lines,
-        lambda x: x["quantity"].partition(",")[0],
-        lambda x: x["quantity"].partition(", ")[2].partition(":")[0],
-        lambda x: f"{figure_text(x)} ({x['remark'].rpartition(': ')[2]})",
-        "Drone",
-    )
-
-
-def held_shares(lines: list[Line]) -> str:
-    """Return the shares of the quadrotors that RAPTOR holds here and in l2f."""
-    return pivot(
-        lines,
-        lambda x: x["quantity"].partition(", ")[2].partition(":")[0],
-        lambda x: x["quantity"].partition(", ")[0],
-        lambda x: f"{figure_text(x)} ({x['remark']})",
-        "Latency",
-    )
-
-
 def transfers(lines: list[Line]) -> str:
     """Return the success of policies by simulator."""
     return pivot(
@@ -589,7 +567,7 @@ def devices(lines: list[Line]) -> str:
     return markdown_table(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
 
 
-SECTIONS = ("closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "l2f")
+SECTIONS = ("closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter")
 TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "readme": (("loop", "step", "versus", "gradient-versus", "queries", "envs"), readme),
     "loop": (("loop",), loops),
@@ -608,7 +586,6 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "training": (("training",), training),
     "trainers": (("trainers",), trainers),
     "controllers": (("controllers",), control),
-    "validation-raptor": (("validation-raptor",), latencies),
     "validation": (tuple(f"validation-{name}" for name in (*SECTIONS, "sim2sim")), summary),
     "other-models": (("validation-rotorpy", "validation-commonroad"), unranged),
     "path-errors": (("path-errors",), path_errors),
@@ -616,7 +593,6 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "validation-sim2sim": (("validation-sim2sim",), transfers),
     **{f"validation-{name}": ((f"validation-{name}",), validation) for name in SECTIONS if name != "idsia"},
     "validation-firmware": (("validation-firmware",), firmware),
-    "validation-l2f": (("validation-l2f",), held_shares),
 }
 """Figures of each table, and the function that makes it of their lines.
 

@@ -36,6 +36,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         help="folder with logs in idsia/ and nanobench/; trained policies are kept in its folder policies/",
     )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="sections; by default all")
+    policy_help = "policy to compare with RAPTOR: rl-tools' .tar, or a run of the task any; by default the package's"
+    parser.add_argument("--policy", type=Path, metavar="FILE|FOLDER", help=policy_help)
     parser.add_argument("--out", type=Path, default=Path("validation.md"), metavar="FILE", help="page to write; its "
                         "pictures, of logs alone, go to the folder pictures next to it")  # fmt: skip
 
@@ -45,8 +47,8 @@ def run(options: argparse.Namespace) -> int:
     check_writable(options.out)
     if (pictures := options.out.parent / PICTURES_FOLDER).exists():
         check_writable(pictures / options.out.name)
-    rows = validate(options.data, options.only)
-    selected_sections = [section for section in sections(options.data) if section.name in options.only]
+    rows = validate(options.data, options.only, options.policy)
+    selected_sections = [section for section in sections(options.data, options.policy) if section.name in options.only]
     for section in selected_sections:
         if section.problem:
             print(f"left out {section.name}: {section.problem}")

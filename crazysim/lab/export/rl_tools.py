@@ -18,6 +18,7 @@ import io
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -181,17 +182,25 @@ def evaluate(weights: Mapping[str, np.ndarray], observations: np.ndarray) -> np.
     memory = np.broadcast_to(weights["1/initial_hidden_state"], (observations.shape[1], N_MEMORY))
     outputs = []
     for x in observations:
-        features = np.maximum(x @ weights["0/weights"].T + weights["0/biases"], 0.0)
-        reset_x, update_x, candidate_x = np.split(
-            features @ weights["1/weights_input"].T + weights["1/biases_input"], 3, axis=-1
-        )
-        reset_h, update_h, candidate_h = np.split(
-            memory @ weights["1/weights_hidden"].T + weights["1/biases_hidden"], 3, axis=-1
-        )
-        reset, update = (1.0 / (1.0 + np.exp(-x)) for x in (reset_x + reset_h, update_x + update_h))
-        memory = update * memory + (1.0 - update) * np.tanh(candidate_x + reset * candidate_h)
-        outputs.append(memory @ weights["2/weights"].T + weights["2/biases"])
+        output, memory = evaluate_step(weights, x, memory)
+        outputs.append(output)
     return np.stack(outputs)
+
+
+def evaluate_step(weights: Mapping[str, np.ndarray], observation: Any, memory: Any) -> tuple[Any, Any]:
+    """Return the outputs of one step, (n, 4), without limits, and the memory after it, (n, 16).
+
+    Arrays of NumPy and of JAX.
+    """
+    xp = observation.__array_namespace__()
+    features = xp.maximum(observation @ weights["0/weights"].T + weights["0/biases"], 0.0)
+    inputs = features @ weights["1/weights_input"].T + weights["1/biases_input"]
+    recalled = memory @ weights["1/weights_hidden"].T + weights["1/biases_hidden"]
+    n = 2 * N_MEMORY
+    # sigmoids; an exponential would overflow for drones that tumble
+    reset, update = xp.split(0.5 + 0.5 * xp.tanh(0.5 * (inputs + recalled)[:, :n]), 2, axis=-1)
+    memory = update * memory + (1.0 - update) * xp.tanh(inputs[:, n:] + reset * recalled[:, n:])
+    return memory @ weights["2/weights"].T + weights["2/biases"], memory
 
 
 def _check_weights(weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -12,7 +12,9 @@ from crazysim.lab.validate.sections import NAMES, sections
 __all__ = ["NAMES", "Row", "validate"]
 
 
-def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> list[Row]:
+def validate(
+    data: str | Path | None = None, only: Sequence[str] = NAMES, policy: str | Path | None = None
+) -> list[Row]:
     """Compute the rows that ``crazysim validate`` writes to its page.
 
     Sections whose package is not installed, or whose logs are missing, have no rows. A comparison that raises an error
@@ -22,6 +24,8 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
         data: Folder with logs of real flights in ``idsia`` and ``nanobench``, and for trainings in ``policies``; None
             for none.
         only: Names of sections.
+        policy: Policy of the section ``any``: a checkpoint of rl-tools (.tar) or the folder of a run; None for the one
+            of the package.
     """
     if unknown_names := [name for name in only if name not in NAMES]:
         raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown_names[0]!r}")
@@ -30,4 +34,5 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
         folder is None or folder.is_dir(),
         f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it.",
     )
-    return measure_sections([section for section in sections(folder) if section.name in only])
+    source = None if policy is None else Path(policy)
+    return measure_sections([section for section in sections(folder, source) if section.name in only])

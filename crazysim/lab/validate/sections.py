@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from crazysim.lab.validate import (
+    any_airframe,
     closed_forms,
     commonroad_cars,
     firmware_controllers,
@@ -14,26 +15,26 @@ from crazysim.lab.validate import (
     flights,
     logged_filter,
     peers,
-    raptor,
     rotorpy_flights,
     sim_to_sim,
 )
 from crazysim.lab.validate.rows import Section
 
 NAMES = (
-    "closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "raptor",
-    "l2f", "sim2sim",
+    "closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "any",
+    "sim2sim",
 )  # fmt: skip
 """Names of the sections."""
 RAPTOR = {"foundation_policy": "foundation-policy==1.0.2"}
 """Package of the foundation policy."""
 
 
-def sections(data: Path | None = None) -> Sequence[Section]:
+def sections(data: Path | None = None, policy: Path | None = None) -> Sequence[Section]:
     """Return the sections of the page.
 
     Args:
         data: Folder with logs in ``idsia`` and ``nanobench``; None for no logs.
+        policy: Policy of the section ``any``, see ``any_airframe.checks``.
     """
     idsia, nanobench = ((data or Path()) / name for name in ("idsia", "nanobench"))
 
@@ -123,22 +124,8 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             axes=("", "error over that of the filter on board"),
         ),
         Section(
-            "raptor", "The foundation policy RAPTOR",
-            "`foundation-policy`, unchanged, commands rotors. It is called every 10 ms, as in its training, or "
-            "every 2 ms, with a recurrent state that advances every 10 ms; the authors' firmware calls it every 0.5 to "
-            "2.5 ms. A drone is held if it stays within 0.3 m of its goal from 9 to 10 s. Method of Runge-Kutta of "
-            "order 4, steps of 2 ms. The latency is added to the lag of the motors. The policy was trained without "
-            "latency, on thrusts of 1.5 to 5 weights and time constants of rising rotor speeds of 30 to 100 ms. Only "
-            "`cf21B_500` is within these ranges: `cf2x_L250` has 1.49 weights and 136 ms, `crazyflie` 20 ms, "
-            "`bumblebee` 10.1 weights.",
-            (raptor.compare_airframes,), packages=RAPTOR,
-        ),
-        Section(
-            "l2f", "l2f, the simulator of RAPTOR's training",
-            "RAPTOR flies the same 256 quadrotors, drawn from the ranges of its training, in crazysim and in `l2f`, "
-            "with methods of Runge-Kutta of order 4 and steps of 2 ms in both. The figure is the difference of "
-            "the shares that it holds; latency costs as many quadrotors in the one as in the other.",
-            (raptor.compare_training_airframes,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
+            "any", "Policies for any airframe", any_airframe.SECTION_TEXT, any_airframe.checks(policy), packages=RAPTOR,
+            peers=any_airframe.PEERS,
         ),
         Section(
             "sim2sim", "Sim to sim", sim_to_sim.SECTION_TEXT, sim_to_sim.checks(data),
