@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3432,
     "geometry": 940,
-    "lab": 15983,
+    "lab": 16189,
     "media": 1080,
     "plugins": 4875,
     "scene": 2569,
