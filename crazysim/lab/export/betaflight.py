@@ -79,7 +79,8 @@ BETAFLIGHT_SOURCE = """/* Policy in place of Betaflight's PID controller and mix
  *
  * now: micros(). pos, vel, goal: m, m/s, in the axes of Betaflight's attitude, x north, y west, z up.
  * quat: of the attitude, w x y z. gyro: gyro.gyroADCf, deg/s. low, high: output of motors at rest and at full speed,
- * mixerRuntime.motorOutputLow and motorOutputHigh. motor: rear right, front right, rear left, front left.
+ * mixerRuntime.motorOutputLow, which is at rest with "set motor_idle = 0", and motorOutputHigh. motor: rear right,
+ * front right, rear left, front left.
  */
 #ifndef CRAZYSIM_BETAFLIGHT_H
 #define CRAZYSIM_BETAFLIGHT_H
