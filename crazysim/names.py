@@ -62,6 +62,8 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.envs.pettingzoo": "make_parallel",
         "crazysim.envs.rsl_rl": "RslRlEnv",
         "crazysim.envs.sb3": "DroneVecEnv",
+        "crazysim.envs.track_files": "load_track track_names",
+        "crazysim.envs.tracks": "Track gates_of_track",
     },
     "crazysim.plugins.bodies": {"crazysim.lab.bodies.free_bodies": "FreeBodies FreeBodiesData"},
     "crazysim.plugins.effects": {
@@ -138,6 +140,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.planning.approaches": "Approach",
         "crazysim.lab.planning.limits": "Limits Report Violation check",
         "crazysim.lab.planning.waypoints": "minimum_jerk minimum_snap smoothest",
+        "crazysim.lab.racing.time_optimal": "Plan fly_open_loop plan_race",
         "crazysim.lab.trajectory_files.csv": "load_csv save_csv save_samples",
         "crazysim.lab.trajectory_files.polynomials": "pack_compressed",
     },

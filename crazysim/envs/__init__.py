@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from crazysim.envs.pettingzoo import make_parallel as make_parallel
     from crazysim.envs.rsl_rl import RslRlEnv as RslRlEnv
     from crazysim.envs.sb3 import DroneVecEnv as DroneVecEnv
+    from crazysim.envs.track_files import load_track, track_names
+    from crazysim.envs.tracks import Track, gates_of_track
 
 # Without names that need optional packages, with which ``from crazysim.envs import *`` would fail.
 __all__ = [
@@ -66,17 +68,21 @@ __all__ = [
     "RandomizeWith",
     "RewardTerms",
     "Task",
+    "Track",
     "VisitTask",
     "Wrapper",
     "actions_of",
     "draw",
     "flatten",
     "flying",
+    "gates_of_track",
+    "load_track",
     "make",
     "register",
     "rollout",
     "state_of",
     "terms",
+    "track_names",
     "uniform",
 ]
 

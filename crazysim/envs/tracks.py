@@ -25,6 +25,9 @@ START_SPACING = 0.4
 START_HEIGHT = 0.4
 """Height of the starts of a random course, m."""
 
+OPENING = 0.45
+"""Width and height of a gate's opening, m, unless a track has others."""
+
 Points = Sequence[Sequence[float]]
 """Points or angles, (n, 3)."""
 
@@ -47,13 +50,25 @@ class Track:
     """Lower limits of the arena, m. (3,)"""
     high: Sequence[float] = (2.5, 1.5, 2.0)
     """Upper limits of the arena, m. (3,)"""
+    openings: Sequence[Points | float] | None = None
+    """Opening of each gate: corners of a convex polygon, left and up of the gate's middle, m (n, 2), or the radius of a
+    ball around a waypoint, which drones pass in any direction, m. None for squares of 0.45 m."""
+    frames: Sequence[Points | float] | None = None
+    """Inner edges of the gates' frames, as ``openings``; None for those of the openings. Drones may have to keep a
+    distance from the frame, so that the opening is smaller."""
+    lengths: Sequence[float] | None = None
+    """Length of each gate along its x axis, m: drones fly through the whole prism. None for gates without length."""
+    finish: Sequence[float] | None = None
+    """Position behind the last gate at which plans end at rest, m; None if they end at the last gate. (3,)"""
 
     @property
     def n_gates(self) -> int:
+        """Number of gates."""
         return len(self.gates_pos)
 
     @property
     def n_obstacles(self) -> int:
+        """Number of poles."""
         return len(self.obstacles_pos)
 
     @property
@@ -62,6 +77,66 @@ class Track:
         free_size = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(CELL_MARGIN)
         n_x, n_y = np.floor(free_size / CELL_SIZE + 1e-6).astype(int)
         return int(n_x), int(n_y)
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One gate of a track."""
+
+    pos: np.ndarray
+    """Middle of the opening, m. (3,)"""
+    rot: np.ndarray
+    """Rotation matrix, gate to world; drones fly along the x axis. (3, 3)"""
+    opening: np.ndarray | float
+    """Corners, left and up of the middle, m (n, 2), or radius of a ball, m."""
+    frame: np.ndarray | float
+    """Inner edge of the frame, as ``opening``."""
+    length: float
+    """Length along the x axis, m."""
+
+    @property
+    def is_ball(self) -> bool:
+        return np.ndim(self.opening) == 0
+
+    @property
+    def size(self) -> np.ndarray:
+        """Width and height of the opening, m. (2,)"""
+        return np.full(2, 2.0 * self.opening) if self.is_ball else np.ptp(self.opening, axis=0)
+
+    @property
+    def half_planes(self) -> np.ndarray:
+        """Half-planes whose intersection is the polygon: outward unit normal, left and up, and distance of the edge
+        from the middle, m. (n, 3)
+        """
+        corners = np.asarray(self.opening)
+        edges = np.roll(corners, -1, axis=0) - corners
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=-1) / np.linalg.norm(edges, axis=-1, keepdims=True)
+        distances = np.sum(normals * corners, axis=-1)
+        inside = np.sum(normals * corners.mean(axis=0), axis=-1)
+        return np.where(distances > inside, 1, -1)[:, None] * np.column_stack([normals, distances])
+
+
+def gates_of_track(track: Track) -> list[Gate]:
+    """Return the gates of a track, in the order of the race."""
+    n, half = track.n_gates, OPENING / 2
+    square = np.array([[half, half], [half, -half], [-half, -half], [-half, half]])
+    openings = [square] * n if track.openings is None else [np.asarray(x, float) for x in track.openings]
+    frames = openings if track.frames is None else [np.asarray(x, float) for x in track.frames]
+    lengths = np.zeros(n) if track.lengths is None else np.asarray(track.lengths, float)
+    quat = rotation_matrices(np.asarray(track.gates_rpy, float))
+    rows = zip(np.asarray(track.gates_pos, float), quat, openings, frames, lengths.tolist(), strict=True)
+    return [Gate(*row) for row in rows]
+
+
+def rotation_matrices(rpy: np.ndarray) -> np.ndarray:
+    """Return the matrices of roll, pitch and yaw, rad, in float64. (n, 3, 3)"""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy).T, np.cos(rpy).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> Track:

@@ -16,9 +16,8 @@ from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.task import TASK_RECORD_NAME
 from crazysim.envs.tasks.goals import pick_entry
+from crazysim.envs.tracks import OPENING
 
-OPENING = 0.45
-"""Width and height of a gate's opening, m."""
 POLE_HEIGHT = 1.7
 """Length of an obstacle, m; if its upper end is lower than this length, its lower part is below the floor."""
 BYPASS_DISTANCE = 0.45

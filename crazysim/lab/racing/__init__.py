@@ -1,0 +1,1 @@
+"""Racing: time-optimal plans, the race clock, and flights over a track."""

@@ -1,0 +1,72 @@
+"""Race tracks from YAML files."""
+
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.envs import gates_of_track, load_track, track_names
+
+FILE = """
+initState: { pos: [0, 0, 1], vel: [0, 0, 0] }
+endState: { pos: [9, 0, 1] }
+orders: ['B', 'A', 'B']
+A: { type: 'SingleBall', position: [4, 1, 2], radius: 0.5, margin: 0.2 }
+B: { type: 'RectanglePrisma', position: [3, 0, 2], rpy: [0, -90, 90], width: 2, height: 1, marginW: 0.4, marginH: 0.2 }
+"""
+
+
+def test_a_track_has_its_gates_in_their_order_with_directions_and_margins(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(FILE, encoding="utf-8")
+    track = load_track(path)
+    gates = gates_of_track(track)
+    np.testing.assert_array_equal([gate.pos for gate in gates], [(3, 0, 2), (4, 1, 2), (3, 0, 2)])
+    # TOGT's z axis points backwards: at -90 degrees of pitch and 90 of yaw a drone flies along y, and up is z.
+    np.testing.assert_allclose(gates[0].rot, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(gates[0].size, (1.6, 0.8))
+    np.testing.assert_allclose(np.ptp(gates[0].frame, axis=0), (2.0, 1.0))
+    assert gates[1].is_ball
+    assert float(gates[1].opening) == 0.4
+    assert (track.start, track.finish) == ((0, 0, 1), (9, 0, 1))
+    assert track.low[2] == 0
+
+
+def test_built_in_tracks_are_those_of_their_sources():
+    """Three laps of seven points on UZH's Split-S track, without the last two."""
+    assert track_names() == ("split_s_gates", "split_s_shapes", "split_s_waypoints")
+    tracks = {name: load_track(name) for name in track_names()}
+    assert [track.n_gates for track in tracks.values()] == [19, 7, 19]
+    for track in tracks.values():
+        assert track.start == (-5.0, 4.5, 1.2)
+        assert track.finish == (4.75, -0.9, 1.2)
+    corners = {len(np.atleast_1d(gate.opening)) for gate in gates_of_track(tracks["split_s_shapes"])}
+    assert corners == {1, 3, 4, 5, 6}
+
+
+def test_half_planes_bound_a_triangle_in_either_order_of_its_corners():
+    gate = gates_of_track(load_track("split_s_shapes"))[0]
+    for corners in (gate.opening, gate.opening[::-1]):
+        planes = type(gate)(gate.pos, gate.rot, corners, corners, 0.0).half_planes
+        inside = lambda point, planes=planes: bool(np.all(planes[:, :2] @ point < planes[:, 2]))  # noqa: E731
+        assert [inside(np.array(p)) for p in ((0, 0), (0.55, 0), (0.65, 0), (1.1, -1.15), (0, -1.3), (0, 1.1))] == [
+            True, True, False, True, False, True,
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("orders", "order", "gates in 'orders'"),
+        ("RectanglePrisma", "Ring", "types SingleBall, RectanglePrisma"),
+        ("radius", "size", "TOGT-Planner"),
+        ("'A', ", "'C', ", "'C'"),
+        ("pos: [0, 0, 1]", "pos: [0, [", "YAML"),
+    ],
+)
+def test_law_09_a_wrong_track_file_is_named(tmp_path, old, new, words):
+    path = tmp_path / "mine.yaml"
+    path.write_text(FILE.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        load_track(path)
+    with pytest.raises(ConfigError, match=r"one of split_s_gates.*got 'nowhere'"):
+        load_track("nowhere")
