@@ -131,6 +131,7 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim.train.export": {
         "crazysim.lab.export.betaflight": "to_betaflight",
         "crazysim.lab.export.cost": "cost_text",
+        "crazysim.lab.export.mc_nn_control": "observe_inputs to_mc_nn_control",
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
         "crazysim.lab.export.rl_tools": "read_rl_tools to_rl_tools weights_to_c",

@@ -18,6 +18,9 @@ from crazysim.commands.options import DefaultsFormatter, load_policy_and_env, nu
 from crazysim.errors import ConfigError, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
+DISTILLATION_WORLDS = 256
+"""Number of worlds in which a policy is distilled for ``--tflite``."""
+
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
     text = "train a policy; write checkpoint, learning curve, policy and film"
@@ -83,6 +86,10 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "--betaflight", type=Path, metavar="FOLDER", help="existing folder for a header to call from Betaflight's mixer"
     )
     add("--rl-tools", type=Path, metavar="FILE", help="policy.tar of PX4's mc_raptor to write, from a checkpoint")
+    tflite_help = (
+        "control_net.tflite of PX4's mc_nn_control to write, distilled from a policy that commands rotor speeds"
+    )
+    add("--tflite", type=Path, metavar="FILE", help=tflite_help)
     add("--drone", metavar="NAME|FILE", help="airframe that flies a checkpoint; by default cf21B_500")
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
@@ -251,21 +258,26 @@ def evaluate(options: argparse.Namespace) -> None:
 def export(options: argparse.Namespace) -> None:
     from crazysim.drones import load_airframe
     from crazysim.train import export as exports
+    from crazysim.train.evaluation import describe_flight, evaluate
     from crazysim.train.training import load_policy
 
-    files = {".onnx": options.onnx, ".h": options.c, ".tar": options.rl_tools}
+    files = {".onnx": options.onnx, ".h": options.c, ".tar": options.rl_tools, ".tflite": options.tflite}
     folders = ((options.out_of_tree, exports.to_out_of_tree), (options.betaflight, exports.to_betaflight))
     require(
         any(path is not None for path in (*files.values(), options.out_of_tree, options.betaflight)),
-        "expected a file to write, got none; use --onnx FILE, --c FILE, --out-of-tree FOLDER, --betaflight FOLDER, or "
-        "--rl-tools FILE",
+        "expected a file to write, got none; use --onnx FILE, --c FILE, --out-of-tree FOLDER, --betaflight FOLDER, "
+        "--tflite FILE, or --rl-tools FILE",
         ValueError,
     )
     for suffix, path in files.items():
         if path is not None:
             check_writable(path, (suffix,))
     if options.folder.suffix == ".tar":
-        require(options.onnx is None, "expected a run for --onnx, got a checkpoint of rl-tools; use --c", ValueError)
+        require(
+            options.onnx is options.tflite is None,
+            "expected a run for --onnx and --tflite, got a checkpoint of rl-tools; use --c",
+            ValueError,
+        )
         policy, config, meta = exports.read_rl_tools(options.folder), None, None
         write_c = partial(exports.weights_to_c, policy)
         written = [exports.to_rl_tools(policy, options.rl_tools, options.folder.stem)] if options.rl_tools else []
@@ -279,6 +291,14 @@ def export(options: argparse.Namespace) -> None:
         policy, config, meta = load_policy(options.folder)
         write_c = partial(exports.to_c, policy, meta=meta)
         written = [exports.to_onnx(policy, options.onnx, meta)] if options.onnx else []
+        if options.tflite is not None:
+            env = config.make_env(DISTILLATION_WORLDS)
+            print("distilling the policy to the inputs of mc_nn_control: 10 to 60 s on two cores", flush=True)
+            student, parameters = exports.to_mc_nn_control(policy, env, options.tflite)
+            metrics = evaluate(exports.observe_inputs(env), student)
+            print(f"student: {describe_flight(metrics, env.task.unit)}")
+            print("parameters of PX4: " + ", ".join(f"{name} {x:g}" for name, x in parameters.items()))
+            written.append(options.tflite)
     if options.c is not None:
         written.append(write_c(options.c))
     for folder, write in folders:
@@ -288,7 +308,7 @@ def export(options: argparse.Namespace) -> None:
             written += write(policy, folder, meta, airframe, *(() if env is None else (env.base.freq,)))
     for path in written:
         print(f"wrote {path}")
-    if options.onnx is None or len(written) > 1:
+    if len(written) > sum(path is not None for path in (options.onnx, options.tflite)):
         print(exports.cost_text(policy, meta))
 
 

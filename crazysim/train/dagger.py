@@ -159,7 +159,13 @@ def wrap_with_teacher(env: Env, config: Config) -> TeacherObservation:
     return TeacherObservation(env, task.observe)
 
 
-def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Obs], Array] | None = None) -> Learner:
+def init(
+    env: Env,
+    configs: Sequence[Config],
+    keys: Array,
+    teacher: Callable[[Obs], Array] | None = None,
+    network: Network | None = None,
+) -> Learner:
     """Return an untrained learner.
 
     Args:
@@ -168,8 +174,9 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
         teacher: Policy of the teacher; None to load it from the folder ``teacher`` of the hyperparameters.
+        network: Custom network of the student; None for the built-in one.
     """
-    config = configs[0]
+    config, hidden = configs[0], configs[0].hidden if network is None else ()
     check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
     k_student, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
@@ -178,10 +185,10 @@ def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Ob
     _check_teacher(teacher, env, teacher_obs, config.teacher)
 
     images = images_of(env, obs) if config.convolution else ()
-    network = choose_network(0, None, config.convolution, images)
+    network = choose_network(0, network, config.convolution, images)
 
     def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
-        student: Any = init_weights(network, k_student, obs.shape[-1], (*config.hidden, env.actions.size), 0.01)
+        student: Any = init_weights(network, k_student, obs.shape[-1], (*hidden, env.actions.size), 0.01)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(student)
         stats = RunningStats.create(obs.shape[-1], network.pixels).update(obs)
         return Agent(student, optimizer, stats, key, network)
@@ -251,6 +258,7 @@ def imitate(
     seed: int = 0,
     observe: Callable[[SimData], Obs] | None = None,
     on_iteration: Callable[[int, dict[str, float]], None] | None = None,
+    network: Network | None = None,
 ) -> Policy:
     """Train a student in an environment, with its wrappers and sensors, and return its policy.
 
@@ -265,6 +273,7 @@ def imitate(
         observe: Function from the true data of one world to the teacher's observations, or from the data of all
             worlds if the task is batched; None for the observations of the task.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
+        network: Custom network of the student, without memory; None for the built-in one.
 
     Raises:
         DivergedError: If weights or losses become non-finite, or the teacher's actions are NaN.
@@ -280,7 +289,9 @@ def imitate(
     require_callable("on_iteration", on_iteration)
     interface = Interface.read(describe_env(env))
     env = AutoReset(TeacherObservation(env, env.task.observe if observe is None else observe))
-    learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher))(jax.random.key(seed)[None])
+    learner = jax.jit(functools.partial(init, env, (hyperparameters,), teacher=teacher, network=network))(
+        jax.random.key(seed)[None]
+    )
     metrics: dict[str, Array] = {}
     taught: Any = True
     for i in range(hyperparameters.iterations):

@@ -1,11 +1,4 @@
-"""Dense networks as TensorFlow Lite files, such as PX4's ``mc_nn_control`` compiles in.
-
-Inputs of ``mc_nn_control``: goal minus position, m; the first two rows of the rotation matrix from body to world;
-velocity, m/s; angular velocity, body frame, rad/s; 15 numbers. The axes of the world are x east, y north, z up, those
-of the body x forward, y left, z up. Outputs: ``thrust - 1`` of motors 1 to 4 of PX4's quadrotor x (front right, back
-left, front left, back right), in the unit of its parameter ``MC_NN_THRST_COEF``, limited to [-1, 1]. Its interpreter
-knows dense layers and ReLU (PX4-Autopilot, ``src/modules/mc_nn_control`` at commit 01486656).
-"""
+"""Dense networks as TensorFlow Lite files, which the interpreter of microcontrollers reads (``tflite-micro``)."""
 
 from __future__ import annotations
 

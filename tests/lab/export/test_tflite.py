@@ -2,11 +2,13 @@
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError
-from crazysim.lab.export.tflite import to_tflite
+from crazysim import ConfigError, Sim, rotation
+from crazysim.envs import make
+from crazysim.train.export import to_mc_nn_control, to_tflite
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +53,53 @@ def test_layers_that_do_not_fit_and_nan_are_refused(tmp_path, layers):
         to_tflite([layers[0], layers[2]], tmp_path / "net.tflite")
     with pytest.raises(ConfigError, match="train again"):
         to_tflite([(np.full((15, 4), np.nan), np.zeros(4))], tmp_path / "net.tflite")
+
+
+def hold_goal(env):
+    """Return a controller of rotor speeds, which turns the heading to zero."""
+    x, y, _ = np.sign(env.sim.airframe.value("rotors.position")).T
+    yaw = env.sim.airframe.value("rotors.yaw_torque_sign")
+
+    def act(obs):
+        rot, ang_vel = obs["rot"].reshape(*obs["rot"].shape[:-1], 3, 3), obs["ang_vel"]
+        acc = jnp.clip(2 * obs["difference_to_goal"], -2, 2) - 2 * obs["vel"]
+        ahead, left, _ = jnp.moveaxis(jnp.einsum("...ij,...i->...j", rot, acc), -1, 0)
+        roll = -0.8 * (0.1 * left + rot[..., 2, 1]) - 0.08 * ang_vel[..., 0]
+        pitch = 0.8 * (0.1 * ahead + rot[..., 2, 0]) - 0.08 * ang_vel[..., 1]
+        turn = -0.3 * jnp.arctan2(rot[..., 1, 0], rot[..., 0, 0]) - 0.15 * ang_vel[..., 2]
+        up, roll, pitch, turn = (v[..., None] for v in (0.15 * acc[..., 2], roll, pitch, turn))
+        return jnp.clip(up + y * roll - x * pitch + yaw * turn, -1, 1)
+
+    return act
+
+
+@pytest.mark.long("trains a student")
+def test_a_distilled_policy_flies_from_its_file_with_the_inputs_and_outputs_of_mc_nn_control(tmp_path):
+    runtime = pytest.importorskip("tflite_micro.python.tflite_micro.runtime")
+    env, path = make("hover", 64, control="rotor_vel", freq=100), tmp_path / "control_net.tflite"
+    _, parameters = to_mc_nn_control(hold_goal(env), env, path, iterations=100)
+    interpreter, sim = runtime.Interpreter.from_file(str(path), arena_size=10 * 1024), Sim(control="rotor_vel")
+    quadrants = [tuple(x > 0) for x in sim.airframe.value("rotors.position")[:, :2]]
+    order = [quadrants.index(x) for x in ((True, False), (False, True), (True, True), (False, False))]
+    goal, rotor_vel = np.array([0.5, -0.8, 1.3]), np.zeros((1, 1, 4))
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.float32([0, 0, 1])))
+    for _ in range(600):
+        pos, quat, vel, ang_vel = (np.array(x)[0, 0] for x in (states.pos, states.quat, states.vel, states.ang_vel))
+        inputs = np.concatenate([goal - pos, np.asarray(rotation.matrix(quat))[:2].ravel(), vel, ang_vel])
+        interpreter.set_input(inputs[None].astype(np.float32), 0)
+        interpreter.invoke()
+        thrust = np.clip(interpreter.get_output(0)[0], -1, 1) + 1
+        rotor_vel[..., order] = 60 * np.sqrt(thrust / (parameters["MC_NN_THRST_COEF"] / 1e5))
+        sim.rotor_vel_control(rotor_vel)
+        sim.step(sim.freq // 100)
+        states = sim.data.states
+    np.testing.assert_allclose(states.pos[0, 0], goal, atol=0.1)  # a student has no integral
+    assert np.max(rotor_vel) <= parameters["MC_NN_MAX_RPM"] * (1 + 1e-4)
+
+
+def test_policies_that_command_no_rotors_are_not_distilled(tmp_path):
+    with pytest.raises(ConfigError, match="got one of level attitude"):
+        to_mc_nn_control(lambda obs: obs["pos"], make("hover", 4), tmp_path / "net.tflite")
+    with pytest.raises(ConfigError, match="got no difference_to_goal"):
+        to_mc_nn_control(lambda obs: obs["pos"], make("reach_vel", 4, control="rotor_vel"), tmp_path / "net.tflite")
