@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 860,
+    "commands": 871,
     "control": 1393,
     "core": 1577,
     "crazysim": 840,
@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3525,
     "geometry": 940,
-    "lab": 16442,
+    "lab": 16496,
     "media": 1080,
     "plugins": 4875,
     "scene": 2569,
