@@ -116,6 +116,8 @@ CHECKS = {
 
 SETTINGS = {"student": {"iterations": 40}, "one_file_ppo": {"iterations": 40, "starts": 200}}
 """Arguments of ``main`` for quicker tests."""
+CONSTANTS = {"one_file_ppo": {"WORLDS": 512}}
+"""Numbers of a module for quicker tests."""
 LONG_REASONS = {
     "one_file_ppo": "trains a policy",
     "student": "trains two policies",
@@ -154,6 +156,7 @@ def test_example_runs(path, capsys):
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    vars(module).update(CONSTANTS.get(path.stem, {}))
     result = module.main(**SETTINGS.get(path.stem, {}))
     if path.stem in CHECKS:
         CHECKS[path.stem](result)
