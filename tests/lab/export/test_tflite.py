@@ -5,8 +5,10 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from policies import save_steering
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.__main__ import main
 from crazysim.envs import make
 from crazysim.train.export import to_mc_nn_control, to_tflite
 
@@ -103,3 +105,18 @@ def test_policies_that_command_no_rotors_are_not_distilled(tmp_path):
         to_mc_nn_control(lambda obs: obs["pos"], make("hover", 4), tmp_path / "net.tflite")
     with pytest.raises(ConfigError, match="got no difference_to_goal"):
         to_mc_nn_control(lambda obs: obs["pos"], make("reach_vel", 4, control="rotor_vel"), tmp_path / "net.tflite")
+
+
+@pytest.mark.long("distils and evaluates a policy")
+def test_the_command_distils_a_run_and_prints_the_parameters_of_the_file(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("crazysim.commands.training.DISTILLATION_WORLDS", 4)
+    folder, path = save_steering(tmp_path, control="rotor_vel"), tmp_path / "control_net.tflite"
+    assert main(["export", str(folder), "--tflite", str(path)]) == 0
+    *_, student, parameters, written = capsys.readouterr().out.splitlines()
+    assert student.startswith("student: success ")
+    # The largest speed of cf21B_500 is 21,661 rpm, at which the coefficient 2e5 (60 / 21,661)^2 is a thrust of 2.
+    assert parameters.endswith("MC_NN_THRST_COEF 1.5346, MC_NN_MAX_RPM 21661, MC_NN_MIN_RPM 0, THR_MDL_FAC 0.8")
+    assert written == f"wrote {path}"
+    assert path.read_bytes()[4:8] == b"TFL3"
+    assert main(["export", "policy.tar", "--tflite", str(path)]) == 2
+    assert "expected a run for --onnx and --tflite" in " ".join(capsys.readouterr().err.split())
