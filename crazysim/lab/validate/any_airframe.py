@@ -238,7 +238,8 @@ def fly(network: Network, drones: Drones, goal: Any, delay: NDArray, period: int
         sum_of_distances += distance
         if call >= n_calls * (1 - 1 / FLIGHT_SECONDS):
             last_distance = np.maximum(last_distance, distance)
-        action = policy.action(state)
+        # Speeds that decay to zero would become subnormal numbers, which take processors a hundred times longer.
+        action = np.maximum(policy.action(state), -0.9999)
         for _ in range(period):
             commands = np.concatenate([action[None], commands[:-1]])
             drones.step(commands[delay, np.arange(n)])

@@ -71,7 +71,8 @@ class Quadrotors(NamedTuple):
     @property
     def hover_action(self) -> NDArray:
         """Action, from -1 to 1, of rotors that carry the weight. (n, 4)"""
-        return np.repeat((2 * np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
+        speed = np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust))  # over the largest
+        return np.repeat((2 * speed - 1)[..., None], 4, axis=-1)
 
     @property
     def rotors(self) -> NDArray:
@@ -158,60 +159,50 @@ class Crazysim(Drones):
 
 
 class L2f(Drones):
-    """The simulator of RAPTOR's training, with the Runge-Kutta method of order 4 and without drag."""
+    """The simulator of RAPTOR's training, with the Runge-Kutta method of order 4 and without drag.
+
+    The number of drones is a power of 2.
+    """
 
     module = "l2f"
 
     def __init__(self, fleet: Quadrotors, start: States) -> None:
-        self._l2f: Any = importlib.import_module("l2f")
+        l2f: Any = importlib.import_module("l2f")
+        self._batch: Any = l2f.vector_selector[len(fleet.mass)]
+        batch = self._batch
         self.hover_action = fleet.hover_action
-        size = max(k for k in self._l2f.vector_selector if len(fleet.mass) % k == 0)
-        self._batches = []
-        for k in range(0, len(fleet.mass), size):
-            part = slice(k, k + size)
-            self._batches.append(self._create_batch(size, Quadrotors(*(x[part] for x in fleet)), start, part))
-
-    def _create_batch(self, size: int, q: Quadrotors, start: States, part: slice) -> tuple[Any, ...]:
-        l2f, batch = self._l2f, self._l2f.vector_selector[size]
-        device, rng, world = l2f.Device(), batch.VectorRng(), batch.VectorEnvironment()
-        parameters, state, next_state = batch.VectorParameters(), batch.VectorState(), batch.VectorState()
-        batch.initialize_rng(device, rng, 0)
+        device, self._rng, world = l2f.Device(), batch.VectorRng(), batch.VectorEnvironment()
+        parameters, self._state, self._next_state = batch.VectorParameters(), batch.VectorState(), batch.VectorState()
+        batch.initialize_rng(device, self._rng, 0)
         batch.initialize_environment(device, world)
         batch.initial_parameters(device, world, parameters)
-        batch.initial_state(device, world, parameters, state)
-        for i in range(size):
+        batch.initial_state(device, world, parameters, self._state)
+        for i, drone in enumerate(self._state.states):
+            q = Quadrotors(*(x[i] for x in fleet))
             file = json.loads(l2f.parameters_to_json(device, world.environments[i], parameters.parameters[i]))
             file["integration"]["dt"] = STEP_MS / 1000
-            signs = np.sign(file["dynamics"]["rotor_positions"])
             numbers = {
-                "mass": q.mass[i], "rotor_positions": q.arm[i] * signs, "J": np.diag(q.inertia[i]),
-                "J_inv": np.diag(1 / q.inertia[i]), "rotor_thrust_coefficients": np.tile([0, 0, q.thrust[i]], (4, 1)),
-                "rotor_torque_constants": np.full(4, q.torque[i]),
-                "rotor_time_constants_rising": np.full(4, q.lag[i, 0]),
-                "rotor_time_constants_falling": np.full(4, q.lag[i, 1]),
+                "mass": q.mass, "rotor_positions": q.arm * np.sign(file["dynamics"]["rotor_positions"]),
+                "J": np.diag(q.inertia), "J_inv": np.diag(1 / q.inertia),
+                "rotor_thrust_coefficients": [[0, 0, float(q.thrust)]] * 4,
+                "rotor_torque_constants": np.full(4, q.torque), "rotor_time_constants_rising": np.full(4, q.lag[0]),
+                "rotor_time_constants_falling": np.full(4, q.lag[1]),
             }  # fmt: skip
             file["dynamics"] |= {name: np.asarray(value).tolist() for name, value in numbers.items()}
             l2f.parameters_from_json(device, world.environments[i], json.dumps(file), parameters.parameters[i])
-            pos, quat, vel, ang_vel = (start[name][part][i] for name in ("pos", "quat", "vel", "ang_vel"))
-            drone = state.states[i]
-            drone.position, drone.orientation = pos.tolist(), np.roll(quat, 1).tolist()
-            drone.linear_velocity, drone.angular_velocity = vel.tolist(), ang_vel.tolist()
-            drone.rpm = ((q.hover_action[i] + 1) / 2).tolist()
-        observed = np.zeros((size, world.OBSERVATION_DIM), np.float32)
-        return batch, device, world, parameters, state, next_state, rng, observed
+            drone.position, drone.orientation = start["pos"][i].tolist(), np.roll(start["quat"][i], 1).tolist()
+            drone.linear_velocity, drone.angular_velocity = start["vel"][i].tolist(), start["ang_vel"][i].tolist()
+            drone.rpm = ((q.hover_action + 1) / 2).tolist()
+        self._world = device, world, parameters
+        self._observed = np.zeros((len(fleet.mass), world.OBSERVATION_DIM), np.float32)
 
     def observe(self) -> NDArray:
-        for batch, device, world, parameters, state, _, rng, observed in self._batches:
-            batch.observe(device, world, parameters, state, observed, rng)
-        return np.concatenate([observed[:, :18] for *_, observed in self._batches]).astype(np.float64)
+        self._batch.observe(*self._world, self._state, self._observed, self._rng)
+        return self._observed[:, :18].astype(np.float64)
 
     def step(self, action: NDArray) -> None:
-        parts = np.split(action.astype(np.float32), len(self._batches))
-        for part, (batch, device, world, parameters, state, next_state, rng, _) in zip(
-            parts, self._batches, strict=True
-        ):
-            batch.step(device, world, parameters, state, part, next_state, rng)
-            state.assign(next_state)
+        self._batch.step(*self._world, self._state, action.astype(np.float32), self._next_state, self._rng)
+        self._state.assign(self._next_state)
 
 
 class Mujoco(Drones):

@@ -1,13 +1,22 @@
 """Policies for any airframe: what they observe, when their memory advances, and what counts as held."""
 
+import dataclasses
 from importlib.util import find_spec
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crazysim.envs import make
+from crazysim.envs.statistics import RunningStats
 from crazysim.lab.export.rl_tools import N_MEMORY, SHAPES, evaluate_step, to_rl_tools
 from crazysim.lab.validate import any_airframe, rotor_simulators
 from crazysim.lab.validate.any_airframe import Network, RecurrentPolicy, fly, load_network
+from crazysim.train import checkpoint
+from crazysim.train.config import TrainConfig
+from crazysim.train.export import describe
+from crazysim.train.networks import Policy
+from crazysim.train.training import POLICY_FILE
 
 
 def counting_network(observations):
@@ -49,6 +58,19 @@ def test_a_checkpoint_computes_as_in_numpy(tmp_path):
         np.testing.assert_allclose(x, expected, atol=1e-5)  # sums of 22 products in float32
 
 
+def test_a_run_of_the_task_gets_its_observations_by_name(tmp_path):
+    weight = np.random.default_rng(0).normal(scale=0.2, size=(22, 4)).astype(np.float32)
+    config = TrainConfig.create("any", config={"hidden": [], "memory": 0})
+    policy = Policy(RunningStats.create(22), [(jnp.asarray(weight), jnp.zeros(4))])
+    meta = describe(make("any", engine="interpret")) | {"settings": dataclasses.asdict(config)}
+    checkpoint.save(tmp_path / POLICY_FILE, policy, meta)
+    network, x = load_network(tmp_path), np.random.default_rng(1).normal(size=(3, 22)).astype(np.float32)
+    pos, attitude, vel, ang_vel, last_action = np.split(x, [3, 12, 15, 18], axis=-1)
+    inputs = np.concatenate([ang_vel, attitude, last_action, pos, vel], axis=-1)  # in the order of their names
+    action, _ = network.step(x, network.initial_memory(3))
+    np.testing.assert_allclose(action, np.tanh(inputs @ weight), atol=1e-5)
+
+
 def test_raptor_computes_as_its_package():
     if find_spec("foundation_policy") is None:
         pytest.skip("needs foundation-policy")
@@ -76,13 +98,14 @@ class Floating:
 
 
 def test_commands_are_late_and_only_drones_near_their_goal_are_held():
-    pos = np.array([[0, 0, 10], [0, 0.4, 10], [0, 0, 10], [np.nan, 0, 10]])
-    drones = Floating(pos)
-    calls = iter(range(1000))
+    drones = Floating([[0, 0, 10], [0, 0.4, 10], [0, 0, 10], [np.nan, 0, 10]])
+    calls = iter(range(2000))
     network = Network(lambda x, memory: (np.full((4, 4), (next(calls) + 1) / 1000), memory), lambda n: 0)
     flight = fly(network, drones, any_airframe.MANOEUVRES["hold"].goal, np.array([0, 3, 10, 0]), 10)
     assert flight.held.tolist() == [True, False, True, False]
     np.testing.assert_allclose(flight.error[:3], [0, 0.4, 0], atol=1e-12)
+    below_floor = np.array([0, 0, -0.1]), np.zeros(3)
+    assert not fly(network, Floating([below_floor[0]] * 4), lambda _: below_floor, np.zeros(4, int), 10).held.any()
     commands = 1000 * np.array(drones.commands)
     assert len(commands) == 10_000
     np.testing.assert_allclose(commands[:14, 0], [1] * 10 + [2] * 4)
