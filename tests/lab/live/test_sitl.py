@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -366,11 +367,15 @@ def start_betaflight(program, folder, **settings):
     return RecordingBetaflight(ports=ports, program=program, folder=folder, **settings)
 
 
+def compile_stand_in(folder):
+    (folder / "stand_in.c").write_text(STAND_IN)
+    subprocess.run(["gcc", "-pthread", folder / "stand_in.c", "-o", folder / "stand_in"], check=True)
+    return folder / "stand_in"
+
+
 @linux_only
 def test_betaflight_in_lockstep_depends_on_the_packets_only(tmp_path):
-    (tmp_path / "stand_in.c").write_text(STAND_IN)
-    program = tmp_path / "stand_in"
-    subprocess.run(["gcc", "-pthread", tmp_path / "stand_in.c", "-o", program], check=True)
+    program = compile_stand_in(tmp_path)
 
     def fly():
         sim = Sim(control="rotor_vel", freq=250)
@@ -389,6 +394,20 @@ def test_betaflight_in_lockstep_depends_on_the_packets_only(tmp_path):
     np.testing.assert_allclose(state_time[1:], times[1:], atol=1e-7)  # the first answer is from before
     np.testing.assert_allclose(throttle[1:], 1000 + np.arange(1, 50) // 2 * 2, atol=1e-3)
     assert np.all(np.diff(loops) > 70)  # 4 ms in turns of about 53 us
+
+
+@linux_only
+def test_betaflight_in_lockstep_ends_with_a_simulation_that_is_killed(tmp_path):
+    program = compile_stand_in(tmp_path)
+    ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
+    code = (
+        "import os; from crazysim.lab.live.sitl import Betaflight\n"
+        f"link = Betaflight(ports={ports}, program={str(program)!r}, folder={str(tmp_path)!r})\n"
+        "print(link._process.pid, flush=True)\n"
+        "os._exit(0)"
+    )
+    pid = int(subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE).stdout)
+    wait_for(lambda: not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_bytes())
 
 
 @linux_only

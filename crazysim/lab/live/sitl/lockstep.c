@@ -18,6 +18,7 @@
 #include <string.h>
 #include <sys/select.h>
 #include <time.h>
+#include <unistd.h>
 
 enum { MOTORS, STATE, RC, N_PORTS };
 static const int program_ports[N_PORTS] = {9002, 9003, 9004};
@@ -33,6 +34,7 @@ static int64_t now, limit = START_TIME - 1, packet_time;
 static int n_rc_packets; /* that the program has read */
 static bool has_state, has_rc;
 static float motors[4];
+static pid_t parent;
 static _Thread_local enum { OTHER, MAIN, RECEIVER } thread;
 
 static int (*real_bind)(int, const struct sockaddr *, socklen_t);
@@ -45,6 +47,7 @@ static ssize_t (*real_sendto)(int, const void *, size_t, int, const struct socka
 __attribute__((constructor)) static void start(void)
 {
     thread = MAIN;
+    parent = getppid();
     setvbuf(stdout, NULL, _IOLBF, 0);
     *(void **)&real_bind = dlsym(RTLD_NEXT, "bind");
     *(void **)&real_select = dlsym(RTLD_NEXT, "select");
@@ -74,7 +77,13 @@ static int64_t advance(int64_t time)
         time -= limit - now;
         now = limit;
         send_to_port(ports[MOTORS], motors, sizeof(motors));
-        while (limit == last) pthread_cond_wait(&change, &lock);
+        while (limit == last) {
+            struct timespec second_later;
+            real_clock_gettime(CLOCK_REALTIME, &second_later);
+            ++second_later.tv_sec;
+            pthread_cond_timedwait(&change, &lock, &second_later);
+            if (getppid() != parent) _exit(1); /* the simulation has ended */
+        }
     }
     time = now += time;
     pthread_mutex_unlock(&lock);
