@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from crazysim.commands import airframe, demo, info, replay, training
 from crazysim.engine import cache
 from crazysim.errors import DivergedError, RenderError, not_installed
-from crazysim.lab.commands import identify, live, show, validate
+from crazysim.lab.commands import identify, live, race, show, validate
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
           "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="crazysim", description="A drone simulator in which millions of worlds advance in one call."
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
-    for module in (demo, replay, show, live, training, airframe, identify, validate, info):
+    for module in (demo, replay, show, live, race, training, airframe, identify, validate, info):
         module.add_parsers(commands)
     options = parser.parse_args(arguments)
     if options.command is None:

@@ -60,6 +60,7 @@ NAMES: dict[str, dict[str, str]] = {
     "crazysim.envs": {
         "crazysim.envs.brax": "BraxEnv",
         "crazysim.envs.pettingzoo": "make_parallel",
+        "crazysim.envs.race_clock": "RaceClock time_flight",
         "crazysim.envs.rsl_rl": "RslRlEnv",
         "crazysim.envs.sb3": "DroneVecEnv",
         "crazysim.envs.track_files": "load_track track_names",

@@ -38,6 +38,7 @@ from crazysim.names import lazy_getattr
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv
     from crazysim.envs.pettingzoo import make_parallel as make_parallel
+    from crazysim.envs.race_clock import RaceClock, time_flight
     from crazysim.envs.rsl_rl import RslRlEnv as RslRlEnv
     from crazysim.envs.sb3 import DroneVecEnv as DroneVecEnv
     from crazysim.envs.track_files import load_track, track_names
@@ -65,6 +66,7 @@ __all__ = [
     "Observe",
     "PrivilegedObservation",
     "ProgressTask",
+    "RaceClock",
     "RandomizeWith",
     "RewardTerms",
     "Task",
@@ -82,6 +84,7 @@ __all__ = [
     "rollout",
     "state_of",
     "terms",
+    "time_flight",
     "track_names",
     "uniform",
 ]

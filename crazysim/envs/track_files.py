@@ -63,11 +63,14 @@ def _read_track(tables: Any) -> Track:
         expect(gate["type"] in _SHAPES, f"gates of types {', '.join(_SHAPES)}", gate["type"])
     shapes = [_SHAPES[gate["type"]] for gate in gates]
     pos = np.array([gate["position"] for gate in gates], float)
-    rot = rotation_matrices(np.deg2rad([gate.get("rpy", (0, -90, 0)) for gate in gates]))
+    start, finish = (np.array(tables[name]["pos"], float) for name in ("initState", "endState"))
+    # Balls have no direction: they get that of the way past them.
+    way = np.concatenate([[start], pos, [finish]])
+    yaw = np.degrees(np.arctan2(*(way[2:] - way[:-2])[:, 1::-1].T))
+    rot = rotation_matrices(np.deg2rad([gate.get("rpy", (0, -90, y)) for gate, y in zip(gates, yaw, strict=True)]))
     # Our gates lie in the y-z plane, with x ahead and z up; theirs in the x-y plane, with x up and z backwards.
     x, y, z = -rot[..., 2], rot[..., 1], rot[..., 0]
     rpy = np.stack([np.arctan2(y[:, 2], z[:, 2]), -np.arcsin(x[:, 2].clip(-1, 1)), np.arctan2(x[:, 1], x[:, 0])], -1)
-    start, finish = (np.array(tables[name]["pos"], float) for name in ("initState", "endState"))
     points = np.concatenate([pos, [start, finish]])
     low, high = points.min(axis=0) - ARENA_MARGIN, points.max(axis=0) + ARENA_MARGIN
     return Track(

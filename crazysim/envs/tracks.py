@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -126,6 +127,30 @@ def gates_of_track(track: Track) -> list[Gate]:
     quat = rotation_matrices(np.asarray(track.gates_rpy, float))
     rows = zip(np.asarray(track.gates_pos, float), quat, openings, frames, lengths.tolist(), strict=True)
     return [Gate(*row) for row in rows]
+
+
+def gate_body(gate: Gate, bar: float = 0.05) -> str:
+    """Return the MJCF of a gate in its own frame: bars around the inner edges of its frame, or a ball of glass.
+
+    Args:
+        bar: Radius of the bars, m.
+    """
+    touch = 'contype="0" conaffinity="2" rgba="0.85 0.35 0.1 1"'
+    if gate.is_ball:
+        geoms = [f'<geom type="sphere" size="{gate.opening}" contype="0" conaffinity="0" rgba="0.85 0.35 0.1 0.3"/>']
+    else:
+        corners = np.asarray(gate.frame)
+        inner_radius = np.min(np.abs(dataclasses.replace(gate, opening=corners).half_planes[:, 2]))
+        corners = corners * (1 + bar / inner_radius)
+        ends = (-gate.length / 2, gate.length / 2) if gate.length else (0.0,)
+        rings = [np.insert(corners, 0, x, axis=-1) for x in ends]
+        bars = [pair for ring in rings for pair in zip(ring, np.roll(ring, -1, axis=0), strict=True)]
+        bars += list(zip(*rings, strict=True)) if gate.length else []
+        geoms = [
+            f'<geom type="capsule" size="{bar}" fromto="{" ".join(map(str, np.concatenate(pair)))}" {touch}/>'
+            for pair in bars
+        ]
+    return f"<mujoco><worldbody><body>{''.join(geoms)}</body></worldbody></mujoco>"
 
 
 def rotation_matrices(rpy: np.ndarray) -> np.ndarray:

@@ -34,6 +34,8 @@ MAX_SLOWING = 6.0
 """Largest duration of a leg of the point mass, as a multiple of the duration with which its plan begins."""
 MIN_FORCE = 2.0
 """Smallest thrust of the point mass, m/s^2, so that it has a direction everywhere."""
+INSET = 1e-4
+"""Distance by which crossings stay inside their openings, m, so that rounding makes no plan miss a gate."""
 MIN_NODES = 4
 """Smallest number of nodes of a leg."""
 MAX_ITERATIONS = 1500
@@ -183,16 +185,16 @@ class _Course:
         for k, (gate, pos) in enumerate(self.crossings):
             offset = states[:3, int(leg_ends[k])] - pos
             if gate.is_ball and balls:
-                nlp.add(nlp.ca.dot(offset, offset) / float(gate.opening) ** 2, 0.0, 1.0)
+                nlp.add(nlp.ca.dot(offset, offset) / (float(gate.opening) - INSET) ** 2, 0.0, 1.0)
                 continue
             if gate.is_ball:  # a cube inside, since searches that begin in the middle of a small ball creep
-                half = float(gate.opening) / np.sqrt(3)
+                half = (float(gate.opening) - INSET) / np.sqrt(3)
                 nlp.add(offset, -half, half)
                 continue
             axis, planes = gate.rot[:, :1].T, gate.half_planes
             nlp.add(axis @ offset, 0.0, 0.0)
             nlp.add(axis @ states[3:6, int(leg_ends[k])], 0.0, FAR)
-            nlp.add(planes[:, :2] @ gate.rot[:, 1:].T @ offset - planes[:, 2], -FAR, 0.0)
+            nlp.add(planes[:, :2] @ gate.rot[:, 1:].T @ offset - planes[:, 2], -FAR, -INSET)
         for leg, gate in self.tubes.items():
             inner = states[:3, int(leg_ends[leg - 1]) + 1 : int(leg_ends[leg])] - gate.pos
             planes = gate.half_planes

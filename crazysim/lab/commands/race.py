@@ -1,0 +1,82 @@
+"""``crazysim race``: time-optimal flights over race tracks."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crazysim.commands.options import DefaultsFormatter, number, size
+from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
+
+if TYPE_CHECKING:
+    from crazysim.lab.racing.flight import RaceFlight
+
+
+def add_parsers(commands: argparse._SubParsersAction) -> None:
+    text = "fly a race track by a time-optimal plan; print laps and splits, draw and film the flight"
+    parser = commands.add_parser("race", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("track", help="name of a track, such as split_s_gates, or a YAML file; list prints all names")
+    add("--laps", type=number(high=100, example=3), default=1, help="number of laps")
+    add("--drone", help="airframe of a plan: a name or the path of a TOML file; by default uzh_cpc")
+    rates_help = "largest roll, pitch and yaw rate of a plan, rad/s; by default 15 15 3"
+    add("--body-rate", type=size(15), nargs=3, metavar=("P", "Q", "R"), help=rates_help)
+    add("--floor", type=number(-1e3, 1e3, 0.5, float), help="smallest height of a plan, m; by default none")
+    add("--dt", type=size(0.04), default=0.04, help="time between changes of the thrusts of a plan, s")
+    add("--plot", type=Path, metavar="FILE", help="plot to write, .png")
+    add("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
+    add("--page", type=Path, metavar="FILE", help="page to write, .html, which plays the flight in a browser")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fly a race track, print the clock, and write what was asked for."""
+    from crazysim.envs.track_files import track_names
+
+    if options.track == "list":
+        print("\n".join(track_names()))
+        return
+    for path, suffixes in (
+        (options.plot, PICTURE_SUFFIXES),
+        (options.film, (".mp4", ".gif")),
+        (options.page, (".html",)),
+    ):
+        if path is not None:
+            check_writable(path, suffixes)
+    from crazysim.lab.racing import flight as flights
+
+    flight = _fly_plan(options)
+    print(flights.summary(flight))
+    if options.plot is not None:
+        flights.plot(flight, options.plot)
+    if options.film is not None:
+        flights.film(flight, options.film, progress=True)
+    if options.page is not None:
+        write_file(options.page, flights.page(flight))
+    for path in (options.plot, options.film, options.page):
+        if path is not None:
+            print(f"wrote {path}")
+
+
+def _fly_plan(options: argparse.Namespace) -> RaceFlight:
+    import numpy as np
+
+    from crazysim.envs.track_files import load_track
+    from crazysim.lab.racing.flight import flight_of_plan
+    from crazysim.lab.racing.time_optimal import fly_open_loop, plan_race
+
+    track = load_track(options.track)
+    plan = plan_race(
+        track,
+        options.drone or "uzh_cpc",
+        laps=options.laps,
+        body_rate=options.body_rate or (15.0, 15.0, 3.0),
+        floor=options.floor,
+        dt=options.dt,
+    )
+    deviation = np.linalg.norm(fly_open_loop(plan)[:, :3] - plan.pos, axis=-1).max()
+    print(
+        f"{plan.airframe.name}: {plan.duration:.3f} s; flown open loop, it deviates by up to {100 * deviation:.1f} cm"
+    )
+    return flight_of_plan(plan, track, options.laps)

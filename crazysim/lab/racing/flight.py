@@ -1,0 +1,181 @@
+"""Flights over a race track: their times, films, pages and plots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.envs.race_clock import RaceClock, time_flight
+from crazysim.envs.tracks import Track, gate_body, gates_of_track
+from crazysim.errors import not_installed
+from crazysim.lab.racing.time_optimal import Plan
+from crazysim.media import Film, Flight, View, flight_of, web
+from crazysim.sim.sim import Sim
+from crazysim.sim.visualize import draw_text
+from crazysim.storage import write_figure
+
+SAMPLE_TIME = 0.01
+"""Time between samples of a flight, s."""
+CAMERA_DISTANCE = 1.1
+"""Distance of the camera of films, as a multiple of the size of the track."""
+
+
+@dataclass(frozen=True, eq=False)
+class RaceFlight:
+    """A flight of one drone over a track."""
+
+    track: Track
+    """The track."""
+    drone: Any
+    """Airframe."""
+    time: NDArray
+    """Times of the samples, s. (n,)"""
+    pos: NDArray
+    """Positions, world frame, m. (n, 3)"""
+    quat: NDArray
+    """Attitudes, body to world, xyzw. (n, 4)"""
+    clock: RaceClock
+    """The clock at the end."""
+
+
+def flight_of_plan(plan: Plan, track: Track, laps: int = 1) -> RaceFlight:
+    """Sample a plan, and time it."""
+    n = max(int(np.ceil(plan.duration / SAMPLE_TIME)), 2)
+    # The times of the plan are among the samples, so that no gate is missed between two of them.
+    times = np.union1d(np.linspace(0.0, plan.duration, n + 1), plan.time)
+    k = np.searchsorted(plan.time, times, side="right").clip(1, len(plan.time) - 1) - 1
+    h = np.diff(plan.time)[k][:, None]
+    u = (times - plan.time[k])[:, None] / h
+    # Cubic Hermite polynomials of positions, and straight lines between attitudes, which are near each other.
+    a, b, v, w = plan.pos[k], plan.pos[k + 1], h * plan.vel[k], h * plan.vel[k + 1]
+    pos = a + u * v + u**2 * (3 * (b - a) - 2 * v - w) + u**3 * (2 * (a - b) + v + w)
+    quat = (1 - u) * plan.quat[k] + u * plan.quat[k + 1]
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    return RaceFlight(track, plan.airframe, times, pos, quat, time_flight(track, times, pos, laps))
+
+
+def summary(flight: RaceFlight) -> str:
+    """Describe laps, splits and penalties in a few lines."""
+    clock, n = flight.clock, flight.track.n_gates
+    laps, splits = np.asarray(clock.lap_times(flight.track)), np.asarray(clock.splits(flight.track))
+    lines = []
+    for k, (lap, row) in enumerate(zip(laps, splits, strict=True)):
+        passed = int(np.clip(int(clock.passed) - k * n, 0, n))
+        if not passed:
+            break
+        time = f"{lap:.3f} s" if passed == n else f"{passed} of {n} gates"
+        lines.append(f"lap {k + 1}: {time}; from gate to gate " + " ".join(f"{x:.2f}" for x in row[:passed]))
+    if float(clock.penalty):
+        lines.append(f"penalties: {float(clock.penalty):g} s")
+    end = f"all gates after {float(clock.time):.3f} s" if bool(clock.finished) else "not all gates were passed"
+    return "\n".join([*lines, f"{end}; the flight ends after {flight.time[-1]:.3f} s"])
+
+
+def media_flight(flight: RaceFlight, dt: float = SAMPLE_TIME) -> tuple[Sim, Flight]:
+    """Return a simulation of the track, and the flight in it that ``crazysim.media`` can play."""
+    sim = track_simulation(flight.track, flight.drone)
+    times = np.arange(0.0, flight.time[-1] + dt, dt).clip(max=flight.time[-1])
+    pos, quat = (
+        np.stack([np.interp(times, flight.time, x) for x in values.T], axis=-1) for values in (flight.pos, flight.quat)
+    )
+    states = SimpleNamespace(pos=pos[:, None, None], quat=quat[:, None, None])
+    return sim, flight_of(sim, states, dt)
+
+
+def track_simulation(track: Track, drone: Any) -> Sim:
+    """Make a simulation of one drone with the gates of a track, each once."""
+    sim = Sim(drone=drone, control="rotor_vel")
+    bodies = {}
+    for gate in gates_of_track(track):
+        bodies.setdefault((*gate.pos.tolist(), *gate.rot.ravel().tolist()), gate)
+    for k, gate in enumerate(bodies.values()):
+        yaw = np.arctan2(gate.rot[1, 0], gate.rot[0, 0])
+        quat = [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
+        sim.scene.add(gate_body(gate), f"gate{k}", pos=gate.pos, quat=quat, mocap=False)
+    return sim
+
+
+def film(flight: RaceFlight, path: str | Path, fps: float = 25, progress: bool = False) -> int:
+    """Film a flight with the clock of the race, and return the number of frames.
+
+    Raises:
+        ImportError: If imageio-ffmpeg is not installed.
+        RenderError: If this machine cannot draw, or the file cannot be written.
+    """
+    sim, recorded = media_flight(flight)
+    points = np.concatenate([flight.pos, np.asarray(flight.track.gates_pos)])
+    low, high = points.min(axis=0), points.max(axis=0)
+    distance = CAMERA_DISTANCE * float(np.linalg.norm(high - low))
+    camera = {"lookat": (low + high) / 2, "distance": distance, "azimuth": 90, "elevation": -40}
+
+    def draw(sim: Sim, world: int) -> None:
+        draw_text(sim, clock_text(flight, float(sim.time[world, 0])))
+
+    view = View(width=1280, height=720, cam_config=camera, trail=1.5, ring_width=25, draw=draw)
+    with Film(path, view, fps=fps, progress=progress) as recording:
+        return recording.play(sim, recorded)
+
+
+def clock_text(flight: RaceFlight, now: float) -> str:
+    """Return the clock of a race at a time of the flight: time, lap, gates and the last split."""
+    times, n = np.asarray(flight.clock.times), flight.track.n_gates
+    passed = int(np.sum(times <= now))
+    shown = min(now, float(flight.clock.time)) if bool(flight.clock.finished) else now
+    laps = len(times) // n
+    lines = [f"{shown:6.2f} s", f"lap {min(passed // n + 1, laps)} of {laps}, gate {passed} of {len(times)}"]
+    if passed:
+        lines.append(f"last gate {times[passed - 1]:.2f} s, split {np.diff(times, prepend=0.0)[passed - 1]:.2f} s")
+    return "\n".join(lines)
+
+
+def page(flight: RaceFlight) -> str:
+    """Make an HTML page that plays a flight in a browser.
+
+    Raises:
+        ImportError: If viser is not installed.
+    """
+    return web.page(media_flight(flight)[1])
+
+
+def plot(flight: RaceFlight, path: str | Path) -> None:
+    """Draw the flight from above, coloured by speed, and height and speed over time with the gates.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError(not_installed("plots need", "matplotlib", "demo")) from error
+    speed = np.linalg.norm(np.gradient(flight.pos, flight.time, axis=0), axis=-1)
+    figure, (above, height, fast) = plt.subplots(
+        3, 1, figsize=(8, 11), height_ratios=(3, 1, 1), constrained_layout=True
+    )
+    dots = above.scatter(flight.pos[:, 0], flight.pos[:, 1], c=speed, s=6)
+    figure.colorbar(dots, ax=above, label="speed, m/s")
+    for gate in gates_of_track(flight.track):
+        if gate.is_ball:
+            above.add_patch(plt.Circle((gate.pos[0], gate.pos[1]), float(gate.opening), fill=False))
+            continue
+        for x in {-gate.length / 2, gate.length / 2}:
+            corners = gate.pos + np.insert(np.asarray(gate.frame), 0, x, axis=-1) @ gate.rot.T
+            above.plot(*corners[[*range(len(corners)), 0], :2].T, color="black")
+    above.set(xlabel="x, m", ylabel="y, m")
+    above.set_aspect("equal", adjustable="datalim")
+    passes = np.asarray(flight.clock.times)
+    for axis, values, label in ((height, flight.pos[:, 2], "z, m"), (fast, speed, "speed, m/s")):
+        axis.plot(flight.time, values)
+        axis.plot(passes, np.interp(passes, flight.time, values), "k.", label="gates")
+        axis.set(xlabel="time, s", ylabel=label)
+        axis.grid(alpha=0.3)
+    height.legend()
+    write_figure(figure, path, dpi=110)
+    plt.close(figure)

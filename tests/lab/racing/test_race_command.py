@@ -1,0 +1,57 @@
+"""``crazysim race``: what it prints and writes."""
+
+import re
+
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.envs import load_track
+from crazysim.lab.racing.flight import clock_text, flight_of_plan, track_simulation
+from crazysim.lab.racing.time_optimal import plan_race
+
+FILE = """
+initState: { pos: [0, 0, 1] }
+endState: { pos: [6, 0, 1] }
+orders: [A, B]
+A: { type: RectanglePrisma, position: [2, 0.5, 1], rpy: [0, -90, 0], width: 1, height: 1, marginW: 0.2, marginH: 0.2 }
+B: { type: SingleBall, position: [4, -0.5, 1], radius: 0.3, margin: 0.0 }
+"""
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("tracks") / "two.yaml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+@pytest.mark.long("plans, and records a page of the flight")
+def test_the_command_prints_laps_and_splits_and_draws(path, tmp_path, capsys):
+    files = [tmp_path / "race.png", tmp_path / "race.html"]
+    assert main(["race", str(path), "--floor", "0.5", "--plot", str(files[0]), "--page", str(files[1])]) == 0
+    text = capsys.readouterr().out
+    duration = float(re.search(r"uzh_cpc: ([\d.]+) s", text)[1])
+    lap, first, second = map(float, re.search(r"lap 1: ([\d.]+) s; from gate to gate ([\d.]+) ([\d.]+)", text).groups())
+    assert lap == pytest.approx(first + second, abs=0.02)  # two decimals
+    assert lap < duration
+    assert f"the flight ends after {duration:.3f} s" in text
+    assert all(file.stat().st_size > 10_000 for file in files)
+
+
+def test_the_tracks_are_listed(capsys):
+    assert main(["race", "list"]) == 0
+    assert "split_s_gates" in capsys.readouterr().out
+
+
+def test_the_clock_of_a_film_shows_lap_gate_and_split(path):
+    track = load_track(path)
+    flight = flight_of_plan(plan_race(track, laps=2), track, laps=2)
+    times = np.asarray(flight.clock.times)
+    assert bool(flight.clock.finished)
+    assert clock_text(flight, 0.0) == "  0.00 s\nlap 1 of 2, gate 0 of 4"
+    text = clock_text(flight, float(times[2]) + 1e-3)
+    assert f"lap 2 of 2, gate 3 of 4\nlast gate {times[2]:.2f} s, split {times[2] - times[1]:.2f} s" in text
+    assert clock_text(flight, 1e3).startswith(f"{times[3]:6.2f} s"), "the clock stops"
+    model = track_simulation(track, "uzh_cpc").mj_model
+    assert sum(name.startswith("gate") for name in (model.body(k).name for k in range(model.nbody))) >= 2
