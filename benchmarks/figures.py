@@ -314,6 +314,7 @@ FIGURES: dict[str, Figure] = {
     "validation-idsia": Figure("validation.py idsia"),
     "validation-nanobench": Figure("validation.py nanobench"),
     "validation-filter": Figure("validation.py filter"),
+    "validation-any": Figure("validation.py any"),
     "validation-sim2sim": Figure("validation.py sim2sim"),
 }
 

@@ -446,6 +446,21 @@ def predictions(lines: list[Line]) -> str:
     )
 
 
+def policies_for_any_airframe(lines: list[Line]) -> str:
+    """Return shares of drones held with each delay, and errors of figure eights, by policy and time between calls."""
+    cells: dict[tuple[str, str], list[Line]] = {}
+    for line in lines:
+        manoeuvre, airframes, period, _ = line["quantity"].split("; ")
+        cells.setdefault((f"{manoeuvre}: {airframes}", f"{line['reference']}, {period}"), []).append(line)
+    return pivot(
+        [{"row": row, "column": column, "cell": cell} for (row, column), cell in cells.items()],
+        lambda x: x["row"],
+        lambda x: x["column"],
+        lambda x: ", ".join(format(line["figure"], ".3g") for line in x["cell"]) + " " + x["cell"][0]["unit"],
+        "Flights",
+    )
+
+
 def transfers(lines: list[Line]) -> str:
     """Return the success of policies by simulator."""
     return pivot(
@@ -567,7 +582,7 @@ def devices(lines: list[Line]) -> str:
     return markdown_table(["", "Worlds", *names, "Ratios", "Bytes", "Memory", "Compile time"], rows)
 
 
-SECTIONS = ("closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter")
+SECTIONS = ("closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "any")
 TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "readme": (("loop", "step", "versus", "gradient-versus", "queries", "envs"), readme),
     "loop": (("loop",), loops),
@@ -593,6 +608,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "validation-sim2sim": (("validation-sim2sim",), transfers),
     **{f"validation-{name}": ((f"validation-{name}",), validation) for name in SECTIONS if name != "idsia"},
     "validation-firmware": (("validation-firmware",), firmware),
+    "validation-any": (("validation-any",), policies_for_any_airframe),
 }
 """Figures of each table, and the function that makes it of their lines.
 
