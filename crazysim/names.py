@@ -46,6 +46,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.control.auto": "Auto",
         "crazysim.control.geometric": "Geometric geometric_control",
         "crazysim.control.indi": "INDI indi_control",
+        "crazysim.lab.control.any_airframe": "AnyAirframe",
         "crazysim.lab.control.firmware": "CFirmware",
         "crazysim.lab.control.load_lqr": "LoadLQR load_lqr_control",
         "crazysim.lab.control.lqr": "LQR lqr_control",
@@ -135,7 +136,9 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.export.mc_nn_control": "observe_inputs to_mc_nn_control",
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
-        "crazysim.lab.export.rl_tools": "read_rl_tools to_rl_tools weights_to_c",
+        "crazysim.lab.export.rl_tools": (
+            "find_weights raptor_policy raptor_weights read_rl_tools shipped_weights to_rl_tools weights_to_c"
+        ),
         "crazysim.lab.export.tflite": "to_tflite",
     },
     "crazysim.trajectories": {

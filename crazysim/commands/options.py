@@ -108,17 +108,27 @@ def require_screen(remedy: str) -> None:
 
 
 def load_policy_and_env(
-    folder: Path, device: str | None, n_worlds: int, task: str | None = None
+    folder: Path, device: str | None, n_worlds: int, task: str | None = None, drone: str | None = None
 ) -> tuple[Policy, TrainConfig, Env]:
     """Return the policy of a run, its configuration, and an environment with the observations of the policy.
 
     Args:
+        folder: Folder of the run, or, for the task ``any``, a checkpoint of rl-tools or the name of the task for the
+            policy of the package.
         device: Device of the environment; None for the device of the training.
         task: Reference of the task, if it has moved since training; None for the reference in the run.
+        drone: Airframe that a policy for any flies; None for airframes that are drawn.
     """
+    from crazysim.train.config import TrainConfig
+    from crazysim.train.export import find_weights, raptor_policy
     from crazysim.train.interface import check_policy
     from crazysim.train.training import load_policy
 
+    if (weights := find_weights(folder)) is not None:
+        config = TrainConfig.create("any", options={} if drone is None else {"drone": drone, "drawn": False})
+        env = config.with_device(device).make_env(n_worlds)
+        return raptor_policy(weights, env.sim.airframes[0]), config, env
+    require(drone is None, f"expected any, or a checkpoint (.tar), for --drone, got {str(folder)!r}", ValueError)
     policy, config, _ = load_policy(folder, task)
     env = config.with_device(device).make_env(n_worlds)
     check_policy(policy, env)

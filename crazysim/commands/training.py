@@ -76,8 +76,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     _add_task_and_device(add)
 
     text = "write a trained policy for flight controllers, or as ONNX or C"
-    folder_help = "folder of the run, or a checkpoint of rl-tools (.tar) with a policy of RAPTOR's shape"
-    add = _add_policy_command(commands, "export", text, export, folder_help)
+    add = _add_policy_command(commands, "export", text, export)
     add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
     out_of_tree_help = "existing folder for an out of tree controller of the Crazyflie's firmware"
@@ -85,23 +84,22 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add(
         "--betaflight", type=Path, metavar="FOLDER", help="existing folder for a header to call from Betaflight's mixer"
     )
-    add("--rl-tools", type=Path, metavar="FILE", help="policy.tar of PX4's mc_raptor to write, from a checkpoint")
+    add("--rl-tools", type=Path, metavar="FILE", help="policy.tar of PX4's mc_raptor to write, of RAPTOR's shape")
     tflite_help = (
         "control_net.tflite of PX4's mc_nn_control to write, distilled from a policy that commands rotor speeds"
     )
     add("--tflite", type=Path, metavar="FILE", help=tflite_help)
-    add("--drone", metavar="NAME|FILE", help="airframe that flies a checkpoint; by default cf21B_500")
+    add("--drone", metavar="NAME|FILE", help="airframe that flies a policy of RAPTOR's shape; by default cf21B_500")
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
-    add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
+    add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder, or any.mp4")
     add("--worlds", type=number(), default=4, help="number of worlds side by side")
     add("--seed", type=seed, default=1, help="seed of the initial states")
     _add_task_and_device(add)
 
 
-def _add_policy_command(
-    commands: argparse._SubParsersAction, name: str, text: str, run: Any, folder_help: str = "folder of the run"
-) -> Any:
+def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
+    folder_help = "folder of the run; or any, the package's policy, or a checkpoint of rl-tools (.tar) of its shape"
     parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     parser.add_argument("folder", type=Path, help=folder_help)
@@ -111,6 +109,8 @@ def _add_policy_command(
 def _add_task_and_device(add: Any) -> None:
     task_help = "FILE.py:CLASS of your task, if it has moved since training"
     add("--task", metavar="FILE.py:CLASS", help=task_help)
+    drone_help = "airframe that a policy for any flies; by default another one in every world"
+    add("--drone", "--airframe", metavar="NAME|FILE", help=drone_help)
     add("--device", help="device: cpu, gpu; by default the training's")
 
 
@@ -246,7 +246,9 @@ def evaluate(options: argparse.Namespace) -> None:
 
     if options.plot is not None:
         check_writable(options.plot, PICTURE_SUFFIXES)
-    policy, config, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)
+    policy, config, env = load_policy_and_env(
+        options.folder, options.device, options.worlds, options.task, options.drone
+    )
     key = None if options.seed is None else jax.random.key(options.seed)
     metrics = evaluate(env, policy, key)
     print(f"{config.title}, {options.worlds:,} starts: {describe_flight(metrics, env.task.unit)}")
@@ -272,27 +274,35 @@ def export(options: argparse.Namespace) -> None:
     for suffix, path in files.items():
         if path is not None:
             check_writable(path, (suffix,))
-    if options.folder.suffix == ".tar":
+    policy: Any = exports.find_weights(options.folder)
+    meta: Any = None
+    trained, written = None, []
+    if policy is None:
+        policy, config, meta = load_policy(options.folder)
+        trained = config.with_device("cpu").make_env(1)
+        if policy.network.is_limited:  # of RAPTOR's shape, which flies other airframes than that of the training, too
+            policy, meta, trained = exports.raptor_weights(policy, trained.sim.airframes[0]), None, None
+    if isinstance(policy, dict):
         require(
             options.onnx is options.tflite is None,
-            "expected a run for --onnx and --tflite, got a checkpoint of rl-tools; use --c",
+            "expected --c or another file for RAPTOR's shape, got --onnx or --tflite",
             ValueError,
         )
-        policy, config, meta = exports.read_rl_tools(options.folder), None, None
+        if options.rl_tools:
+            written.append(exports.to_rl_tools(policy, options.rl_tools, options.folder.stem))
         write_c = partial(exports.weights_to_c, policy)
-        written = [exports.to_rl_tools(policy, options.rl_tools, options.folder.stem)] if options.rl_tools else []
     else:
         require(
             options.rl_tools is options.drone is None,
-            f"expected a checkpoint of rl-tools (.tar) for --rl-tools and --drone, got {str(options.folder)!r}; a run "
-            f"has its drone, and mc_raptor flies policies of RAPTOR's shape only",
+            f"expected a policy of RAPTOR's shape for --rl-tools and --drone, got {str(options.folder)!r}; a run "
+            f"has its drone, and mc_raptor flies policies of the task any, or a checkpoint (.tar), only",
             ValueError,
         )
-        policy, config, meta = load_policy(options.folder)
+        if options.onnx:
+            written.append(exports.to_onnx(policy, options.onnx, meta))
         write_c = partial(exports.to_c, policy, meta=meta)
-        written = [exports.to_onnx(policy, options.onnx, meta)] if options.onnx else []
         if options.tflite is not None:
-            env = config.make_env(DISTILLATION_WORLDS)
+            env = config.with_device("cpu").make_env(DISTILLATION_WORLDS)
             print("distilling the policy to the inputs of mc_nn_control: 10 to 60 s on two cores", flush=True)
             student, parameters = exports.to_mc_nn_control(policy, env, options.tflite)
             metrics = evaluate(exports.observe_inputs(env), student)
@@ -302,10 +312,10 @@ def export(options: argparse.Namespace) -> None:
     if options.c is not None:
         written.append(write_c(options.c))
     for folder, write in folders:
-        if folder is not None:
-            env = None if config is None else config.make_env(1)
-            airframe = load_airframe(options.drone or "cf21B_500") if env is None else env.sim.airframes[0]
-            written += write(policy, folder, meta, airframe, *(() if env is None else (env.base.freq,)))
+        if folder is not None and trained is None:
+            written += write(policy, folder, meta, load_airframe(options.drone or "cf21B_500"))
+        elif folder is not None:
+            written += write(policy, folder, meta, trained.sim.airframes[0], trained.base.freq)
     for path in written:
         print(f"wrote {path}")
     if len(written) > sum(path is not None for path in (options.onnx, options.tflite)):
@@ -315,7 +325,7 @@ def export(options: argparse.Namespace) -> None:
 def render(options: argparse.Namespace) -> None:
     from crazysim.train.show import film
 
-    policy, _, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task)
-    path = options.film or options.folder / "policy.mp4"
+    policy, _, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task, options.drone)
+    path = options.film or (options.folder / "policy.mp4" if options.folder.is_dir() else Path("any.mp4"))
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")

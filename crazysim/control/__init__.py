@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from crazysim.control.auto import Auto
     from crazysim.control.geometric import Geometric, geometric_control
     from crazysim.control.indi import INDI, indi_control
+    from crazysim.lab.control.any_airframe import AnyAirframe
     from crazysim.lab.control.firmware import CFirmware
     from crazysim.lab.control.load_lqr import LoadLQR, load_lqr_control
     from crazysim.lab.control.lqr import LQR, lqr_control
@@ -35,6 +36,7 @@ __all__ = [
     "PID",
     "AirframeParams",
     "AllocationParams",
+    "AnyAirframe",
     "AttitudeParams",
     "Auto",
     "CFirmware",

@@ -21,6 +21,7 @@ CONTROLLERS = {
     "lqr": "crazysim.control:LQR",
     "load_lqr": "crazysim.control:LoadLQR",
     "tracking_lqr": "crazysim.control:TrackingLQR",
+    "any": "crazysim.control:AnyAirframe",
 }
 """Controllers by name, as ``"module:class"``, which ``find_controller`` imports."""
 

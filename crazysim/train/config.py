@@ -220,7 +220,12 @@ class TrainConfig:
                 self.algorithm == "ppo",
                 f"expected no custom network for {self.algorithm}, got one. Use algorithm='ppo'.",
             )
-            choose_network(self.config.get("memory", 0), self.network, self.config.get("convolution", ()))
+            choose_network(
+                self.config.get("memory", 0),
+                self.network,
+                self.config.get("convolution", ()),
+                shape=self.config.get("shape", "default"),
+            )
             object.__setattr__(self, "own_network", True)
         config = dataclasses.asdict(self.algorithm_config())
         values = {

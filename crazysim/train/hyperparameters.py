@@ -25,7 +25,10 @@ COUNT_NAMES = ("memory", "demonstrations")
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 MAX_COUNT, MAX_SIZE = 2**26, 2**14
 """Largest whole number, and largest size of a layer or a memory."""
-CHOICES_BY_NAME = {"critic": ("observations", "privileged", "all_drones", "all_drones_privileged")}
+CHOICES_BY_NAME = {
+    "critic": ("observations", "privileged", "all_drones", "all_drones_privileged"),
+    "shape": ("default", "raptor"),
+}
 """Allowed values of the hyperparameters that are a choice of words, by name."""
 
 

@@ -23,7 +23,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import sum_terms
 from crazysim.errors import ConfigError, expect, require
 from crazysim.train.convolution import images_of
-from crazysim.train.critic import critic_input, critic_obs, policy_obs, rescale_value, return_std
+from crazysim.train.critic import PRIVILEGED_CRITICS, critic_input, critic_obs, policy_obs, rescale_value, return_std
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.mlp_kernel import choose_mlp
 from crazysim.train.networks import ApplyLayers, Network, Policy, Weights, choose_network, forward, init_weights, unroll
@@ -49,7 +49,12 @@ class Config:
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of policy and value function; not used with a custom network."""
     memory: int = 0
-    """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none."""
+    """Size of the memory of policy and value function, a gated recurrent unit before the hidden layers; 0 for none. A
+    privileged critic has none: it sees what the policy has to remember."""
+    shape: str = "default"
+    """Shape of the policy. ``raptor``: a dense layer of the size of the memory with ReLU, the memory and a linear layer
+    whose outputs are limited to [-1, 1], as flight controllers with RAPTOR's network run; ``hidden`` is then of the
+    value function alone."""
     convolution: tuple[int, ...] = ()
     """Channels of the layers of a convolution over each image, with patches of 3 x 3 pixels and stride 2, before the
     memory and the hidden layers; empty to use the pixels without convolution."""
@@ -107,9 +112,13 @@ class Agent(PyTree):
     n_obs: int = static()
     """Number of observations of the policy."""
     network: Network = static()
-    """Network of policy and value function."""
+    """Network of the policy."""
+    critic_network: Network = static()
+    """Network of the value function."""
     apply_layers: ApplyLayers = static()
-    """Function that computes the layers after the network."""
+    """Function that computes the layers after the network of the policy."""
+    apply_critic_layers: ApplyLayers = static()
+    """Function that computes the layers after the network of the value function."""
 
     def observe(self, obs: Obs, config: Config) -> tuple[Array, Array]:
         """Join the observations of policy and critic: as they are, and normalised. (n_worlds, n_drones, k) each"""
@@ -118,7 +127,8 @@ class Agent(PyTree):
 
     def estimate_value(self, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
         """Estimate the return from normalised observations, (..., k) -> (...), and advance the critic's memory."""
-        output, memory = forward(self.network, self.value, critic_input(obs, config.critic), memory, self.apply_layers)
+        x = critic_input(obs, config.critic)
+        output, memory = forward(self.critic_network, self.value, x, memory, self.apply_critic_layers)
         return output[..., 0] * return_std(self.returns) + self.returns.mean, memory
 
     def as_policy(self) -> Policy:
@@ -183,23 +193,34 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     expect(names.keys() <= terms.keys(), f"rewards of terms among {', '.join(terms)}", list(names))
     obs = policy_obs(state.obs, config.critic)
     images = images_of(env, obs) if config.convolution else ()
-    network = choose_network(config.memory, network, config.convolution, images)
-    apply_layers = choose_mlp(network, env.sim.device, env.sim.mesh, len(configs))
+    is_privileged = config.critic in PRIVILEGED_CRITICS and network is None
+    critic_network = choose_network(0 if is_privileged else config.memory, network, config.convolution, images)
+    network = choose_network(config.memory, network, config.convolution, images, config.shape)
+    policy_hidden = () if config.shape == "raptor" else hidden
+    apply_layers, apply_critic_layers = (
+        choose_mlp(x, env.sim.device, env.sim.mesh, len(configs)) for x in (network, critic_network)
+    )
     n_obs, n_actions = flatten(obs).shape[-1], env.actions.size
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, raw_obs: Array) -> Agent:
-        policy = init_weights(network, k_policy, n_obs, (*hidden, n_actions), 0.01)
+        policy = init_weights(network, k_policy, n_obs, (*policy_hidden, n_actions), 0.01)
         n_inputs = critic_input(raw_obs, config.critic).shape[-1]
-        value = init_weights(network, k_value, n_inputs, (*hidden, 1), 1.0)
+        value = init_weights(critic_network, k_value, n_inputs, (*hidden, 1), 1.0)
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(parameters)
         stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
-        return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, network, apply_layers)
+        networks = network, critic_network, apply_layers, apply_critic_layers
+        return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, *networks)
 
     raw_obs = split_blocks(critic_obs(state.obs, config.critic), len(configs))
     agents = for_each_seed(init_agent, k_policy, k_value, k_agent, raw_obs)
-    return Learner(agents, state, (network.make_memory(*state.reward.shape),) * 2, jnp.int32(0))
+    return Learner(agents, state, _initial_memory(agents, state), jnp.int32(0))
+
+
+def _initial_memory(agents: Agent, state: EnvState) -> tuple[Any, Any]:
+    batch = state.reward.shape
+    return agents.network.make_memory(*batch), agents.critic_network.make_memory(*batch)
 
 
 @partial(jax.jit, static_argnames=("env", "configs"))
@@ -216,7 +237,7 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     """Return the results of ``iterate``, without compiling it, with the hyperparameters of ``stack_configs``."""
     key, k_fly, k_learn = split_keys(learner.agents.key, 3)
     agents, n_seeds = learner.agents.replace(key=key), len(learner.agents.key)
-    initial_memory = (agents.network.make_memory(*learner.env.reward.shape),) * 2
+    initial_memory = _initial_memory(agents, learner.env)
     show = env.task.demonstrate if config.demonstrations else None
     # Fly the worlds of all seeds as one batch.
     state, memory, records = rollout_seeds(
@@ -252,7 +273,7 @@ def act(
     raw_obs, x = agent.observe(obs, config)
     output, policy_memory = forward(agent.network, agent.policy, x[..., : agent.n_obs], memory[0], agent.apply_layers)
     value, value_memory = agent.estimate_value(x, memory[1], config)
-    mean = jnp.tanh(output)
+    mean = agent.network.squash(output)
     action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
     shown = None if show is None else jnp.clip(show(policy_obs(obs, config.critic)), -1.0, 1.0).astype(mean.dtype)
     extras = raw_obs, x, action, log_prob(mean, agent.log_std, action), value, value_memory, shown
@@ -338,9 +359,9 @@ def compute_loss(
     policy, log_std, value = parameters
     sample, advantage, target, memory = minibatch
     policy_memory, value_memory = jax.tree.map(lambda x: x[0], memory)
-    evaluate = partial(unroll, agent.network, done=sample.done, apply_layers=agent.apply_layers)
-    mean = jnp.tanh(evaluate(policy, sample.obs[..., : agent.n_obs], policy_memory))
-    values = evaluate(value, critic_input(sample.obs, config.critic), value_memory)[..., 0]
+    obs, value_obs, done = sample.obs[..., : agent.n_obs], critic_input(sample.obs, config.critic), sample.done
+    mean = agent.network.squash(unroll(agent.network, policy, obs, policy_memory, done, agent.apply_layers))
+    values = unroll(agent.critic_network, value, value_obs, value_memory, done, agent.apply_critic_layers)[..., 0]
     ratio = jnp.exp(log_prob(mean, log_std, sample.action) - sample.log_prob)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
     objective = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - config.clip, 1 + config.clip) * advantage).mean()

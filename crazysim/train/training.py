@@ -542,8 +542,9 @@ def load_policy(
             f"expected {expected} with which {path} was trained, got {network}. Use crazysim.train.load_policy(folder, "
             f"network={'network' if config.own_network else None})."
         )
-    used_network = choose_network(config.config.get("memory", 0), network, convolution, images)
-    hidden = () if config.own_network else config.config["hidden"]
+    shape = config.config.get("shape", "default")
+    used_network = choose_network(config.config.get("memory", 0), network, convolution, images, shape)
+    hidden = () if config.own_network or shape == "raptor" else config.config["hidden"]
 
     def make_policy() -> Policy:
         weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)

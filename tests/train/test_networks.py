@@ -122,12 +122,36 @@ def test_a_policy_with_memory_learns_a_task_that_needs_it():
     assert float(metrics["reward"][0]) + float(metrics["std"][0]) ** 2 > -0.06  # without the cost of exploration
 
 
+@pytest.mark.long("compiles two trainings")
+def test_raptors_shape_is_trained_by_both_gradients_and_stored(tmp_path):
+    """By PPO and by analytic gradients, weights of the memory change; actions are limited instead of squashed."""
+    for name, config in (("ppo", {"critic": "privileged"}), ("apg", {"hidden": (8,)})):
+        base = SMALL_CONFIG if name == "ppo" else {"n_steps": 4}
+        settings = {"algorithm": name, "config": base | config | {"shape": "raptor", "memory": 4, "iterations": 2}}
+        options = RUN_SETTINGS["options"] | {"engine": "interpret" if name == "ppo" else "plain"}
+        run = train(
+            TrainConfig.create("hover", n_worlds=16, options=options, **settings), tmp_path / name, evaluation_worlds=8,
+            log=lambda line: None, progress=False,
+        )  # fmt: skip
+        arrays = read(tmp_path / name / CHECKPOINT_FILE)[0]
+        moments = [x for key, x in arrays.items() if "recurrent" in key and x.shape[-2:] == (4, 12)]
+        assert len(moments) == 4, "weights of learner and policy, and two moments of Adam"
+        assert all(np.abs(x).max() > 0 for x in moments)
+        policy, *_ = load_policy(tmp_path / name)
+        assert evaluate(run.env, policy)["reward"] == evaluate(run.env, run.policy)["reward"]
+        obs = jax.jit(run.env.reset)(jax.random.key(0)).obs
+        loud = policy.replace(layers=[(weight, bias + 10) for weight, bias in policy.layers])
+        assert np.all(np.asarray(loud.act(obs, policy.initial_memory(8, 1))[0]) == 1.0)
+    with pytest.raises(ConfigError, match=r"shape='raptor'.*memory=16"):
+        train_quietly(tmp_path / "none", {"shape": "raptor"})
+
+
 @pytest.mark.long("compiles a training and renders a film")
 def test_a_run_with_memory_is_stored_evaluated_filmed_and_exported(tmp_path):
     whole = train_quietly(tmp_path / "whole", {"memory": 4, "critic": "privileged"})
     arrays = read(tmp_path / "whole" / CHECKPOINT_FILE)[0]
     memories = [x for name, x in arrays.items() if name.startswith("['learner'].memory")]
-    assert [x.shape for x in memories] == [(16, 1, 4)] * 2
+    assert [x.shape for x in memories] == [(16, 1, 4)]  # the privileged critic has none
     assert all(np.abs(x).max() > 0 for x in memories)
     policy, loaded, meta = load_policy(tmp_path / "whole")
     assert loaded.config["memory"] == 4

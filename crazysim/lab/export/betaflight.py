@@ -13,9 +13,9 @@ from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
 from crazysim.errors import require
-from crazysim.lab.export.out_of_tree import HEADER_FILE, command_lines, rotor_order, write_header
+from crazysim.lab.export.out_of_tree import HEADER_FILE, command_lines, write_header
 from crazysim.lab.export.policies import float_literal
-from crazysim.lab.export.rl_tools import RAPTOR_RATE
+from crazysim.lab.export.rl_tools import RAPTOR_RATE, rotor_order
 from crazysim.storage import as_path, write_file
 from crazysim.train.networks import Policy
 

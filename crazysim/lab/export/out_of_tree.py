@@ -17,9 +17,9 @@ import crazysim
 from crazysim.control import Control
 from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
-from crazysim.errors import expect, require, require_type
+from crazysim.errors import require, require_type
 from crazysim.lab.export.policies import POLICY_REMEDY, float_literal, to_c
-from crazysim.lab.export.rl_tools import RAPTOR_RATE, weights_to_c
+from crazysim.lab.export.rl_tools import RAPTOR_RATE, raptor_order, weights_to_c
 from crazysim.storage import as_path, write_file
 from crazysim.train.interface import Interface
 from crazysim.train.networks import Policy
@@ -45,8 +45,6 @@ RAPTOR_FIELDS = {
     "previous_action": ("memory->previous[{i}]", 4),
 }
 """The same for a policy of RAPTOR's shape, in its order and with the limits of ``mc_raptor``."""
-RAPTOR_ROTORS, RAPTOR_YAW_TORQUE_SIGNS = ((1, -1), (-1, -1), (-1, 1), (1, 1)), [-1, 1, -1, 1]
-"""Signs of x (forward) and y (left) of RAPTOR's rotors, and of the torques about z that they exert on the body."""
 
 
 class Controller(NamedTuple):
@@ -108,13 +106,7 @@ def write_header(policy: Any, path: Path, meta: Any, airframe: Airframe, freq: i
         require_type(policy, Policy, POLICY_REMEDY)
     require_type(airframe, Airframe, "Use sim.airframes[0], or load_airframe(name).")
     if isinstance(policy, Mapping):
-        order = rotor_order(airframe, RAPTOR_ROTORS)
-        expect(
-            (signs := airframe.value("rotors.yaw_torque_sign")[order].tolist()) == RAPTOR_YAW_TORQUE_SIGNS,
-            f"rotors of {airframe.name!r} whose drag turns the body by {RAPTOR_YAW_TORQUE_SIGNS} about z, as RAPTOR's",
-            signs,
-            "Swap the propellers of each side.",
-        )
+        order = raptor_order(airframe)
         weights_to_c(policy, path)
         half = float(np.max(airframe.rotor_vel_limits[1])) / 2
         return Controller(RAPTOR_FIELDS, Control.rotor_vel, [(half, half)] * 4, order, True, freq)
@@ -143,20 +135,6 @@ def write_header(policy: Any, path: Path, meta: Any, airframe: Airframe, freq: i
     to_c(policy, path, meta)
     fields = {name: OBSERVATION_FIELDS[name] for name in sorted(sizes)}
     return Controller(fields, level, interface.ranges, range(len(interface.ranges)), policy.has_memory, freq)
-
-
-def rotor_order(airframe: Airframe, quadrants: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the index of the airframe's rotor in each quadrant.
-
-    Args:
-        quadrants: Signs of x (forward) and y (left) of each rotor.
-    """
-    signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]
-    require(
-        sorted(signs) == sorted(quadrants),
-        f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame.",
-    )
-    return [signs.index(quadrant) for quadrant in quadrants]
 
 
 def command_lines(controller: Controller) -> Iterator[str]:

@@ -284,8 +284,8 @@ def policy_numbers(policy: Policy, meta: Mapping[str, Any]) -> PolicyNumbers:
         policy.interface.require(described, "a description")
     require(
         policy.network.is_built_in,
-        "expected a policy with the built-in network, got one with a custom network. Export it with its "
-        "library, or with jax.export.",
+        "expected a policy with the built-in network, got one with another network. Export it with raptor_weights if "
+        "it is of RAPTOR's shape, with its library, or with jax.export.",
     )
     host_policy = jax.tree.map(lambda x: np.asarray(x, np.float32), policy)
     mean, var, layers = host_policy.stats.mean, host_policy.stats.var, host_policy.layers

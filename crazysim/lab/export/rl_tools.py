@@ -16,15 +16,19 @@ from __future__ import annotations
 
 import io
 import tarfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
+from crazysim.drones import Airframe
+from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError, expect, require
 from crazysim.lab.export.policies import constant_line
 from crazysim.storage import as_path, write_file
+from crazysim.train.networks import Network, Policy, Raptor
 
 N_INPUTS, N_MEMORY, N_ACTIONS = 22, 16, 4
 """Sizes of RAPTOR."""
@@ -47,6 +51,14 @@ LAYER_ATTRIBUTES = (
     {"type": "gru"},
     {"activation_function": "IDENTITY", "type": "dense"},
 )
+RAPTOR_ROTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
+"""Signs of x (forward) and y (left) of the rotors in the order of the outputs."""
+RAPTOR_YAW_TORQUE_SIGNS = [-1, 1, -1, 1]
+"""Signs of the torques about z that the drag of these rotors exerts on the body."""
+SHIPPED_FILE = Path(__file__).parents[1] / "policies" / "any.npz"
+"""Weights of the policy that ships with the package."""
+OBSERVATION_SIZES = {"pos_from_goal": 3, "attitude_from_goal": 9, "vel_from_goal": 3, "ang_vel": 3, "last_action": 4}
+"""Observations of the task ``any`` in the order of the inputs."""
 EXAMPLE_STEPS, EXAMPLE_EPISODES = 500, 2
 """Steps and episodes of the example, as in RAPTOR's own checkpoint: their strides are compiled in, too."""
 MAX_NAME_LENGTH = 99
@@ -142,6 +154,106 @@ def to_rl_tools(weights: Mapping[str, np.ndarray], path: str | Path, name: str =
     path = as_path(path)
     write_file(path, file.getvalue())
     return path
+
+
+def shipped_weights() -> dict[str, np.ndarray]:
+    """Weights of the policy for any quadrotor that ships with the package, named as in ``SHAPES``.
+
+    ``crazysim train any --device gpu``, with seed 0, trained them in six minutes on one H200.
+    """
+    return _check_weights(dict(np.load(SHIPPED_FILE)))
+
+
+def raptor_order(airframe: Airframe) -> list[int]:
+    """Return the index of the airframe's rotor for each output, after checking that they turn the same way."""
+    order = rotor_order(airframe, RAPTOR_ROTORS)
+    expect(
+        (signs := airframe.value("rotors.yaw_torque_sign")[order].tolist()) == RAPTOR_YAW_TORQUE_SIGNS,
+        f"rotors of {airframe.name!r} whose drag turns the body by {RAPTOR_YAW_TORQUE_SIGNS} about z, as RAPTOR's",
+        signs,
+        "Swap the propellers of each side.",
+    )
+    return order
+
+
+def find_weights(path: Path) -> dict[str, np.ndarray] | None:
+    """Weights of a checkpoint of rl-tools, or of the package's policy for the path ``any``; None for a run's folder."""
+    if path.suffix == ".tar":
+        return read_rl_tools(path)
+    return shipped_weights() if path == SHIPPED_FILE or (path == Path("any") and not path.exists()) else None
+
+
+def _inputs(airframe: Airframe) -> tuple[np.ndarray, list[int]]:
+    # Policies take observations in the order of their names, and rotors in the order of the airframe.
+    order, names = raptor_order(airframe), sorted(OBSERVATION_SIZES)
+    ends = np.cumsum([OBSERVATION_SIZES[name] for name in names])
+    columns = dict(zip(names, np.split(np.arange(N_INPUTS), ends[:-1]), strict=True))
+    columns["last_action"] = columns["last_action"][order]
+    return np.concatenate([columns[name] for name in OBSERVATION_SIZES]), order
+
+
+def raptor_policy(weights: Mapping[str, np.ndarray], airframe: Airframe) -> Policy:
+    """Make a policy of the task ``any`` from weights of RAPTOR's shape, for ``evaluate`` and ``film``."""
+    inputs, order = _inputs(airframe)
+
+    def apply(_: Any, obs: Any, memory: Any) -> tuple[Any, Any]:
+        outputs, memory = evaluate_step(weights, obs[inputs][None], memory[None])
+        return outputs[0], memory[0]
+
+    network = Network(lambda _key, _n_obs: (), apply, weights["1/initial_hidden_state"], is_limited=True)
+    stats = RunningStats.create(N_INPUTS, (range(N_INPUTS),))  # observations as they are
+    last_layer = np.eye(N_ACTIONS, dtype=np.float32)[:, np.argsort(order)], np.zeros(N_ACTIONS, np.float32)
+    return Policy(stats, [last_layer], (), network)
+
+
+def raptor_weights(policy: Policy, airframe: Airframe) -> dict[str, np.ndarray]:
+    """Weights of a policy that was trained with ``shape="raptor"`` and ``memory=16`` in the task ``any``, named as in
+    ``SHAPES``.
+
+    The normalisation of the observations is part of the first layer, so that they are not limited to ten standard
+    deviations as in training.
+
+    Args:
+        airframe: The drone of the training, which has the order of the rotors.
+    """
+    body, stats = policy.body, policy.stats
+    expect(
+        isinstance(body, Raptor) and body.dense[0].shape == (N_INPUTS, N_MEMORY) and len(policy.layers) == 1,
+        "a policy of RAPTOR's shape",
+        policy.network,
+        "Train the task any, or use shape='raptor' and memory=16.",
+    )
+    inputs, order = _inputs(airframe)
+    host = jax.tree.map(lambda x: np.asarray(x, float), (body.dense, body.memory, policy.layers[0]))
+    (weight, bias), gru, (last_weight, last_bias) = host
+    scale = 1.0 / np.sqrt(np.asarray(stats.var, float) + EPSILON)
+    return _check_weights(
+        {
+            "0/weights": (weight * scale[:, None])[inputs].T,
+            "0/biases": bias - np.asarray(stats.mean, float) * scale @ weight,
+            "1/weights_input": gru.inputs.T,
+            "1/biases_input": gru.bias,
+            "1/weights_hidden": gru.recurrent.T,
+            "1/biases_hidden": np.zeros(3 * N_MEMORY),
+            "1/initial_hidden_state": np.zeros(N_MEMORY),
+            "2/weights": last_weight[:, order].T,
+            "2/biases": last_bias[order],
+        }
+    )
+
+
+def rotor_order(airframe: Airframe, quadrants: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the index of the airframe's rotor in each quadrant.
+
+    Args:
+        quadrants: Signs of x (forward) and y (left) of each rotor.
+    """
+    signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]
+    require(
+        sorted(signs) == sorted(quadrants),
+        f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame.",
+    )
+    return [signs.index(quadrant) for quadrant in quadrants]
 
 
 def read_rl_tools(path: str | Path) -> dict[str, np.ndarray]:

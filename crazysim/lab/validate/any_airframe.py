@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from crazysim.envs.spawn import random_attitude
 from crazysim.errors import expect
+from crazysim.lab.control.any_airframe import MAX_DIFFERENCE, MAX_VELOCITY
 from crazysim.lab.export import rl_tools
-from crazysim.lab.tasks.any_airframe import MAX_DIFFERENCE, MAX_VELOCITY
 from crazysim.lab.validate.rotor_simulators import (
     CRAZYFLOW_AIRFRAMES,
     N_STARTS,
@@ -38,8 +38,6 @@ from crazysim.lab.validate.rows import Row
 from crazysim.lab.validate.simulators import States
 from crazysim.trajectories import figure_eight
 
-SHIPPED_POLICY = Path(__file__).parents[1] / "policies" / "any.tar"
-"""Policy that ships with the package."""
 ADVANCE_PERIOD = 1000 // rl_tools.RAPTOR_RATE
 """Time between two advances of the memory, ms."""
 PERIODS = (ADVANCE_PERIOD, 2)
@@ -97,17 +95,18 @@ def load_network(source: Path | None) -> Network:
     """Load the network of a policy.
 
     Args:
-        source: Checkpoint of rl-tools, ``.tar``, or folder of a run of the task ``any``; None for RAPTOR.
+        source: Checkpoint of rl-tools, ``.tar``, weights of the package, or folder of a run of the task ``any``; None
+            for RAPTOR.
     """
-    if source is None or source.suffix == ".tar":
-        weights = raptor_weights() if source is None else rl_tools.read_rl_tools(source)
+    weights = raptor_weights() if source is None else rl_tools.find_weights(source)
+    if weights is not None:
         memory = weights["1/initial_hidden_state"]
         return Network(
             jax.jit(partial(rl_tools.evaluate_step, weights)), lambda n: np.broadcast_to(memory, (n, *memory.shape))
         )
     from crazysim.train import load_policy  # only here: it needs packages of the extra train
 
-    policy, _, meta = load_policy(source)
+    policy, _, meta = load_policy(str(source))
     expect(meta["freq"] == rl_tools.RAPTOR_RATE, f"a policy at {rl_tools.RAPTOR_RATE} Hz", meta["freq"])
 
     def step(observation: Array, memory: Any) -> tuple[Array, Any]:
@@ -316,10 +315,9 @@ def checks(policy: Path | None) -> Sequence[Callable[[], Iterable[Row]]]:
     """Return the comparisons of RAPTOR and of another policy in all simulators.
 
     Args:
-        policy: See ``load_network``; None for the policy of the package, or for RAPTOR alone if there is none.
+        policy: See ``load_network``; None for the policy of the package.
     """
-    other = policy or (SHIPPED_POLICY if SHIPPED_POLICY.exists() else None)
-    policies = {"RAPTOR": None} | ({} if other is None else {"any": other})
+    policies = {"RAPTOR": None, "any": policy or rl_tools.SHIPPED_FILE}
     return [
         partial(compare, name, source, simulator, fleet, period)
         for simulator, fleet in FLIGHTS

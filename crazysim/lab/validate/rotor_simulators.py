@@ -22,7 +22,7 @@ from crazysim.drones import airframe_names, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.first_principles import Params
 from crazysim.envs.actions import hover_rotor_states
-from crazysim.lab.export.out_of_tree import RAPTOR_ROTORS, RAPTOR_YAW_TORQUE_SIGNS
+from crazysim.lab.export.rl_tools import RAPTOR_ROTORS, RAPTOR_YAW_TORQUE_SIGNS
 from crazysim.lab.plugins.random_airframe import CRAZYFLIE_ARM, CRAZYFLIE_MASS, RandomAirframe, quadrotor_params
 from crazysim.lab.validate.closed_forms import with_states
 from crazysim.lab.validate.simulators import States

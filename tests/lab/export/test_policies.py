@@ -242,7 +242,9 @@ def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, 
 def test_a_custom_network_with_the_weights_of_a_gru_is_an_error(tmp_path, policy, meta):
     """Its outputs are not those of the built-in network, although its weights have the same type."""
     policy_with_memory = with_memory(policy, 3)
-    network = Network(policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(obs, memory)), np.zeros(3))
+    network = Network(
+        policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(gru.encode(obs), memory)), np.zeros(3)
+    )
     with pytest.raises(ConfigError, match="policy with the built-in network, got one with a custom"):
         to_c(policy_with_memory.replace(network=network), tmp_path / "policy.h", meta)
     assert not list(tmp_path.iterdir())

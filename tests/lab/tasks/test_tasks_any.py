@@ -15,7 +15,7 @@ N = 64
 
 @pytest.fixture(scope="module")
 def env():
-    return make("any", N, engine="interpret")
+    return make("any", N, noise=0.0, speed=1.0, engine="interpret")
 
 
 @pytest.fixture(scope="module")
