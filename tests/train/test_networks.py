@@ -317,7 +317,7 @@ def test_a_custom_network_is_trained_saved_and_loaded(tmp_path):
         load_policy(tmp_path, network=Network(lambda key, n: jnp.zeros((n, 3)), lambda w, x, m: (x @ w, m)))
     with pytest.raises(ConfigError, match=r"to be resumed with its custom network. Use network=network"):
         train_quietly(tmp_path, {}, resume=True)
-    with pytest.raises(ConfigError, match="policy with the built-in network, got one with a custom network"):
+    with pytest.raises(ConfigError, match="policy with the built-in network, got one with another network"):
         to_c(policy, tmp_path / "policy.h", meta)
 
 

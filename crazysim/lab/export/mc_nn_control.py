@@ -25,7 +25,7 @@ from crazysim.envs.state import Obs
 from crazysim.envs.statistics import EPSILON
 from crazysim.envs.wrappers import Observe
 from crazysim.errors import require
-from crazysim.lab.export.out_of_tree import rotor_order
+from crazysim.lab.export.rl_tools import rotor_order
 from crazysim.lab.export.tflite import to_tflite
 from crazysim.train.networks import Network, Policy, init_mlp
 

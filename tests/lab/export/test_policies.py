@@ -245,7 +245,7 @@ def test_a_custom_network_with_the_weights_of_a_gru_is_an_error(tmp_path, policy
     network = Network(
         policy_with_memory.network.init, lambda gru, obs, memory: (obs, -gru(gru.encode(obs), memory)), np.zeros(3)
     )
-    with pytest.raises(ConfigError, match="policy with the built-in network, got one with a custom"):
+    with pytest.raises(ConfigError, match="policy with the built-in network, got one with another"):
         to_c(policy_with_memory.replace(network=network), tmp_path / "policy.h", meta)
     assert not list(tmp_path.iterdir())
 

@@ -60,7 +60,7 @@ def test_a_checkpoint_computes_as_in_numpy(tmp_path):
 
 def test_a_run_of_the_task_gets_its_observations_by_name(tmp_path):
     weight = np.random.default_rng(0).normal(scale=0.2, size=(22, 4)).astype(np.float32)
-    config = TrainConfig.create("any", config={"hidden": [], "memory": 0})
+    config = TrainConfig.create("any", config={"hidden": [], "memory": 0, "shape": "default"})
     policy = Policy(RunningStats.create(22), [(jnp.asarray(weight), jnp.zeros(4))])
     meta = describe(make("any", engine="interpret")) | {"settings": dataclasses.asdict(config)}
     checkpoint.save(tmp_path / POLICY_FILE, policy, meta)
