@@ -8,6 +8,8 @@ import compiling
 import machine
 
 os.environ.setdefault("MUJOCO_GL", "egl")
+# Threads of NumPy's linear algebra spin while they wait: a tenth of the processor time of fits and plans.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.update(compiling.environment(os.environ))
