@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from crazysim.errors import ConfigError, require
+from crazysim.lab.validate.any_airframe import load_network
 from crazysim.lab.validate.rows import Row, measure_sections
 from crazysim.lab.validate.sections import NAMES, sections
 
@@ -35,4 +36,6 @@ def validate(
         f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it.",
     )
     source = None if policy is None else Path(policy)
+    if source is not None:
+        load_network(source)  # wrong files are refused before the work
     return measure_sections([section for section in sections(folder, source) if section.name in only])

@@ -93,5 +93,8 @@ def test_what_cannot_run_is_a_failed_row_or_a_message(tmp_path, capsys):
     assert "Repeat: `pip install numpy such==1` and `crazysim validate --only closed`." in format_page(
         [missing], [], "", {}
     )
+    for policy, message in (("none.tar", "expected a checkpoint of rl-tools"), ("none", "none")):
+        assert main(["validate", "--only", "any", "--policy", str(tmp_path / policy)]) == 2
+        assert message in capsys.readouterr().err
     assert main(["validate", "--data", str(tmp_path / "none")]) == 2
     assert "expected a folder with logs" in capsys.readouterr().err
