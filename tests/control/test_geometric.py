@@ -213,6 +213,13 @@ def test_an_integral_compensates_a_push():
     np.testing.assert_allclose(offsets[0.0], 0.1 * 9.81 * gains.mass[0] / gains.kr[0], rtol=0.02)
 
 
+@pytest.mark.parametrize("drone", ["cf21B_500", "bumblebee"])
+def test_gains_of_the_bandwidth_damp_the_position_critically(drone):
+    """m x'' + kv x' + kr x = 0 has a double root: kv^2 = 4 m kr."""
+    p = params(drone, "bandwidth")
+    np.testing.assert_allclose(np.square(p.kv), 4 * p.mass * p.kr, rtol=1e-6)
+
+
 def test_an_integral_does_not_wind_up():
     for distance, largest in ((0.5, 0.5 * 9.81), (10.0, 0.0)):
         sim = Sim(control="state", controller=Geometric(integral=1.0))
