@@ -14,14 +14,16 @@ from crazysim import rotation
 from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.lab.export.rl_tools import (
     N_ACTIONS,
     N_MEMORY,
     RAPTOR_RATE,
+    RAPTOR_ROTORS,
+    RAPTOR_YAW_TORQUE_SIGNS,
     evaluate_step,
-    raptor_order,
     shipped_weights,
 )
 
@@ -60,24 +62,36 @@ class AnyAirframeMemory(PyTree):
     """Last action. (n_worlds, n_drones, 4)"""
 
 
+def rotor_shares(airframe: Airframe) -> np.ndarray:
+    """Shares of the thrust of each rotor in that of the policy's four. (n_rotors, 4)
+
+    The rotors exert the wrench of four at the corners of the frame: four rotors at corners have one of them each,
+    others the least squares of the thrusts.
+    """
+    corners, pos = np.array(RAPTOR_ROTORS), np.asarray(airframe.value("rotors.position"))[:, :2]
+    arms = np.sqrt(np.mean(np.square(pos), axis=0))
+    signs = [airframe.value("rotors.yaw_torque_sign"), np.array(RAPTOR_YAW_TORQUE_SIGNS)]
+    wrenches = [np.vstack([np.ones(len(x)), *x.T, sign]) for x, sign in zip((pos, corners * arms), signs, strict=True)]
+    return np.linalg.pinv(wrenches[0]) @ wrenches[1] * (len(pos) / 4)
+
+
 class AnyAirframeParams(AirframeParams):
     """What the policy is told of an airframe; it finds out everything else in flight."""
 
-    order: Array = leaf(
-        "parameter", 2, (4, 4), airframe=lambda airframe: np.eye(4)[:, np.argsort(raptor_order(airframe))].T
-    )
-    """Matrix from actions to rotors in the order of the airframe. (4, 4)"""
+    shares: Array = leaf("parameter", 2, airframe=rotor_shares)
+    """See ``rotor_shares``. (n_rotors, 4)"""
     max_rotor_vel: Array = leaf("parameter", 1, (1,), airframe=lambda airframe: np.max(airframe.rotor_vel_limits[1]))
     """Largest rotor speed, rpm. (1,)"""
 
 
 class AnyAirframe(Controller, params=AnyAirframeParams, memory=AnyAirframeMemory):
-    """A trained policy that flies quadrotors it has not seen, from 20 g to 8 kg, with delayed commands.
+    """A trained policy that flies multirotors it has not seen, from 20 g to 8 kg, with delayed commands.
 
-    It knows the order and the largest speed of the rotors, and no mass, inertia, thrust or lag: choose it for airframes
-    whose numbers are unknown or change, and to try in simulation what ``crazysim export any`` writes for flight
-    controllers. Position errors beyond 0.5 m and velocity errors beyond 1 m/s along an axis are limited, so that a fast
-    setpoint runs away from it.
+    It knows the places and the largest speed of the rotors, and no mass, inertia, thrust or lag: choose it for
+    airframes whose numbers are unknown or change, and to try in simulation what ``crazysim export any`` writes for
+    flight controllers. It was trained with four rotors at the corners; others exert the wrench of these. Position
+    errors beyond 0.5 m and velocity errors beyond 1 m/s along an axis are limited, so that a fast setpoint runs away
+    from it.
     """
 
     name = "any"
@@ -97,5 +111,6 @@ class AnyAirframe(Controller, params=AnyAirframeParams, memory=AnyAirframeMemory
         observation = jnp.concatenate([*parts.values(), s.ang_vel, memory.action])
         outputs, network = evaluate_step(self.weights, observation[None], memory.network[None])
         action = rotation.clip(outputs[0], -1.0, 1.0)
-        rotor_vel = params.order @ (params.max_rotor_vel / 2 * (action + 1))
-        return rotor_vel, AnyAirframeMemory(network[0], action)
+        # Thrust is about proportional to the square of the speed; the policy corrects for the rest.
+        thrusts = rotation.clip(params.shares @ jnp.square((action + 1) / 2), 0.0, 1.0)
+        return params.max_rotor_vel * jnp.sqrt(thrusts), AnyAirframeMemory(network[0], action)

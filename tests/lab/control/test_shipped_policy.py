@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import crazysim
-from crazysim import ConfigError, RandomAirframe, Sim
+from crazysim import RandomAirframe, Sim
 from crazysim.__main__ import main
-from crazysim.drones import load_airframe
+from crazysim.drones import estimate_airframe, load_airframe
 from crazysim.envs import make
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
+from crazysim.lab.control.any_airframe import rotor_shares
 from crazysim.lab.export.rl_tools import evaluate, raptor_order, raptor_policy, raptor_weights
 from crazysim.plugins.effects import Latency
 from crazysim.train.networks import Policy, init_weights, raptor_network
@@ -54,6 +55,7 @@ def test_it_holds_drawn_airframes_with_delayed_commands():
     )
 
 
+@pytest.mark.long("compiles the start of an episode with drawn airframes")
 def test_weights_compute_the_actions_of_the_trained_policy(rng, obs, turned):
     """Over steps with memory, to rounding, also if the rotors of the training have another order."""
     airframe, network = load_airframe(turned), raptor_network(16)
@@ -104,9 +106,18 @@ def test_the_order_of_the_rotors_does_not_matter(turned):
     assert np.linalg.norm(flights[0] - [0.3, -0.2, 1.0]) < 0.05
 
 
-def test_airframes_that_it_cannot_fly_are_refused(tmp_path):
-    path = tmp_path / "other_way.toml"
-    text = (Path(crazysim.__file__).parent / "drones" / "crazyflie.toml").read_text()
-    path.write_text(text.replace("[-1, 1, -1, 1]", "[1, -1, 1, -1]"))
-    with pytest.raises(ConfigError, match="Swap the propellers"):
-        Sim(control="state", controller="any", drone=path)
+@pytest.mark.parametrize("layout", [{"n_rotors": 6}, {"n_rotors": 8, "mass": 4.0, "arm": 0.5}, {"layout": "+"}])
+def test_other_layouts_of_rotors_exert_the_wrench_of_four(layout, tmp_path):
+    settings = {"mass": 2.0, "arm": 0.25, "propeller": 0.25, "thrust_to_weight": 3} | layout
+    path = tmp_path / "mine.toml"
+    path.write_text(estimate_airframe(**settings))
+    shares = rotor_shares(load_airframe(path))
+    np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-9)  # all give their largest thrust together
+    sim = Sim(drone=path, control="state", controller="any")
+    sim.state_control(pos=[0.3, -0.2, 1.0], yaw=0.5)
+    sim.step(4 * sim.freq)
+    assert np.linalg.norm(np.asarray(sim.data.states.pos)[0, 0] - [0.3, -0.2, 1.0]) < 0.05
+
+
+def test_four_rotors_at_corners_have_the_actions_themselves():
+    np.testing.assert_allclose(rotor_shares(load_airframe("cf21B_500")), np.eye(4), atol=1e-12)
