@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3607,
     "geometry": 940,
-    "lab": 16747,
+    "lab": 16754,
     "media": 1080,
     "plugins": 4875,
     "scene": 2569,
