@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Self
 
 import jax
@@ -10,7 +11,9 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
+from crazysim import rotation
 from crazysim.engine.pytree import PyTree, leaf
+from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tracks import Track, gates_of_track
 from crazysim.errors import expect
 
@@ -37,7 +40,7 @@ class RaceClock(PyTree):
         return cls(jnp.zeros((), jnp.int32), jnp.full(laps * track.n_gates, jnp.inf), jnp.zeros(()))
 
     def advance(self, track: Track, before: Array, now: Array, time_before: Array, time_now: Array) -> Self:
-        """Return the clock after a straight motion of the drone, which passes at most one gate.
+        """Return the clock after a straight motion of the drone, which passes at most one gate, tunnels at their ends.
 
         Args:
             track: The track, which is constant in compiled programs.
@@ -47,7 +50,11 @@ class RaceClock(PyTree):
             time_now: Time now, s.
         """
         before, now = jnp.asarray(before), jnp.asarray(now)
-        is_passed, share = crosses(track, self.passed % track.n_gates, before, now)
+        gates, gate = gates_of_track(track), self.passed % track.n_gates
+        ends = np.array([gate.pos + gate.rot[:, 0] * gate.length / 2 for gate in gates], now.dtype)
+        rot = pick_entry(np.array([gate.rot.ravel() for gate in gates], now.dtype), gate).reshape(3, 3)
+        start, end = (rot.T @ (x - pick_entry(ends, gate)) for x in (before, now))
+        is_passed, share = Openings.of(track).crosses(gate, start, end)
         is_passed &= self.passed < len(self.times)
         time = time_before + share * (time_now - time_before)
         times = jnp.where(is_passed & (np.arange(len(self.times)) == self.passed), time, self.times)
@@ -76,45 +83,55 @@ class RaceClock(PyTree):
         return jnp.diff(self.times[track.n_gates - 1 :: track.n_gates], prepend=0.0)
 
 
-def crosses(track: Track, gate: Array, before: Array, now: Array) -> tuple[Array, Array]:
-    """Return whether a straight motion passes a gate, and the share of the motion up to there.
+@dataclass(frozen=True)
+class Openings:
+    """Openings of the gates of a track, as constants of a compiled program."""
 
-    Openings that are polygons are passed forwards at the end of the gate, and balls where the motion enters them.
+    planes: tuple[tuple[tuple[float, ...], ...], ...]
+    """Half-planes of each gate, as ``Gate.half_planes``. (n_gates, n, 3)"""
+    radii: tuple[tuple[float], ...]
+    """Radius of balls, m; zero for polygons. (n_gates, 1)"""
+    sizes: tuple[tuple[float, float], ...]
+    """Width and height of each opening, m. (n_gates, 2)"""
 
-    Args:
-        gate: Index of the gate. ()
-        before: Position before, m. (3,)
-        now: Position now, m. (3,)
-    """
-    gates = gates_of_track(track)
-    pos = np.array([gate.pos + gate.rot[:, 0] * gate.length / 2 for gate in gates])
-    rot = np.array([gate.rot for gate in gates])
-    is_ball = np.array([gate.is_ball for gate in gates])
-    radius = np.array([float(gate.opening) if gate.is_ball else 1.0 for gate in gates])
-    n_planes = max(1 if gate.is_ball else len(gate.half_planes) for gate in gates)
-    everywhere = np.array([0.0, 0.0, 1.0])  # a half-plane without an edge
-    planes = np.array([[everywhere] * n_planes for _ in gates])
-    for k, entry in enumerate(gates):
-        if not entry.is_ball:
-            planes[k, : len(entry.half_planes)] = entry.half_planes
+    @classmethod
+    def of(cls, track: Track) -> Self:
+        gates = gates_of_track(track)
+        everywhere = [(0.0, 0.0, 1.0)]  # a half-plane without an edge
+        planes = [everywhere if gate.is_ball else list(map(tuple, gate.half_planes.tolist())) for gate in gates]
+        n = max(map(len, planes))
+        return cls(
+            tuple(tuple(x + everywhere * (n - len(x))) for x in planes),
+            tuple((float(gate.opening) if gate.is_ball else 0.0,) for gate in gates),
+            tuple(tuple(gate.size.tolist()) for gate in gates),
+        )
 
-    def pick(values: np.ndarray) -> Array:
-        return jnp.asarray(values, now.dtype)[gate]
+    def crosses(self, gate: Array, start: Array, end: Array) -> tuple[Array, Array]:
+        """Return whether a straight motion passes a gate, and the share of the motion up to there.
 
-    start, end = (pick(rot).T @ (x - pick(pos)) for x in (before, now))
-    way = end - start
-    # Polygons: forwards through the plane.
-    forwards = (start[0] < 0) & (end[0] >= 0)
-    share = -start[0] / jnp.where(forwards, way[0], 1)
-    point = (start + share * way)[1:]
-    through = forwards & jnp.all(pick(planes)[:, :2] @ point < pick(planes)[:, 2])
-    # Balls: the first point of the line within the radius.
-    a, b, c = way @ way, start @ way, start @ start - pick(radius) ** 2
-    root = jnp.sqrt(jnp.maximum(b * b - a * c, 0))
-    entry_share = jnp.where(c <= 0, 0.0, (-b - root) / jnp.where(a > 0, a, 1))
-    enters = (c <= 0) | ((b * b >= a * c) & (entry_share >= 0) & (entry_share <= 1) & (a > 0))
-    ball = jnp.asarray(is_ball)[gate]
-    return jnp.where(ball, enters, through), jnp.where(ball, entry_share, share).clip(0, 1)
+        Polygons are passed forwards, and balls where the motion enters them.
+
+        Args:
+            gate: Index of the gate. (...)
+            start: Position before, in the gate's frame, m. (..., 3)
+            end: Position after, in the gate's frame, m. (..., 3)
+        """
+        way = end - start
+        planes = np.reshape(np.array(self.planes, end.dtype), (len(self.planes), -1))
+        y, z, distance = jnp.moveaxis(pick_entry(planes, gate).reshape(*gate.shape, -1, 3), -1, 0)
+        radius = pick_entry(np.array(self.radii, end.dtype), gate)[..., 0]
+        # Polygons: forwards through the plane.
+        forwards = (start[..., 0] < 0) & (end[..., 0] >= 0)
+        share = -start[..., 0] / jnp.where(forwards, way[..., 0], 1)
+        point = start + share[..., None] * way
+        through = forwards & jnp.all(y * point[..., 1:2] + z * point[..., 2:] < distance, axis=-1)
+        # Balls: the first point of the line within the radius.
+        a, b, square = (jnp.sum(x * y, axis=-1) for x, y in ((way, way), (start, way), (start, start)))
+        c = square - radius * radius
+        root = rotation.safe_sqrt(jnp.maximum(b * b - a * c, 0))
+        entry = jnp.where(c <= 0, 0.0, (-b - root) / jnp.where(a > 0, a, 1))
+        enters = (c <= 0) | ((b * b >= a * c) & (entry >= 0) & (entry <= 1) & (a > 0))
+        return jnp.where(radius > 0, enters, through), rotation.clip(jnp.where(radius > 0, entry, share), 0, 1)
 
 
 def time_flight(track: Track, times: ArrayLike, pos: ArrayLike, laps: int = 1) -> RaceClock:

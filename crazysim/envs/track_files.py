@@ -13,6 +13,8 @@ from crazysim.errors import ConfigError, expect, optional_import, require
 from crazysim.storage import MAX_TEXT_BYTES, is_file, read_text
 
 TRACK_FOLDER = Path(__file__).parent / "race_tracks"
+DEFAULT_TRACK = "lsy_drone_racing"
+"""Name of ``Track()``."""
 ARENA_MARGIN = 5.0
 """Distance of the limits of the arena from gates, start and finish, m. Track files have no limits."""
 
@@ -21,7 +23,7 @@ Shape = Callable[[Mapping[str, Any], float], Points | float]
 
 def track_names() -> tuple[str, ...]:
     """Return the names of the built-in tracks."""
-    return tuple(sorted(path.stem for path in TRACK_FOLDER.glob("*.yaml")))
+    return (DEFAULT_TRACK, *sorted(path.stem for path in TRACK_FOLDER.glob("*.yaml")))
 
 
 def load_track(source: str | Path) -> Track:
@@ -35,6 +37,8 @@ def load_track(source: str | Path) -> Track:
     Raises:
         ConfigError: If there is no such track, or the file is no track.
     """
+    if str(source) == DEFAULT_TRACK:
+        return Track()
     path = TRACK_FOLDER / f"{source}.yaml" if str(source) in track_names() else Path(source)
     require(
         is_file(path), f"expected a track as one of {', '.join(track_names())}, or a YAML file, got {str(source)!r}."

@@ -176,7 +176,8 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
         value = np.asarray(getattr(track, name), float)
         is_valid = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
-        if not is_valid or not value.size or not np.all(np.isfinite(value)):
+        is_valid |= name == "obstacles_pos" and not value.size
+        if not is_valid or (not value.size and name != "obstacles_pos") or not np.all(np.isfinite(value)):
             expected = str(shape).replace("-1", "n")
             raise ConfigError(f"expected {name} of the track as finite numbers, {expected}, got shape {value.shape}")
     low, high = np.asarray(track.low, float), np.asarray(track.high, float)
@@ -195,7 +196,7 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
     # Starts that are clear of gates, obstacles and limits.
     starts = np.asarray(track.start) + start_offsets(n_drones)
     for kind, points, clearance in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
-        distance = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)
+        distance = np.linalg.norm((starts[:, None] - np.reshape(points, (1, -1, 3)))[..., :2], axis=-1)
         if np.any(distance < clearance + jitter):
             k = int(np.argwhere(distance < clearance + jitter)[0, 1])
             raise ConfigError(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crazysim import Sim
+from crazysim import ConfigError, Sim
 from crazysim.engine.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks import race as task
@@ -321,3 +321,60 @@ def test_a_track_of_the_user_can_be_raced():
     np.testing.assert_allclose(metrics["success"], 2 / 3, rtol=1e-6)
     np.testing.assert_allclose(metrics["crashed"], 1 / 3, rtol=1e-6)
     assert metrics["error"] == 0
+
+
+# Tracks with other gates, and laps ------------------------------------------------------------------------------------
+
+HALF = 0.225
+SQUARES = tuple([((HALF, HALF), (HALF, -HALF), (-HALF, -HALF), (-HALF, HALF))] * 4)
+
+
+def test_openings_of_the_default_size_follow_the_rules_of_the_default_track():
+    """The same ways, corners and gates passed for squares that a track states, with drones at and off their gates."""
+    rng, rots = np.random.default_rng(0), Rotation.from_euler("xyz", TRACK.gates_rpy)
+    pos, vel = np.float32(rng.uniform([-2, -1, 0.3], [2, 1, 1.9], (32, 1, 3))), np.zeros((32, 1, 3), np.float32)
+    for k in range(0, 32, 2):
+        pos[k] = np.array(TRACK.gates_pos[k % 4]) + rots[k % 4].apply([-0.01, *rng.uniform(-0.1, 0.1, 2)])
+        vel[k] = 2 * rots[k % 4].apply([1, 0, 0])
+    results = []
+    for track in (TRACK, Track(openings=SQUARES)):
+        env = make_env(32, track=track)
+        passed = jnp.asarray(np.arange(32)[:, None] % 4, jnp.int32)
+        before = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=passed)
+        ways = jax.jit(vmap_worlds(rules.remaining_way))(before.data)
+        after = jax.jit(env.step)(before, before.action)
+        results.append((np.asarray(ways), np.asarray(after.info["gates_passed"]) - passed, after.obs))
+    np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-5)
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+    np.testing.assert_array_equal(results[0][1][::2], 1)
+    for name, value in results[0][2].items():
+        np.testing.assert_allclose(value, results[1][2][name], atol=1e-5, err_msg=name)
+
+
+def test_laps_lead_through_the_same_gates_again_and_balls_are_passed_in_any_direction():
+    """A gate at the origin along x and a ball 2 m ahead of it, two laps, without obstacles."""
+    track = Track(
+        gates_pos=[(0, 0, 1), (2, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, openings=[SQUARES[0], 0.3], obstacles_pos=(),
+        start=(-2, 0, 1), low=(-9, -9, 0), high=(9, 9, 9),
+    )  # fmt: skip
+    env = make_env(4, track=track, laps=2)
+    pos = np.float32([[[-0.01, 0, 1]], [[-0.01, 0, 1]], [[2, 0.31, 1]], [[2, -0.31, 1]]])
+    vel = np.float32([[[2, 0, 0]], [[2, 0, 0]], [[0, -2, 0]], [[0, 2, 0]]])
+    passed = jnp.array([[0], [2], [1], [3]])
+    before = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=passed)
+    after = jax.jit(env.step)(before, before.action)
+    np.testing.assert_array_equal(after.info["gates_passed"], passed + 1)
+    np.testing.assert_array_equal(np.asarray(after.obs["target_gate"])[:, 0, 0], [1, 1, 0, -1])
+    np.testing.assert_array_equal(after.info["finished"][:, 0], [False, False, False, True])
+    assert "obstacles_pos" not in after.obs
+    # From the ball back to the gate, which the way leads around: 2 (0.45) - 0.15 m and the distance to a side.
+    back = 0.75 + min(np.hypot(2, 0.45), np.hypot(2, 0.45))
+    ways = np.asarray(jax.jit(vmap_worlds(rules.remaining_way))(before.data))[:, 0]
+    np.testing.assert_allclose(ways, [0.01 + 2 + back + 2, 0.01 + 2, 0.31 + back + 2, 0.31], atol=1e-4)
+
+
+def test_a_track_file_is_raced_and_tunnels_are_refused():
+    race = task.Race(track="split_s_gates")
+    assert race.course.n_gates == 19
+    with pytest.raises(ConfigError, match="got tunnels"):
+        make_env(1, track="split_s_shapes")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.envs import gates_of_track, load_track, track_names
+from crazysim.envs import Track, gates_of_track, load_track, track_names
 
 FILE = """
 initState: { pos: [0, 0, 1], vel: [0, 0, 0] }
@@ -33,8 +33,9 @@ def test_a_track_has_its_gates_in_their_order_with_directions_and_margins(tmp_pa
 
 def test_built_in_tracks_are_those_of_their_sources():
     """Three laps of seven points on UZH's Split-S track, without the last two."""
-    assert track_names() == ("split_s_gates", "split_s_shapes", "split_s_waypoints")
-    tracks = {name: load_track(name) for name in track_names()}
+    assert track_names() == ("lsy_drone_racing", "split_s_gates", "split_s_shapes", "split_s_waypoints")
+    assert load_track("lsy_drone_racing") == Track()
+    tracks = {name: load_track(name) for name in track_names()[1:]}
     assert [track.n_gates for track in tracks.values()] == [19, 7, 19]
     for track in tracks.values():
         assert track.start == (-5.0, 4.5, 1.2)
@@ -68,5 +69,5 @@ def test_law_09_a_wrong_track_file_is_named(tmp_path, old, new, words):
     path.write_text(FILE.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         load_track(path)
-    with pytest.raises(ConfigError, match=r"one of split_s_gates.*got 'nowhere'"):
+    with pytest.raises(ConfigError, match=r"one of lsy_drone_racing.*got 'nowhere'"):
         load_track("nowhere")

@@ -165,7 +165,7 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 
 
-def pick_entry(x: Array, index: Array) -> Array:
+def pick_entry(x: Array | np.ndarray, index: Array) -> Array:
     """Return the entry with an index, by masking all entries, which is faster than indexing. (..., k)
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import field
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,13 +18,23 @@ from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
 from crazysim.engine.pytree import device_array, host_array, static
 from crazysim.engine.stage import stage
+from crazysim.envs.race_clock import Openings
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tasks.goals import OutcomeTask, ProgressTask, collision_placements, pick_entry
 from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
-from crazysim.envs.tracks import Track, check_track, count_random_numbers, random_course, start_offsets
+from crazysim.envs.track_files import load_track
+from crazysim.envs.tracks import (
+    Track,
+    check_track,
+    count_random_numbers,
+    gate_body,
+    gates_of_track,
+    random_course,
+    start_offsets,
+)
 from crazysim.errors import require
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
@@ -68,10 +79,13 @@ class Race(ProgressTask, OutcomeTask):
 
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3, as in the table above."""
-    track: Track = field(default_factory=Track)
-    """The course. Level 3 uses only the limits of the arena, and numbers and heights of gates and obstacles."""
+    track: Track | str | Path = field(default_factory=Track)
+    """The course, or a name or file for ``load_track``. Level 3 uses only the limits of the arena, and numbers and
+    heights of gates and obstacles."""
     sensor_range: float = setting(default=SENSOR_RANGE, low=0.0)
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
+    laps: int = setting(default=1, low=1, high=100)
+    """Number of laps."""
     seconds: float = 12.0
     """Length of an episode, s."""
     reward: Rewards = dense
@@ -82,7 +96,7 @@ class Race(ProgressTask, OutcomeTask):
     gates."""
 
     passed: Array = state((), dtype=np.int32)
-    """Number of gates passed, which is the index of the next gate."""
+    """Number of gates passed in all laps."""
     last_pos: Array = state((3,))
     """Position one physics step ago, m."""
     gates_visited: Array = state(("gates",), dtype=bool)
@@ -97,34 +111,47 @@ class Race(ProgressTask, OutcomeTask):
     """Nominal attitudes of gates, xyzw; None if objects are not displaced."""
     gates: Handle = static()
     """Handle of the gates, in their order."""
-    obstacles: Handle = static()
-    """Handle of the obstacles."""
+    obstacles: Handle | None = static()
+    """Handle of the obstacles; None without."""
+    openings: Openings | None = static()
+    """Openings of the gates; None for squares of 0.45 m."""
+    n_laps: int = static()
+    """Number of laps."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.track, Track):
+            object.__setattr__(self, "track", load_track(self.track))
+        super().__post_init__()
 
     def install(self, sim: Sim) -> None:
         require(
-            not self.practice or sim.n_drones < max(self.track.n_gates, 2),
-            f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
+            not self.practice or sim.n_drones < max(self.course.n_gates, 2),
+            f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.course.n_gates} "
             f"gates: drones start behind different gates. Use practice=False.",
         )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
-        course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
-        stand_height = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
-        # Posts of all gates have the same length, so that they are computed as one batch; most extend below the floor.
-        gates = sim.scene.add("gate", count=course.n_gates, pos=course.gates_pos, quat=self._gates_quat(),
-                              stand=stand_height, width=OPENING, height=OPENING)  # fmt: skip
-        obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT_TO_TOP
-        obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=obstacles_pos, height=POLE_HEIGHT)
+        course = check_track(self.course, sim.n_drones, float(jitter), self.level == 3)
+        gates, obstacles = self._add_gates(sim), None
+        if course.n_obstacles:
+            feet = np.asarray(course.obstacles_pos, float) - FOOT_TO_TOP
+            obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=feet, height=POLE_HEIGHT)
         if self.level >= 1:
             _repeat_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
         low, high = (np.asarray(x, float).astype(sim.data.states.pos.dtype) for x in (course.low, course.high))
-        contacts = sim.scene.contact_fn([gates, obstacles], drones=False)
+        openings = None if course.openings is None else Openings.of(course)
+        # Balls have nothing to touch.
+        framed = [gates] if openings is None else [gates[k] for k, (r,) in enumerate(openings.radii) if not r]
+        touched = framed if obstacles is None else [*framed, obstacles]
+        contacts = sim.scene.contact_fn(touched, drones=False)
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
             pos = data.states.pos
             fails = jnp.any((pos < low) | (pos > high), axis=-1) | contacts(data).any
             passed = race_of(data).passed + (rules.passes_gate(data) & ~(race_of(data).failure | fails))
-            return self.judge(self.write(data, passed=passed, last_pos=pos), passed >= course.n_gates, fails)
+            return self.judge(
+                self.write(data, passed=passed, last_pos=pos), passed >= self.laps * course.n_gates, fails
+            )
 
         numbers: dict[str, Any] = {
             "gates_visited": np.zeros(course.n_gates),
@@ -134,10 +161,11 @@ class Race(ProgressTask, OutcomeTask):
             numbers["nominal_pos"] = np.zeros((course.n_gates + course.n_obstacles, 3))
             numbers["nominal_quat"] = np.zeros((course.n_gates, 4))
         placements = [*collision_placements(sim), StagePlacement(judge, before="increment_steps")]
-        self.add_states(sim, placements, gates=gates, obstacles=obstacles, **numbers)
+        fixed = {"gates": gates, "obstacles": obstacles, "openings": openings, "n_laps": self.laps}
+        self.add_states(sim, placements, **fixed, **numbers)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
-        course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
+        course, n_drones, dtype = self.course, data.core.n_drones, data.states.pos.dtype
         # Random numbers that this level needs, from one draw.
         sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:
@@ -196,12 +224,31 @@ class Race(ProgressTask, OutcomeTask):
     def target(self, data: SimData) -> Array:
         return rules.next_gate(data)[0]
 
+    @property
+    def course(self) -> Track:
+        """The track, loaded."""
+        return self.track  # type: ignore[return-value]
+
+    def _add_gates(self, sim: Sim) -> Handle:
+        course = self.course
+        poses: dict[str, Any] = {"pos": course.gates_pos, "quat": self._gates_quat()}
+        if course.openings is not None:
+            gates = gates_of_track(course)
+            require(
+                not any(gate.length for gate in gates),
+                "expected gates without length for the task race, got tunnels. Use length: 0.0.",
+            )
+            return sim.scene.add([gate_body(gate) for gate in gates], "gate", count=course.n_gates, **poses)
+        # Posts of all gates have the same length, so that they are computed as one batch; most extend below the floor.
+        stand = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
+        return sim.scene.add("gate", count=course.n_gates, **poses, stand=stand, width=OPENING, height=OPENING)
+
     def _gates_quat(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # returns an array even while a step is traced
-            return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
+            return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.course.gates_rpy, self.course.n_gates, 3)))
 
     def _displace_objects(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
-        course, dtype = self.track, data.states.pos.dtype
+        course, dtype = self.course, data.states.pos.dtype
         start, pos, quat, poles = course.start, course.gates_pos, self._gates_quat(), course.obstacles_pos
         if self.level == 3:
             start, pos, quat, poles = random_course(course, x["course"])
@@ -210,7 +257,8 @@ class Race(ProgressTask, OutcomeTask):
         pole_shift = (2 * x["obstacles"] - 1) * np.array(OBSTACLE_JITTER, dtype)
         gates_quat = rotation.multiply(quat, rotation.from_rpy(gate_shift[..., 3:]))
         data = race_of(data).gates.set_pose(data, pos + gate_shift[..., :3], gates_quat)
-        data = race_of(data).obstacles.set_pose(data, poles + pole_shift - FOOT_TO_TOP.astype(dtype))
+        if race_of(data).obstacles is not None:
+            data = race_of(data).obstacles.set_pose(data, poles + pole_shift - FOOT_TO_TOP.astype(dtype))
         return self.write(data, nominal_pos=jnp.concatenate([pos, poles]), nominal_quat=quat), start
 
 

@@ -14,7 +14,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tasks.race import Race
 from crazysim.envs.tasks.race_observations import observe
-from crazysim.envs.tasks.race_rules import gates_of, next_gate, race_of
+from crazysim.envs.tasks.race_rules import gate_index, gates_of, next_gate, race_of
 from crazysim.plugins.sensors.camera import Camera
 
 AWAY_COST = 0.03
@@ -60,7 +60,8 @@ class RaceByCamera(Race):
         """
         s, record = data.states, race_of(data)
         matrix = rotation.matrix(s.quat)
-        is_next = record.passed[..., None] == np.arange(self.track.n_gates, dtype=np.int32)
+        next_index = jnp.where(record.success, -1, gate_index(data))
+        is_next = next_index[..., None] == np.arange(self.course.n_gates, dtype=np.int32)
         obs = {
             "ang_vel": s.ang_vel,
             "height": s.pos[..., 2:],
@@ -72,7 +73,7 @@ class RaceByCamera(Race):
 
     def privileged(self, data: SimData) -> dict[str, Array]:
         obs = observe(data, np.inf)
-        return {name: obs[name] for name in PRIVILEGED_NAMES}
+        return {name: obs[name] for name in PRIVILEGED_NAMES if name in obs}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         s, (gate_pos, _) = data.states, next_gate(data)

@@ -12,7 +12,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.envs.tasks.goals import flight_over, nearest_drones, nearest_entries, pick_entry
-from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
+from crazysim.envs.tasks.race_rules import OPENING, gate_index, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
 """Corners of a gate's opening in the gate's frame, m. (4, 3)"""
@@ -61,9 +61,13 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     # Corners of the next two gates, body frame.
     corners = []
     for k in (0, 1):
-        index = jnp.minimum(record.passed + k, n_gates - 1)
+        index = gate_index(data, k)
         pos, quat = pick_entry(gates_pos, index)[..., None, :], pick_entry(gates_quat, index)[..., None, :]
-        gate_corners = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
+        own_corners = jnp.asarray(CORNERS, pos.dtype)
+        if record.openings is not None:
+            size = pick_entry(np.insert(np.array(record.openings.sizes, pos.dtype), 0, 0, axis=-1), index)
+            own_corners = own_corners / OPENING * size[..., None, :]
+        gate_corners = pos + rotation.rotate(quat, own_corners)
         corners.append(to_body_frame(gate_corners - s.pos[..., None, :]))
     # Horizontal vectors to the nearest poles.
     to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
@@ -73,17 +77,20 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "quat": s.quat,
         "vel": s.vel,
         "ang_vel": s.ang_vel,
-        "target_gate": jnp.where(record.success, -1, record.passed)[..., None],
+        "target_gate": jnp.where(record.success, -1, gate_index(data))[..., None],
         "gates_pos": gates_pos,
         "gates_quat": gates_quat,
         "gates_visited": visited_gates,
-        "obstacles_pos": poles,
-        "obstacles_visited": visited_obstacles,
         "rot": matrix,
         "vel_body": to_body_frame(s.vel[..., None, :]),
         "gate_corners": jnp.concatenate(corners, axis=-2),
-        "obstacles_near": to_body_frame(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
     }
+    if n_obstacles:
+        obs |= {
+            "obstacles_pos": poles,
+            "obstacles_visited": visited_obstacles,
+            "obstacles_near": to_body_frame(nearest_entries(square_distance, to_poles, min(2, n_obstacles))),
+        }
     if n_drones > 1:
         obs["drones_near"] = to_body_frame(nearest_drones(data, 2, ~flight_over(record))[0])
     return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

@@ -41,6 +41,8 @@ def gates_of(data: SimData) -> tuple[Array, Array]:
 
 def obstacles_of(data: SimData) -> Array:
     """Return the upper ends of the obstacles, m. (..., n_obstacles, 3)"""
+    if race_of(data).obstacles is None:
+        return jnp.zeros((*data.states.pos.shape[:-2], 0, 3), data.states.pos.dtype)
     rows = race_of(data).obstacles.rows
     pos = data.objects.pos[..., rows[0] : rows[-1] + 1, :]  # type: ignore[union-attr]
     return pos + np.array([0.0, 0.0, POLE_HEIGHT], pos.dtype)
@@ -49,8 +51,15 @@ def obstacles_of(data: SimData) -> Array:
 def next_gate(data: SimData) -> tuple[Array, Array]:
     """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's next gate, or of the last gate."""
     pos, quat = gates_of(data)
-    index = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
+    index = gate_index(data)
     return pick_entry(pos, index), pick_entry(quat, index)
+
+
+def gate_index(data: SimData, ahead: int = 0) -> Array:
+    """Return the index of the gate that is some gates after each drone's next gate, or of the last gate. (...)"""
+    record, n = race_of(data), len(race_of(data).gates)
+    index = jnp.minimum(record.passed + ahead, record.n_laps * n - 1)
+    return index if record.n_laps == 1 else index % n
 
 
 def passes_gate(data: SimData) -> Array:
@@ -58,6 +67,8 @@ def passes_gate(data: SimData) -> Array:
     record = race_of(data)
     pos, quat = next_gate(data)
     pos_before, pos_now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
+    if record.openings is not None:
+        return record.openings.crosses(gate_index(data), pos_before, pos_now)[0] & ~record.success
     crossed = (pos_before[..., 0] < 0) & (pos_now[..., 0] >= 0)
     fraction = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
     crossing = pos_before + fraction * (pos_now - pos_before)
@@ -74,14 +85,30 @@ def remaining_way(data: SimData) -> Array:
     """Return the length of the way through the middles of all gates that are not passed, m. (n_drones,)"""
     record = race_of(data)
     pos, quat = gates_of(data)
-    legs = way_to_gate(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
-    is_ahead = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
+    n, openings = pos.shape[-2], record.openings
+    sizes = None
+    if openings is not None:
+        size = np.max(openings.sizes, axis=-1, keepdims=True)
+        sizes = np.where(np.array(openings.radii) > 0, 0, size).astype(pos.dtype)
+    next_size = None if sizes is None else pick_entry(sizes, gate_index(data))
     next_pos, next_quat = next_gate(data)
-    way_to_next = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
-    return jnp.where(record.success, 0, way_to_next + jnp.sum(jnp.where(is_ahead, legs, 0), axis=-1))
+    way_to_next = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos), next_size)
+    # The leg to each gate, and how often it is flown after the next gate.
+    first = 1 if record.n_laps == 1 else 0
+    before = pos[..., :-1, :] if first else jnp.roll(pos, 1, axis=-2)
+    offsets = rotation.rotate_inverse(quat[..., first:, :], before - pos[..., first:, :])
+    legs = way_to_gate(offsets, None if sizes is None else sizes[first:])
+    index = np.arange(first, n, dtype=np.int32)
+    if first:
+        is_ahead = index > record.passed[..., None]
+        rest = jnp.sum(jnp.where(is_ahead, legs, 0), axis=-1)
+    else:
+        flights = record.n_laps - 1 - (record.passed[..., None] - index) // n
+        rest = jnp.sum(flights * legs, axis=-1)
+    return jnp.where(record.success, 0, way_to_next + rest)
 
 
-def way_to_gate(pos: Array) -> Array:
+def way_to_gate(pos: Array, size: Array | np.ndarray | None = None) -> Array:
     """Return the length of the way to a gate's middle that avoids the frame, m. (...)
 
     In front of the gate it is longer than the straight line for positions outside of the funnel (``FUNNEL_RADIUS``).
@@ -89,13 +116,21 @@ def way_to_gate(pos: Array) -> Array:
 
     Args:
         pos: Position in the gate's frame, m. (..., 3)
+        size: Larger side of the opening, m, by which the distances are scaled, or 0 for a waypoint without a frame;
+            None for 0.45 m. (..., 1)
     """
+    scale: Any = 1.0 if size is None else size / OPENING
     bypass = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
+    if size is not None:
+        bypass = scale[..., None] * bypass
+        scale = scale[..., 0]
     bypass_distance = rotation.safe_norm(pos[..., None, :] - bypass)[..., 0]
     axis_distance = rotation.safe_norm(pos[..., 1:])[..., 0]
-    detour = jnp.maximum(axis_distance - (FUNNEL_RADIUS - pos[..., 0]), 0)
-    way_around = 2 * BYPASS_DISTANCE - FUNNEL_RADIUS + jnp.min(bypass_distance, axis=-1)
-    return jnp.where(pos[..., 0] > 0, way_around, rotation.safe_norm(pos)[..., 0] + detour)
+    distance = rotation.safe_norm(pos)[..., 0]
+    detour = jnp.maximum(axis_distance - (scale * FUNNEL_RADIUS - pos[..., 0]), 0)
+    way_around = scale * (2 * BYPASS_DISTANCE - FUNNEL_RADIUS) + jnp.min(bypass_distance, axis=-1)
+    way = jnp.where(pos[..., 0] > 0, way_around, distance + detour)
+    return way if size is None else jnp.where(scale > 0, way, distance)
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:

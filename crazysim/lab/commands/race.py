@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crazysim.commands.options import DefaultsFormatter, number, size
+from crazysim.errors import expect, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
 
 if TYPE_CHECKING:
@@ -14,11 +15,15 @@ if TYPE_CHECKING:
 
 
 def add_parsers(commands: argparse._SubParsersAction) -> None:
-    text = "fly a race track by a time-optimal plan; print laps and splits, draw and film the flight"
+    text = "fly a race track by a time-optimal plan or a policy; print laps and splits, draw and film the flight"
     parser = commands.add_parser("race", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
     add("track", help="name of a track, such as split_s_gates, or a YAML file; list prints all names")
+    policy_help = (
+        "folder of a training run of the task race, whose policy flies; by default a time-optimal plan is flown"
+    )
+    add("--policy", type=Path, metavar="FOLDER", help=policy_help)
     add("--laps", type=number(high=100, example=3), default=1, help="number of laps")
     add("--drone", help="airframe of a plan: a name or the path of a TOML file; by default uzh_cpc")
     rates_help = "largest roll, pitch and yaw rate of a plan, rad/s; by default 15 15 3"
@@ -46,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
             check_writable(path, suffixes)
     from crazysim.lab.racing import flight as flights
 
-    flight = _fly_plan(options)
+    flight = _fly_plan(options) if options.policy is None else _fly_policy(options)
     print(flights.summary(flight))
     if options.plot is not None:
         flights.plot(flight, options.plot)
@@ -80,3 +85,21 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
         f"{plan.airframe.name}: {plan.duration:.3f} s; flown open loop, it deviates by up to {100 * deviation:.1f} cm"
     )
     return flight_of_plan(plan, track, options.laps)
+
+
+def _fly_policy(options: argparse.Namespace) -> RaceFlight:
+    import dataclasses
+
+    from crazysim.envs.tasks.race import Race
+    from crazysim.lab.racing.flight import flight_of_policy
+    from crazysim.train.interface import check_policy
+    from crazysim.train.training import load_policy
+
+    given = [name for name in ("drone", "body_rate", "floor") if getattr(options, name) is not None]
+    require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
+    policy, config, _ = load_policy(options.policy)
+    course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
+    env = dataclasses.replace(config, options=config.options | course).make_env(1)
+    expect(isinstance(env.task, Race), "a policy of the task race", config.task)
+    check_policy(policy, env)
+    return flight_of_policy(env, policy)

@@ -7,10 +7,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.envs.env import Env
 from crazysim.envs.race_clock import RaceClock, time_flight
+from crazysim.envs.state import EnvState
 from crazysim.envs.tracks import Track, gate_body, gates_of_track
 from crazysim.errors import not_installed
 from crazysim.lab.racing.time_optimal import Plan
@@ -18,6 +21,7 @@ from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_text
 from crazysim.storage import write_figure
+from crazysim.train.evaluation import act, initial_memory
 
 SAMPLE_TIME = 0.01
 """Time between samples of a flight, s."""
@@ -57,6 +61,26 @@ def flight_of_plan(plan: Plan, track: Track, laps: int = 1) -> RaceFlight:
     quat = (1 - u) * plan.quat[k] + u * plan.quat[k + 1]
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     return RaceFlight(track, plan.airframe, times, pos, quat, time_flight(track, times, pos, laps))
+
+
+def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
+    """Fly one episode of the task ``race`` with a policy, until all gates are passed or it ends, and time it."""
+    step = jax.jit(lambda state, memory: _policy_step(env, policy, state, memory))
+    state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
+    states = [state.data.states]
+    while len(states) <= env.max_steps and not state.done[0]:
+        state, memory = step(state, memory)
+        states.append(state.data.states)
+    times = np.arange(len(states)) / env.base.freq
+    pos, quat = (np.array([getattr(s, name)[0, 0] for s in states], float) for name in ("pos", "quat"))
+    task: Any = env.task
+    clock = time_flight(task.course, times, pos, task.laps)
+    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock)
+
+
+def _policy_step(env: Env, policy: Any, state: EnvState, memory: Any) -> tuple[EnvState, Any]:
+    action, memory = act(policy, state.obs, memory)
+    return env.step(state, action), memory
 
 
 def summary(flight: RaceFlight) -> str:

@@ -2,12 +2,13 @@
 
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim.__main__ import main
-from crazysim.envs import load_track
-from crazysim.lab.racing.flight import clock_text, flight_of_plan, track_simulation
+from crazysim.envs import Track, load_track, make
+from crazysim.lab.racing.flight import clock_text, flight_of_plan, flight_of_policy, summary, track_simulation
 from crazysim.lab.racing.time_optimal import plan_race
 
 FILE = """
@@ -55,3 +56,20 @@ def test_the_clock_of_a_film_shows_lap_gate_and_split(path):
     assert clock_text(flight, 1e3).startswith(f"{times[3]:6.2f} s"), "the clock stops"
     model = track_simulation(track, "uzh_cpc").mj_model
     assert sum(name.startswith("gate") for name in (model.body(k).name for k in range(model.nbody))) >= 2
+
+
+def test_a_policy_is_timed_in_the_task_race():
+    """A constant setpoint 1 m ahead of the origin pulls the drone past two waypoints, which lie on its way."""
+    track = Track(
+        gates_pos=[(-0.2, 0, 1), (0.5, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], obstacles_pos=(),
+        start=(-1, 0, 1), low=(-3, -3, 0), high=(3, 3, 3),
+    )  # fmt: skip
+    env = make("race", track=track, control="state", engine="interpret", seconds=8.0)
+    flight = flight_of_policy(env, lambda obs: jnp.zeros((1, 1, env.actions.size)).at[..., 0].set(1.0))
+    times = np.asarray(flight.clock.times)
+    assert bool(flight.clock.finished)
+    assert 0 < times[0] < times[1] <= flight.time[-1]
+    before = np.searchsorted(flight.time, times)
+    distance = np.linalg.norm(flight.pos[before] - np.array(track.gates_pos), axis=-1)
+    np.testing.assert_allclose(distance, 0.3, atol=0.06)  # a step of 20 ms at up to 3 m/s
+    assert "lap 1: " in summary(flight)
