@@ -1,5 +1,7 @@
 """Sampling model-predictive control: flights, reproducibility, and wrong settings."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from crazysim import RangeFinder, Sim, Wind
 from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
-from crazysim.lab.control.mppi import MPPI, RolloutRecord
+from crazysim.lab.control.mppi import MPPI, RECORD_NAME, RolloutRecord
 from crazysim.trajectories import figure_eight
 
 
@@ -74,6 +76,16 @@ def test_the_command_follows_from_the_cost(sim):
         command = np.asarray(mppi.command(sim.data, setpoint()))
     assert np.all(command[..., 3] < 0.15)
     assert np.all(command[..., 3] >= 4 * 0.02136 - 1e-4)
+
+
+def test_commands_are_interpolated_between_the_knots_of_a_plan(mppi):
+    knots = np.random.default_rng(0).normal(size=(mppi.knots, 4)).astype(np.float32)
+    data = SimpleNamespace(plugins={RECORD_NAME: SimpleNamespace(knots=jnp.asarray(knots))})
+    n_steps = (mppi.horizon - 1) * mppi.substeps
+    at = np.linspace(0, mppi.knots - 1, n_steps + 1)
+    expected = [np.interp(at, np.arange(mppi.knots), column) for column in knots.T]
+    commands = jax.vmap(lambda step: mppi._command_at(data, step))(jnp.arange(n_steps + 1))
+    np.testing.assert_allclose(commands, np.transpose(expected), atol=1e-5)
 
 
 def test_a_sample_that_is_not_finite_has_no_weight(sim):

@@ -11,6 +11,7 @@ from crazysim import IMU, Battery, ConfigError, Latency, Randomize, Sim, Wind
 from crazysim.core.pipeline import append_fn
 from crazysim.engine.stage import stage
 from crazysim.plugins.effects.battery import open_circuit_voltage
+from crazysim.plugins.effects.moving_air import drag_factor
 from crazysim.plugins.estimators import ESKF
 from crazysim.plugins.sensors import TimeOfFlight
 
@@ -271,3 +272,8 @@ def test_a_filter_assumes_nominal_numbers():
         accelerations.append(np.asarray(sim.plugins.observations(sim.data)["imu.accel"]))
     np.testing.assert_allclose(*covariances, rtol=0.01, atol=1e-8)
     assert np.abs(accelerations[0] - accelerations[1]).max() > 0.01
+
+
+def test_without_a_range_of_the_drag_it_stays_as_it_is():
+    sim, _ = build(thrust=(0.9, 1.1))
+    assert drag_factor(sim.data) == 1
