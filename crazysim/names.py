@@ -137,7 +137,8 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.lab.export.out_of_tree": "to_out_of_tree",
         "crazysim.lab.export.policies": "to_c to_onnx",
         "crazysim.lab.export.rl_tools": (
-            "find_weights raptor_policy raptor_weights read_rl_tools shipped_weights to_rl_tools weights_to_c"
+            "find_weights raptor_order raptor_policy raptor_weights read_rl_tools shipped_weights to_rl_tools "
+            "weights_to_c"
         ),
         "crazysim.lab.export.tflite": "to_tflite",
     },

@@ -89,7 +89,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "control_net.tflite of PX4's mc_nn_control to write, distilled from a policy that commands rotor speeds"
     )
     add("--tflite", type=Path, metavar="FILE", help=tflite_help)
-    add("--drone", metavar="NAME|FILE", help="airframe that flies a policy of RAPTOR's shape; by default cf21B_500")
+    drone_help = "airframe that flies a policy of RAPTOR's shape; by default cf21B_500"
+    add("--drone", "--airframe", metavar="NAME|FILE", help=drone_help)
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder, or any.mp4")
@@ -285,9 +286,11 @@ def export(options: argparse.Namespace) -> None:
     if isinstance(policy, dict):
         require(
             options.onnx is options.tflite is None,
-            "expected --c or another file for RAPTOR's shape, got --onnx or --tflite",
+            f"expected --c or another file for RAPTOR's shape, got {'--tflite' if options.onnx is None else '--onnx'}",
             ValueError,
         )
+        if options.drone is not None:
+            exports.raptor_order(load_airframe(options.drone))  # refuses rotors that turn the other way
         if options.rl_tools:
             written.append(exports.to_rl_tools(policy, options.rl_tools, options.folder.stem))
         write_c = partial(exports.weights_to_c, policy)

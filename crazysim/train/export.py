@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from crazysim.lab.export.policies import to_c, to_onnx
     from crazysim.lab.export.rl_tools import (
         find_weights,
+        raptor_order,
         raptor_policy,
         raptor_weights,
         read_rl_tools,
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
     from crazysim.lab.export.tflite import to_tflite
 
 __all__ = [
-    "cost_text", "describe", "find_weights", "observe_inputs", "raptor_policy", "raptor_weights", "read_rl_tools",
-    "shipped_weights", "to_betaflight", "to_c", "to_mc_nn_control", "to_onnx", "to_out_of_tree", "to_rl_tools",
-    "to_tflite", "weights_to_c",
+    "cost_text", "describe", "find_weights", "observe_inputs", "raptor_order", "raptor_policy",
+    "raptor_weights", "read_rl_tools", "shipped_weights", "to_betaflight", "to_c", "to_mc_nn_control",
+    "to_onnx", "to_out_of_tree", "to_rl_tools", "to_tflite", "weights_to_c",
 ]  # fmt: skip
 
 __getattr__ = lazy_getattr(__name__)

@@ -78,8 +78,8 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
 
     Its numbers are drawn independently of each other from the ranges below, each (2,): the first four uniformly in the
     logarithm. The order and the directions of rotation of the rotors, and their largest speed, are the airframe's, at
-    which the drawn thrust is reached; the thrust is proportional to the square of the speed. Dynamics, controllers and
-    plugins compute with the drawn numbers; ``sim.data.params`` keeps those of the airframe, and
+    which the drawn thrust is reached; the thrust is proportional to the square of the speed. Dynamics and
+    plugins compute with the drawn numbers; controllers keep those of the airframe, as does ``sim.data.params``, and
     ``sim.plugins.observations(sim.data)`` has the drawn ones by name, such as ``"airframe.mass"``.
     """
 

@@ -119,4 +119,4 @@ def test_the_command_distils_a_run_and_prints_the_parameters_of_the_file(tmp_pat
     assert written == f"wrote {path}"
     assert path.read_bytes()[4:8] == b"TFL3"
     assert main(["export", "any", "--tflite", str(path)]) == 2
-    assert "got --onnx or --tflite" in " ".join(capsys.readouterr().err.split())
+    assert "got --tflite" in " ".join(capsys.readouterr().err.split())
