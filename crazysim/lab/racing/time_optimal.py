@@ -34,8 +34,9 @@ MAX_SLOWING = 6.0
 """Largest duration of a leg of the point mass, as a multiple of the duration with which its plan begins."""
 MIN_FORCE = 2.0
 """Smallest thrust of the point mass, m/s^2, so that it has a direction everywhere."""
-INSET = 1e-4
-"""Distance by which crossings stay inside their openings, m, so that rounding makes no plan miss a gate."""
+INSET, BEHIND = 1e-3, 1e-5
+"""Distances by which crossings stay inside the edge of an opening, and lie behind the plane of a gate, m, so that
+rounding makes no plan miss a gate."""
 MIN_NODES = 4
 """Smallest number of nodes of a leg."""
 MAX_ITERATIONS = 1500
@@ -192,8 +193,12 @@ class _Course:
                 nlp.add(offset, -half, half)
                 continue
             axis, planes = gate.rot[:, :1].T, gate.half_planes
-            nlp.add(axis @ offset, 0.0, 0.0)
+            nlp.add(axis @ offset, BEHIND, BEHIND)
             nlp.add(axis @ states[3:6, int(leg_ends[k])], 0.0, FAR)
+            # The nodes before and after are on either side: a motion along the plane could touch it without crossing.
+            nlp.add(axis @ (states[:3, int(leg_ends[k]) - 1] - pos), -FAR, -BEHIND)
+            if leg_ends[k] < leg_ends[-1]:
+                nlp.add(axis @ (states[:3, int(leg_ends[k]) + 1] - pos), BEHIND, FAR)
             nlp.add(planes[:, :2] @ gate.rot[:, 1:].T @ offset - planes[:, 2], -FAR, -INSET)
         for leg, gate in self.tubes.items():
             inner = states[:3, int(leg_ends[leg - 1]) + 1 : int(leg_ends[leg])] - gate.pos
@@ -333,15 +338,20 @@ def _step_function(ca: Any, airframe: Airframe, substeps: int = 2) -> Any:
     rot = ca.horzcat(*axes)
     drag = rot @ airframe.matrix("drag.coefficients") @ rot.T @ vel
     acc = (axes[2] * ca.sum1(u) + drag) / float(airframe.value("rigid_body.mass")) - GRAVITY_MAGNITUDE * identity[2]
-    arms = airframe.mixing_matrix * [[airframe.arm], [airframe.arm], [_torque_ratio(airframe)]]
-    momentum = airframe.inertia @ ang_vel
-    spin_inertia = airframe.value("rotors.inertia")
-    if np.any(spin_inertia):
-        k0, k1, k2 = np.atleast_2d(airframe.value("rotors.thrust_curve"))[0]
+    arms = airframe.mixing_matrix * [[airframe.arm], [airframe.arm], [1.0]]
+    thrust_curve, torque_curve = (np.atleast_2d(airframe.value(f"rotors.{x}_curve"))[0] for x in ("thrust", "torque"))
+    spin_inertia, momentum = airframe.value("rotors.inertia"), airframe.inertia @ ang_vel
+    ratio = torque_curve[2] / thrust_curve[2]
+    drag_torque = ratio * u
+    if np.any(spin_inertia) or not np.allclose(torque_curve, ratio * thrust_curve):
+        # The slope of the speed is infinite at no thrust, so that it is left out where nothing depends on it.
+        k0, k1, k2 = thrust_curve
         rotor_vel = (-k1 + ca.sqrt(k1**2 - 4 * k2 * (k0 - u))) / (2 * k2)
+        drag_torque = torque_curve[0] + torque_curve[1] * rotor_vel + torque_curve[2] * rotor_vel**2
         spin = ca.sum1(-RPM_TO_RAD_S * airframe.value("rotors.yaw_torque_sign") * spin_inertia * rotor_vel)
         momentum = momentum + ca.vertcat(0, 0, spin)
-    torque = arms @ u - ca.cross(ang_vel, momentum)
+    turning = ca.vertcat(arms[:2] @ u, arms[2:] @ drag_torque)
+    torque = turning - ca.cross(ang_vel, momentum)
     turn = 0.5 * ca.vertcat(w * ang_vel + ca.cross(q, ang_vel), -ca.dot(q, ang_vel))
     rate = ca.Function("rate", [x, u], [ca.vertcat(vel, acc, turn, np.linalg.inv(airframe.inertia) @ torque)])
     y, d = x, h / substeps
@@ -353,13 +363,6 @@ def _step_function(ca: Any, airframe: Airframe, substeps: int = 2) -> Any:
         y = y + d / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     y = ca.vertcat(y[:6], y[6:10] / ca.norm_2(y[6:10]), y[10:])
     return ca.Function("step", [x, u, h], [y])
-
-
-def _torque_ratio(airframe: Airframe) -> float:
-    # Torque over thrust of a rotor in hover, m.
-    hover = float(airframe.value("rigid_body.mass")) * GRAVITY_MAGNITUDE / airframe.n_rotors
-    curve = np.atleast_2d(airframe.value("rotors.torque_curve"))[0]
-    return float(np.polyval(curve[::-1], airframe.rotor_vel([hover])[0])) / hover
 
 
 def _turn_along(axis: Floats, time: Floats) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, load_airframe
-from crazysim.envs import Track, gates_of_track, load_track
+from crazysim.envs import Track, gates_of_track, load_track, time_flight
 from crazysim.lab.racing.time_optimal import fly_open_loop, plan_race
 
 G = 9.81
@@ -49,13 +49,24 @@ def test_a_plan_keeps_its_limits_and_crosses_its_gates_in_the_simulators_dynamic
     assert plan.pos[:, 2].min() > 0.5 - 1e-6
     (gate,) = gates_of_track(track)
     offset = (plan.pos - gate.pos) @ gate.rot
-    k = np.argmin(np.abs(offset[:, 0]))
+    k = 4 + np.argmin(np.abs(offset[4:, 0]))  # the start lies in the gate's plane, beside the gate
     assert abs(offset[k, 0]) < 1e-4
     assert np.all(np.abs(offset[k, 1:]) < 0.2 + 1e-4)
     assert (plan.vel[k] @ gate.rot)[0] > 0, "along the gate's axis"
     flown = fly_open_loop(plan)
     np.testing.assert_allclose(flown[:, :3], plan.pos, atol=5e-3)
     np.testing.assert_allclose(flown[-1, 3:6], 0, atol=0.01)
+
+
+@pytest.mark.long("plans eight gates")
+def test_a_drone_with_other_curves_crosses_the_gates_of_two_laps():
+    """Torque curves with linear terms, corners cut at fast sideways motion, and the last gate as the end."""
+    track = load_track("lsy_drone_racing")
+    plan = plan_race(track, "cf21B_500", floor=0.2, laps=2)
+    clock = time_flight(track, plan.time, plan.pos, laps=2)
+    assert bool(clock.finished)
+    assert float(clock.time) == pytest.approx(plan.duration, abs=1e-3)
+    np.testing.assert_allclose(fly_open_loop(plan)[:, :3], plan.pos, atol=5e-3)
 
 
 @pytest.mark.long("searches 183 nodes for the fastest flight through seven gates")
