@@ -10,7 +10,7 @@ import numpy as np
 
 from crazysim.envs.tracks import Points, Track, rotation_matrices
 from crazysim.errors import ConfigError, expect, optional_import, require
-from crazysim.storage import MAX_TEXT_BYTES, is_file, read_text
+from crazysim.storage import MAX_TEXT_BYTES, as_path, is_file, read_text
 
 TRACK_FOLDER = Path(__file__).parent / "race_tracks"
 DEFAULT_TRACK = "lsy_drone_racing"
@@ -39,7 +39,7 @@ def load_track(source: str | Path) -> Track:
     """
     if str(source) == DEFAULT_TRACK:
         return Track()
-    path = TRACK_FOLDER / f"{source}.yaml" if str(source) in track_names() else Path(source)
+    path = TRACK_FOLDER / f"{source}.yaml" if str(source) in track_names() else as_path(source)
     require(
         is_file(path), f"expected a track as one of {', '.join(track_names())}, or a YAML file, got {str(source)!r}."
     )
