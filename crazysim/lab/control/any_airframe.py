@@ -31,6 +31,9 @@ MAX_DIFFERENCE, MAX_VELOCITY = 0.5, 1.0
 """Limits of each axis of the observed position, m, and velocity, m/s, relative to the goal (PX4 1.18,
 ``src/modules/mc_raptor/mc_raptor.hpp``)."""
 
+LEAST_THRUST = 1e-6
+"""Least thrust over the largest, at which the speed still has a derivative."""
+
 
 def state_from_goal(pos: Array, quat: Array, vel: Array, goal: Array, goal_vel: Array, yaw: Array) -> dict[str, Array]:
     """Position, attitude and velocity in the frame of a goal, limited as PX4 does, by the names of the task ``any``.
@@ -112,5 +115,5 @@ class AnyAirframe(Controller, params=AnyAirframeParams, memory=AnyAirframeMemory
         outputs, network = evaluate_step(self.weights, observation[None], memory.network[None])
         action = rotation.clip(outputs[0], -1.0, 1.0)
         # Thrust is about proportional to the square of the speed; the policy corrects for the rest.
-        thrusts = rotation.clip(params.shares @ jnp.square((action + 1) / 2), 0.0, 1.0)
+        thrusts = rotation.clip(params.shares @ jnp.square((action + 1) / 2), LEAST_THRUST, 1.0)
         return params.max_rotor_vel * jnp.sqrt(thrusts), AnyAirframeMemory(network[0], action)

@@ -419,6 +419,7 @@ def test_betaflight_that_does_not_start_is_refused(tmp_path, monkeypatch):
         start_betaflight(shutil.which("true"), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("CRAZYSIM_BETAFLIGHT" not in os.environ, reason="needs the path of betaflight_SITL")
 def test_betaflight_itself_arms_flies_and_repeats_its_flight(tmp_path):
     program = os.environ["CRAZYSIM_BETAFLIGHT"]

@@ -1,7 +1,6 @@
 """Policies for any airframe: what they observe, when their memory advances, and what counts as held."""
 
 import dataclasses
-from importlib.util import find_spec
 
 import jax.numpy as jnp
 import numpy as np
@@ -71,9 +70,8 @@ def test_a_run_of_the_task_gets_its_observations_by_name(tmp_path):
     np.testing.assert_allclose(action, np.tanh(inputs @ weight), atol=1e-5)
 
 
+@pytest.mark.slow  # needs foundation-policy
 def test_raptor_computes_as_its_package():
-    if find_spec("foundation_policy") is None:
-        pytest.skip("needs foundation-policy")
     package, network = pytest.importorskip("foundation_policy").Raptor(), load_network(None)
     package.reset()
     memory = network.initial_memory(8)
@@ -114,11 +112,17 @@ def test_commands_are_late_and_only_drones_near_their_goal_are_held():
 
 
 @pytest.mark.filterwarnings("ignore:Attaching a spec")  # Crazyflow's
-@pytest.mark.parametrize("simulator", list(rotor_simulators.SIMULATORS))
+@pytest.mark.parametrize(
+    "simulator",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if drones.module else [])  # needs the package of the simulator
+        for name, drones in rotor_simulators.SIMULATORS.items()
+    ],
+)
 def test_simulators_start_and_hover_and_turn_alike(simulator):
     drones_class = rotor_simulators.SIMULATORS[simulator]
-    if drones_class.module and find_spec(drones_class.module) is None:
-        pytest.skip(f"needs {drones_class.module}")
+    if drones_class.module:
+        pytest.importorskip(drones_class.module)
     is_crazyflow = simulator == "Crazyflow"
     fleet = np.array(["cf2x_L250", "cf21B_500"] * 2) if is_crazyflow else rotor_simulators.Quadrotors.sample(4)
     start = any_airframe.MANOEUVRES["recover"].start(4) | {"quat": np.tile([0, 0, 0, 1.0], (4, 1))}
