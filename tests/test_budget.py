@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3678,
     "geometry": 940,
-    "lab": 16793,
+    "lab": 16794,
     "media": 1080,
     "plugins": 4875,
     "scene": 2569,
