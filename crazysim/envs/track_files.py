@@ -63,8 +63,12 @@ def load_track(source: str | Path) -> Track:
 def _read_track(tables: Any) -> Track:
     expect(isinstance(tables, dict) and tables.get("orders"), "a track with gates in 'orders'", tables)
     gates = [tables[name] for name in tables["orders"]]
-    for gate in gates:
+    for name, gate in zip(tables["orders"], gates, strict=True):
         expect(gate["type"] in _SHAPES, f"gates of types {', '.join(_SHAPES)}", gate["type"])
+        try:
+            _SHAPES[gate["type"]](gate, 1.0)
+        except KeyError as error:
+            raise ConfigError(f"expected {error} of the gate {name!r}, got {', '.join(gate)}. Add it.") from error
     shapes = [_SHAPES[gate["type"]] for gate in gates]
     pos = np.array([gate["position"] for gate in gates], float)
     start, finish = (np.array(tables[name]["pos"], float) for name in ("initState", "endState"))

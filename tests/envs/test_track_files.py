@@ -59,7 +59,7 @@ def test_half_planes_bound_a_triangle_in_either_order_of_its_corners():
     [
         ("orders", "order", "gates in 'orders'"),
         ("RectanglePrisma", "Ring", "types SingleBall, RectanglePrisma"),
-        ("radius", "size", "TOGT-Planner"),
+        ("radius", "size", r"'radius' of the gate '.', got type, position, size"),
         ("'A', ", "'C', ", "'C'"),
         ("pos: [0, 0, 1]", "pos: [0, [", "YAML"),
     ],
