@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 516,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3678,
+    "envs": 3681,
     "geometry": 940,
     "lab": 16794,
     "media": 1080,
