@@ -5,10 +5,10 @@
     python benchmarks/memory.py --worlds 16 --iterations 2 --starts 8 --seeds 0:2 --seconds 0.4
 
 Every variant of a task is trained by PPO on drones that ``randomize="generic"`` draws around one airframe, all seeds in
-one program. The memory of a variant is a gated recurrent unit in policy and critic. The policy that a training keeps
-(``TrainResult.policy``) is then flown on other drones. They are drawn in the same way around the airframe of the
-training (``drawn``) and around each of the other Crazyflies. Each evaluation uses the controller gains and the action
-ranges of its airframe.
+one program. The memory of a variant is a gated recurrent unit in policy and critic, but not in a privileged critic. The
+policy that a training keeps (``TrainResult.policy``) is then flown on other drones. They are drawn in the same way
+around the airframe of the training (``drawn``) and around each of the other Crazyflies. Each evaluation uses the
+controller gains and the action ranges of its airframe.
 
 There is a JSON line for each seed. Runs in the folder ``--out`` are continued from their checkpoints.
 """
