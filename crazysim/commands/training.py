@@ -277,12 +277,12 @@ def export(options: argparse.Namespace) -> None:
             check_writable(path, (suffix,))
     policy: Any = exports.find_weights(options.folder)
     meta: Any = None
-    trained, written = None, []
+    config = None
     if policy is None:
         policy, config, meta = load_policy(options.folder)
-        trained = config.with_device("cpu").make_env(1)
         if policy.network.is_limited:  # of RAPTOR's shape, which flies other airframes than that of the training, too
-            policy, meta, trained = exports.raptor_weights(policy, trained.sim.airframes[0]), None, None
+            airframe = config.with_device("cpu").make_env(1).sim.airframes[0]
+            policy, config, meta = exports.raptor_weights(policy, airframe), None, None
     if isinstance(policy, dict):
         require(
             options.onnx is options.tflite is None,
@@ -291,8 +291,7 @@ def export(options: argparse.Namespace) -> None:
         )
         if options.drone is not None:
             exports.raptor_order(load_airframe(options.drone))  # refuses rotors that turn the other way
-        if options.rl_tools:
-            written.append(exports.to_rl_tools(policy, options.rl_tools, options.folder.stem))
+        written = [exports.to_rl_tools(policy, options.rl_tools, options.folder.stem)] if options.rl_tools else []
         write_c = partial(exports.weights_to_c, policy)
     else:
         require(
@@ -301,8 +300,7 @@ def export(options: argparse.Namespace) -> None:
             f"has its drone, and mc_raptor flies policies of the task any, or a checkpoint (.tar), only",
             ValueError,
         )
-        if options.onnx:
-            written.append(exports.to_onnx(policy, options.onnx, meta))
+        written = [exports.to_onnx(policy, options.onnx, meta)] if options.onnx else []
         write_c = partial(exports.to_c, policy, meta=meta)
         if options.tflite is not None:
             env = config.with_device("cpu").make_env(DISTILLATION_WORLDS)
@@ -315,10 +313,11 @@ def export(options: argparse.Namespace) -> None:
     if options.c is not None:
         written.append(write_c(options.c))
     for folder, write in folders:
-        if folder is not None and trained is None:
+        if folder is not None and config is None:
             written += write(policy, folder, meta, load_airframe(options.drone or "cf21B_500"))
         elif folder is not None:
-            written += write(policy, folder, meta, trained.sim.airframes[0], trained.base.freq)
+            env = config.with_device("cpu").make_env(1)
+            written += write(policy, folder, meta, env.sim.airframes[0], env.base.freq)
     for path in written:
         print(f"wrote {path}")
     if len(written) > sum(path is not None for path in (options.onnx, options.tflite)):

@@ -105,7 +105,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
     k_policy, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
     network = choose_network(config.memory, None, shape=config.shape)
-    hidden = () if config.shape == "raptor" else config.hidden
+    hidden = config.hidden if network.is_built_in else ()
 
     def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
         policy: Any = init_weights(network, k_policy, obs.shape[-1], (*hidden, env.actions.size), 0.01)

@@ -106,7 +106,7 @@ class Network:
 
     @property
     def is_built_in(self) -> bool:
-        """Whether it is the default network, with or without convolution and memory."""
+        """Whether it is the default network, with or without convolution and memory; hidden layers follow it."""
         apply = self.apply.func if isinstance(self.apply, functools.partial) else self.apply
         return apply in (MEMORYLESS_NETWORK.apply, _apply_gru, _apply_convolution)
 

@@ -196,7 +196,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     is_privileged = config.critic in PRIVILEGED_CRITICS and network is None
     critic_network = choose_network(0 if is_privileged else config.memory, network, config.convolution, images)
     network = choose_network(config.memory, network, config.convolution, images, config.shape)
-    policy_hidden = () if config.shape == "raptor" else hidden
+    policy_hidden = hidden if network.is_built_in else ()
     apply_layers, apply_critic_layers = (
         choose_mlp(x, env.sim.device, env.sim.mesh, len(configs)) for x in (network, critic_network)
     )

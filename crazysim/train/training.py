@@ -544,7 +544,7 @@ def load_policy(
         )
     shape = config.config.get("shape", "default")
     used_network = choose_network(config.config.get("memory", 0), network, convolution, images, shape)
-    hidden = () if config.own_network or shape == "raptor" else config.config["hidden"]
+    hidden = () if config.own_network or not used_network.is_built_in else config.config["hidden"]
 
     def make_policy() -> Policy:
         weights = init_weights(used_network, jax.random.key(0), n_obs, (*hidden, n_actions), 1.0)

@@ -18,6 +18,8 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.models import AirframeParams
 from crazysim.engine.pytree import PyTree, leaf
 from crazysim.lab.export.rl_tools import (
+    MAX_DIFFERENCE,
+    MAX_VELOCITY,
     N_ACTIONS,
     N_MEMORY,
     RAPTOR_RATE,
@@ -26,10 +28,6 @@ from crazysim.lab.export.rl_tools import (
     evaluate_step,
     shipped_weights,
 )
-
-MAX_DIFFERENCE, MAX_VELOCITY = 0.5, 1.0
-"""Limits of each axis of the observed position, m, and velocity, m/s, relative to the goal (PX4 1.18,
-``src/modules/mc_raptor/mc_raptor.hpp``)."""
 
 LEAST_THRUST = 1e-6
 """Least thrust over the largest, at which the speed still has a derivative."""

@@ -19,7 +19,7 @@ from crazysim.core.settings import positive_integer
 from crazysim.drones import Airframe
 from crazysim.errors import require, require_type
 from crazysim.lab.export.policies import POLICY_REMEDY, float_literal, to_c
-from crazysim.lab.export.rl_tools import RAPTOR_RATE, raptor_order, weights_to_c
+from crazysim.lab.export.rl_tools import MAX_DIFFERENCE, MAX_VELOCITY, RAPTOR_RATE, raptor_order, weights_to_c
 from crazysim.storage import as_path, write_file
 from crazysim.train.interface import Interface
 from crazysim.train.networks import Policy
@@ -38,9 +38,9 @@ OBSERVATION_FIELDS = {
 }
 """C expression and size, by name, of the observations that follow from a drone's state and its goal."""
 RAPTOR_FIELDS = {
-    "pos": ("limited(pos[{i}] - goal[{i}], 0.5f)", 3),
+    "pos": (f"limited(pos[{{i}}] - goal[{{i}}], {MAX_DIFFERENCE}f)", 3),
     "rot": OBSERVATION_FIELDS["rot"],
-    "vel": ("limited(vel[{i}], 1.0f)", 3),
+    "vel": (f"limited(vel[{{i}}], {MAX_VELOCITY}f)", 3),
     "ang_vel": OBSERVATION_FIELDS["ang_vel"],
     "previous_action": ("memory->previous[{i}]", 4),
 }

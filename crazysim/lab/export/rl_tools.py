@@ -32,6 +32,9 @@ from crazysim.train.networks import Network, Policy, Raptor
 
 N_INPUTS, N_MEMORY, N_ACTIONS = 22, 16, 4
 """Sizes of RAPTOR."""
+MAX_DIFFERENCE, MAX_VELOCITY = 0.5, 1.0
+"""Limits of each axis of the observed position, m, and velocity, m/s, relative to the goal (PX4 1.18,
+``src/modules/mc_raptor/mc_raptor.hpp``)."""
 RAPTOR_RATE = 100
 """Rate of RAPTOR's training, at which its memory advances, Hz."""
 SHAPES = {

@@ -15,7 +15,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.race_clock import RaceClock, time_flight
 from crazysim.envs.state import EnvState
 from crazysim.envs.tracks import Track, gate_body, gates_of_track
-from crazysim.errors import not_installed
+from crazysim.errors import optional_import
 from crazysim.lab.racing.time_optimal import Plan
 from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.sim.sim import Sim
@@ -172,13 +172,11 @@ def plot(flight: RaceFlight, path: str | Path) -> None:
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    try:
+    with optional_import("plots need", "matplotlib", "demo"):
         import matplotlib
 
         matplotlib.use("Agg")
         import matplotlib.pyplot as plt
-    except ImportError as error:
-        raise ImportError(not_installed("plots need", "matplotlib", "demo")) from error
     speed = np.linalg.norm(np.gradient(flight.pos, flight.time, axis=0), axis=-1)
     figure, (above, height, fast) = plt.subplots(
         3, 1, figsize=(8, 11), height_ratios=(3, 1, 1), constrained_layout=True

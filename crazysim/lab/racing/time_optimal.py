@@ -19,6 +19,7 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.envs.tracks import Gate, Track, gates_of_track
 from crazysim.errors import expect, optional_import, require
+from crazysim.lab.live.attitude import multiply
 
 Floats = NDArray[np.float64]
 
@@ -132,11 +133,7 @@ def fly_open_loop(plan: Plan, substeps: int = 20) -> Floats:
     def step(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         speeds, h = inputs[0], inputs[1] / substeps
         for _ in range(substeps):
-            k1 = derivative(x, speeds)
-            k2 = derivative(x + h / 2 * k1, speeds)
-            k3 = derivative(x + h / 2 * k2, speeds)
-            k4 = derivative(x + h * k3, speeds)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            x = _step_rk4(derivative, x, speeds, h)
             x = x.at[6:10].divide(jnp.linalg.norm(x[6:10]))
         return x, x
 
@@ -356,13 +353,18 @@ def _step_function(ca: Any, airframe: Airframe, substeps: int = 2) -> Any:
     rate = ca.Function("rate", [x, u], [ca.vertcat(vel, acc, turn, np.linalg.inv(airframe.inertia) @ torque)])
     y, d = x, h / substeps
     for _ in range(substeps):
-        k1 = rate(y, u)
-        k2 = rate(y + d / 2 * k1, u)
-        k3 = rate(y + d / 2 * k2, u)
-        k4 = rate(y + d * k3, u)
-        y = y + d / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        y = _step_rk4(rate, y, u, d)
     y = ca.vertcat(y[:6], y[6:10] / ca.norm_2(y[6:10]), y[10:])
     return ca.Function("step", [x, u, h], [y])
+
+
+def _step_rk4(rate: Any, x: Any, u: Any, h: Any) -> Any:
+    # For arrays of JAX and expressions of CasADi.
+    k1 = rate(x, u)
+    k2 = rate(x + h / 2 * k1, u)
+    k3 = rate(x + h / 2 * k2, u)
+    k4 = rate(x + h * k3, u)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def _turn_along(axis: Floats, time: Floats) -> tuple[Floats, Floats]:
@@ -375,11 +377,6 @@ def _turn_along(axis: Floats, time: Floats) -> tuple[Floats, Floats]:
         a, b = axis[:, k], axis[:, k + 1]
         turn = np.append(np.cross(a, b), 1 + a @ b)
         turn /= np.linalg.norm(turn)
-        quat[:, k + 1] = _multiply(turn, quat[:, k])
-        ang_vel[:, k] = 2 * _multiply(quat[:, k] * [-1, -1, -1, 1], quat[:, k + 1])[:3] / (time[k + 1] - time[k])
+        quat[:, k + 1] = multiply(turn, quat[:, k])
+        ang_vel[:, k] = 2 * multiply(quat[:, k] * [-1, -1, -1, 1], quat[:, k + 1])[:3] / (time[k + 1] - time[k])
     return quat, ang_vel
-
-
-def _multiply(a: Floats, b: Floats) -> Floats:
-    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
-    return np.append(vector, a[3] * b[3] - a[:3] @ b[:3])

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from crazysim.envs.spawn import random_attitude
 from crazysim.errors import expect
-from crazysim.lab.control.any_airframe import MAX_DIFFERENCE, MAX_VELOCITY
 from crazysim.lab.export import rl_tools
+from crazysim.lab.export.rl_tools import MAX_DIFFERENCE, MAX_VELOCITY
 from crazysim.lab.validate.rotor_simulators import (
     CRAZYFLOW_AIRFRAMES,
     N_STARTS,
@@ -98,7 +98,7 @@ def load_network(source: Path | None) -> Network:
         source: Checkpoint of rl-tools, ``.tar``, weights of the package, or folder of a run of the task ``any``; None
             for RAPTOR.
     """
-    weights = raptor_weights() if source is None else rl_tools.find_weights(source)
+    weights = foundation_weights() if source is None else rl_tools.find_weights(source)
     if weights is not None:
         memory = weights["1/initial_hidden_state"]
         return Network(
@@ -110,13 +110,14 @@ def load_network(source: Path | None) -> Network:
     expect(meta["freq"] == rl_tools.RAPTOR_RATE, f"a policy at {rl_tools.RAPTOR_RATE} Hz", meta["freq"])
 
     def step(observation: Array, memory: Any) -> tuple[Array, Any]:
-        names = ("pos_from_goal", "attitude_from_goal", "vel_from_goal", "ang_vel", "last_action")
-        return policy.act(dict(zip(names, jnp.split(observation, [3, 12, 15, 18], axis=-1), strict=True)), memory)
+        sizes = rl_tools.OBSERVATION_SIZES
+        parts = jnp.split(observation, np.cumsum(list(sizes.values()))[:-1], axis=-1)
+        return policy.act(dict(zip(sizes, parts, strict=True)), memory)
 
     return Network(jax.jit(step), policy.initial_memory)
 
 
-def raptor_weights() -> dict[str, NDArray]:
+def foundation_weights() -> dict[str, NDArray]:
     """Read RAPTOR's weights from its package, named as in ``rl_tools.SHAPES``."""
     layers = importlib.import_module("foundation_policy").Raptor().layers
     keys = {name: name.split("/") for name in rl_tools.SHAPES}
