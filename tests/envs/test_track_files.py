@@ -1,7 +1,10 @@
 """Race tracks from YAML files."""
 
+import random
+
 import numpy as np
 import pytest
+import yaml
 
 from crazysim import ConfigError
 from crazysim.envs import Track, gates_of_track, load_track, track_names
@@ -58,16 +61,98 @@ def test_half_planes_bound_a_triangle_in_either_order_of_its_corners():
     ("old", "new", "words"),
     [
         ("orders", "order", "gates in 'orders'"),
-        ("RectanglePrisma", "Ring", "types SingleBall, RectanglePrisma"),
-        ("radius", "size", r"'radius' of the gate '.', got type, position, size"),
-        ("'A', ", "'C', ", "'C'"),
+        ("['B', 'A', 'B']", "B", "gates in 'orders'"),
+        ("['B', 'A', 'B']", "[]", "gates in 'orders'"),
+        ("['B', 'A', 'B']", "[[A]]", "gates in 'orders'"),
+        ("'A', ", "'C', ", "'C' in mine.yaml as a table, got None"),
+        ("initState", "start", "'initState' in mine.yaml as a table"),
+        ("pos: [9, 0, 1]", "pos: [9, 0]", r"pos of endState of shape \(3,\), got \(2,\)"),
+        ("RectanglePrisma", "Ring", "'B' in mine.yaml of type SingleBall, RectanglePrisma"),
+        ("radius", "size", "keys type, position, radius, margin of 'A' in mine.yaml, got type, position, size"),
+        ("width", "widht", "position, width, height, marginW, marginH of 'B' in mine.yaml, got .*widht"),
+        ("rpy", "rpz", "of 'B' in mine.yaml, got .*rpz"),
+        ("margin: 0.2", "margin: 0.2, rpy: [0, 0, 0]", "of 'A' in mine.yaml, got .*rpy"),
+        ("width: 2", "width: wide", "width of 'B' as a number, got 'wide'"),
+        ("width: 2", "width: [2, 2]", "width of 'B' of shape"),
+        ("width: 2", "width: -2", "width of 'B' to be from"),
+        ("width: 2", "width: .nan", "width of 'B' to be from"),
+        ("marginH: 0.2", "marginH: 1.0", "margin of 'B' in mine.yaml that leaves an opening, got 'height: 0'"),
+        ("position: [3, 0, 2]", "position: [3, 0]", r"position of 'B' of shape \(3,\), got \(2,\)"),
+        ("rpy: [0, -90, 90]", "rpy: 90", "rpy of 'B' of shape"),
         ("pos: [0, 0, 1]", "pos: [0, [", "YAML"),
+        ("pos: [0, 0, 1]", "pos: 2026-99-99", "YAML"),
     ],
 )
 def test_law_09_a_wrong_track_file_is_named(tmp_path, old, new, words):
     path = tmp_path / "mine.yaml"
+    assert old in FILE
     path.write_text(FILE.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         load_track(path)
     with pytest.raises(ConfigError, match=r"one of lsy_drone_racing.*got 'nowhere'"):
         load_track("nowhere")
+
+
+ODD_VALUES = (
+    None,
+    True,
+    "1",
+    "A",
+    -1,
+    0,
+    1e300,
+    float("nan"),
+    [],
+    [1, 2],
+    ["A"],
+    [[0, 0, 1]],
+    {},
+    {"type": "A"},
+    2**70,
+)
+
+
+def mutate(tables, rng):
+    """Replace, remove or rename one entry of a random table or list, or replace everything."""
+    places = [tables]
+    for place in places:
+        values = place.values() if isinstance(place, dict) else place
+        places += [value for value in values if isinstance(value, (dict, list)) and value]
+    place = rng.choice(places)
+    key = rng.choice(list(place) if isinstance(place, dict) else range(len(place)))
+    change = rng.randrange(4)
+    if change == 0:
+        return rng.choice(ODD_VALUES) if rng.random() < 0.05 else tables
+    if change == 1:
+        del place[key]
+    elif change == 2 and isinstance(place, dict):
+        place[rng.choice([f"{key}s", 1, None, ""])] = place.pop(key)
+    else:
+        place[key] = rng.choice(ODD_VALUES)
+    return tables
+
+
+def read(path):
+    try:
+        return load_track(path)
+    except ConfigError as error:
+        return str(error)
+
+
+def test_law_09_a_file_with_any_wrong_entry_is_refused_or_a_track(tmp_path):
+    """Every error is ours, and what is no error has finite gates with an area."""
+    rng, path, n_refused = random.Random(0), tmp_path / "mine.yaml", 0
+    for k in range(600):
+        tables = yaml.safe_load(FILE)
+        for _ in range(1 + k % 3):
+            tables = mutate(tables, rng) if isinstance(tables, dict) and tables else tables
+        path.write_text(yaml.safe_dump(tables), encoding="utf-8")
+        track = read(path)
+        if isinstance(track, str):
+            assert "mine.yaml" in track
+            n_refused += 1
+            continue
+        for gate in gates_of_track(track):
+            assert np.isfinite(np.concatenate([gate.pos, gate.rot.ravel()])).all()
+            assert np.all(gate.size > 0)
+    assert 300 < n_refused < 590

@@ -35,13 +35,13 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--page", type=Path, metavar="FILE", help="page to write, .html, which plays the flight in a browser")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Fly a race track, print the clock, and write what was asked for."""
+def run(options: argparse.Namespace) -> int:
+    """Fly a race track, print the clock, and write what was asked for; the exit status is 1 if a gate was missed."""
     from crazysim.envs.track_files import track_names
 
     if options.track == "list":
         print("\n".join(track_names()))
-        return
+        return 0
     for path, suffixes in (
         (options.plot, PICTURE_SUFFIXES),
         (options.film, (".mp4", ".gif")),
@@ -62,6 +62,7 @@ def run(options: argparse.Namespace) -> None:
     for path in (options.plot, options.film, options.page):
         if path is not None:
             print(f"wrote {path}")
+    return 0 if bool(flight.clock.finished) else 1
 
 
 def _fly_plan(options: argparse.Namespace) -> RaceFlight:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from crazysim.envs.env import Env
 from crazysim.envs.race_clock import RaceClock, time_flight
 from crazysim.envs.state import EnvState
+from crazysim.envs.tasks.race_rules import race_of
 from crazysim.envs.tracks import Track, gate_body, gates_of_track
 from crazysim.errors import optional_import
 from crazysim.lab.racing.time_optimal import Plan
@@ -45,6 +46,8 @@ class RaceFlight:
     """Attitudes, body to world, xyzw. (n, 4)"""
     clock: RaceClock
     """The clock at the end."""
+    reason: str = "the flight was over"
+    """Why the flight ended, if not by the last gate."""
 
 
 def flight_of_plan(plan: Plan, track: Track, laps: int = 1) -> RaceFlight:
@@ -75,7 +78,13 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
     pos, quat = (np.array([getattr(s, name)[0, 0] for s in states], float) for name in ("pos", "quat"))
     task: Any = env.task
     clock = time_flight(task.course, times, pos, task.laps)
-    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock)
+    if not np.all((pos[-1] >= task.course.low) & (pos[-1] <= task.course.high)):
+        reason = "the drone left the arena"
+    elif race_of(state.data).failure[0, 0]:
+        reason = "the drone touched a gate, an obstacle or the floor"
+    else:
+        reason = "the time of the episode was over"
+    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason)
 
 
 def _policy_step(env: Env, policy: Any, state: EnvState, memory: Any) -> tuple[EnvState, Any]:
@@ -96,7 +105,8 @@ def summary(flight: RaceFlight) -> str:
         lines.append(f"lap {k + 1}: {time}; from gate to gate " + " ".join(f"{x:.2f}" for x in row[:passed]))
     if float(clock.penalty):
         lines.append(f"penalties: {float(clock.penalty):g} s")
-    end = f"all gates after {float(clock.time):.3f} s" if bool(clock.finished) else "not all gates were passed"
+    missed = f"gate {int(clock.passed) + 1} of {len(clock.times)} was not passed: {flight.reason}"
+    end = f"all gates after {float(clock.time):.3f} s" if bool(clock.finished) else missed
     return "\n".join([*lines, f"{end}; the flight ends after {flight.time[-1]:.3f} s"])
 
 

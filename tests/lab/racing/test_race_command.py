@@ -1,6 +1,7 @@
 """``crazysim race``: what it prints and writes."""
 
 import re
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,16 @@ orders: [A, B]
 A: { type: RectanglePrisma, position: [2, 0.5, 1], rpy: [0, -90, 0], width: 1, height: 1, marginW: 0.2, marginH: 0.2 }
 B: { type: SingleBall, position: [4, -0.5, 1], radius: 0.3, margin: 0.0 }
 """
+SQUARE = [(0.2, 0.2), (0.2, -0.2), (-0.2, -0.2), (-0.2, 0.2)]
+TWO_POINTS = Track(
+    gates_pos=[(-0.2, 0, 1), (0.5, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], obstacles_pos=(),
+    start=(-1, 0, 1), low=(-3, -3, 0), high=(3, 3, 3),
+)  # fmt: skip
+
+
+def fly_ahead(track, seconds=8.0, **settings):
+    env = make("race", track=track, control="state", engine="interpret", seconds=seconds, **settings)
+    return flight_of_policy(env, lambda obs: jnp.zeros((1, 1, env.actions.size)).at[..., 0].set(1.0))
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +71,8 @@ def test_the_clock_of_a_film_shows_lap_gate_and_split(path):
 
 def test_a_policy_is_timed_in_the_task_race():
     """A constant setpoint 1 m ahead of the origin pulls the drone past two waypoints, which lie on its way."""
-    track = Track(
-        gates_pos=[(-0.2, 0, 1), (0.5, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], obstacles_pos=(),
-        start=(-1, 0, 1), low=(-3, -3, 0), high=(3, 3, 3),
-    )  # fmt: skip
-    env = make("race", track=track, control="state", engine="interpret", seconds=8.0)
-    flight = flight_of_policy(env, lambda obs: jnp.zeros((1, 1, env.actions.size)).at[..., 0].set(1.0))
+    track = TWO_POINTS
+    flight = fly_ahead(track)
     times = np.asarray(flight.clock.times)
     assert bool(flight.clock.finished)
     assert 0 < times[0] < times[1] <= flight.time[-1]
@@ -73,3 +80,16 @@ def test_a_policy_is_timed_in_the_task_race():
     distance = np.linalg.norm(flight.pos[before] - np.array(track.gates_pos), axis=-1)
     np.testing.assert_allclose(distance, 0.3, atol=0.06)  # a step of 20 ms at up to 3 m/s
     assert "lap 1: " in summary(flight)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"seconds": 0.2}, "gate 1 of 2 was not passed: the time of the episode was over"),
+        ({"high": (0.0, 3, 3)}, "gate 2 of 2 was not passed: the drone left the arena"),
+        ({"openings": [SQUARE, 0.3], "gates_pos": [(-0.2, 0, 0.75), (0.5, 0, 1)]}, "the drone touched a gate"),
+    ],
+)
+def test_a_missed_gate_has_its_reason(changes, reason):
+    seconds, track = (changes["seconds"], TWO_POINTS) if "seconds" in changes else (8.0, replace(TWO_POINTS, **changes))
+    assert reason in summary(fly_ahead(track, seconds))
