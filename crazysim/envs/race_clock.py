@@ -39,7 +39,9 @@ class RaceClock(PyTree):
         expect(laps >= 1, "at least one lap", laps)
         return cls(jnp.zeros((), jnp.int32), jnp.full(laps * track.n_gates, jnp.inf), jnp.zeros(()))
 
-    def advance(self, track: Track, before: Array, now: Array, time_before: Array, time_now: Array) -> Self:
+    def advance(
+        self, track: Track, before: Array, now: Array, time_before: Array, time_now: Array, missed: float | None = None
+    ) -> Self:
         """Return the clock after a straight motion of the drone, which passes at most one gate, tunnels at their ends.
 
         Args:
@@ -48,17 +50,32 @@ class RaceClock(PyTree):
             now: Position now, m. (3,)
             time_before: Time before, s.
             time_now: Time now, s.
+            missed: Penalty for a gate that is missed, s: passing the gate after it counts both. None if all gates must
+                be passed. Of two gates, none can be missed.
         """
         before, now = jnp.asarray(before), jnp.asarray(now)
-        gates, gate = gates_of_track(track), self.passed % track.n_gates
+        gates, openings, n_all = gates_of_track(track), Openings.of(track), len(self.times)
         ends = np.array([gate.pos + gate.rot[:, 0] * gate.length / 2 for gate in gates], now.dtype)
-        rot = pick_entry(np.array([gate.rot.ravel() for gate in gates], now.dtype), gate).reshape(3, 3)
-        start, end = (rot.T @ (x - pick_entry(ends, gate)) for x in (before, now))
-        is_passed, share = Openings.of(track).crosses(gate, start, end)
-        is_passed &= self.passed < len(self.times)
+        rots = np.array([gate.rot.ravel() for gate in gates], now.dtype)
+
+        def passes(number: Array) -> tuple[Array, Array]:
+            gate = number % track.n_gates
+            rot = pick_entry(rots, gate).reshape(3, 3)
+            start, end = (rot.T @ (x - pick_entry(ends, gate)) for x in (before, now))
+            is_passed, share = openings.crosses(gate, start, end)
+            return is_passed & (number < n_all), share
+
+        is_passed, share = passes(self.passed)
+        passed, penalty = self.passed + is_passed, self.penalty
+        if missed is not None and track.n_gates > 2:
+            skips, share_after = passes(self.passed + 1)
+            skips &= ~is_passed
+            passed, penalty = passed + 2 * skips, penalty + missed * skips
+            share = jnp.where(skips, share_after, share)
         time = time_before + share * (time_now - time_before)
-        times = jnp.where(is_passed & (np.arange(len(self.times)) == self.passed), time, self.times)
-        return self.replace(passed=self.passed + is_passed, times=times)
+        number = np.arange(n_all)
+        times = jnp.where((number >= self.passed) & (number < passed), time, self.times)
+        return self.replace(passed=passed, times=times, penalty=penalty)
 
     def add_penalty(self, seconds: Array | float) -> Self:
         """Return the clock with a further penalty, for example for a touched gate, s."""
@@ -134,17 +151,20 @@ class Openings:
         return jnp.where(radius > 0, enters, through), rotation.clip(jnp.where(radius > 0, entry, share), 0, 1)
 
 
-def time_flight(track: Track, times: ArrayLike, pos: ArrayLike, laps: int = 1) -> RaceClock:
+def time_flight(
+    track: Track, times: ArrayLike, pos: ArrayLike, laps: int = 1, missed: float | None = None
+) -> RaceClock:
     """Return the clock at the end of a recorded flight of one drone.
 
     Args:
         times: Times, s. (n,)
         pos: Positions, m. (n, 3)
         laps: Number of laps.
+        missed: Penalty for a gate that is missed, s, as in ``RaceClock.advance``.
     """
     t, x = (jnp.asarray(values, jnp.float32) for values in (times, pos))
 
-    def advance(clock: RaceClock, row: tuple[Array, ...]) -> tuple[RaceClock, None]:
-        return clock.advance(track, *row), None
+    def advance(clock: RaceClock, row: tuple[Array, Array, Array, Array]) -> tuple[RaceClock, None]:
+        return clock.advance(track, *row, missed), None
 
     return jax.jit(lambda *rows: lax.scan(advance, RaceClock.start(track, laps), rows)[0])(x[:-1], x[1:], t[:-1], t[1:])

@@ -16,11 +16,11 @@ def track(**changes):
     return Track(**settings | changes)
 
 
-def fly(*points, laps=1, course=None):
+def fly(*points, laps=1, course=None, missed=None):
     """Fly straight from point to point, 1 s each, in steps of 10 ms that no gate begins or ends."""
     course, times = course or track(), np.linspace(0, len(points) - 1, 100 * (len(points) - 1) + 1)
     pos = np.stack([np.interp(times, np.arange(len(points)), np.array(points)[:, k]) for k in range(3)], axis=-1)
-    return time_flight(course, times, pos, laps), course
+    return time_flight(course, times, pos, laps, missed), course
 
 
 def test_times_are_those_of_the_crossing_within_a_step():
@@ -48,6 +48,23 @@ def test_gates_count_in_their_order_and_direction_within_their_openings(points, 
     assert int(clock.passed) == passed
     assert bool(clock.finished) == (passed == 2)
     assert np.isinf(clock.times[passed:]).all()
+
+
+def test_a_missed_gate_costs_a_penalty_when_the_gate_after_it_is_passed():
+    """Beside the gate and through two balls, twice; the last gate cannot be missed, and none of two."""
+    three = track(
+        gates_pos=[(1, 0, 1), (3, 0, 1), (3, 4, 1)], gates_rpy=[(0, 0, 0)] * 3, openings=[SQUARE, 0.5, 0.5]
+    )  # fmt: skip
+    ways = [(0, 0, 1), (0, 2, 1), (3, 2, 1), (3, 0, 1), (3, 4, 1), (3, 0, 1)]
+    clock, _ = fly(*ways, laps=2, course=three, missed=2.0)
+    np.testing.assert_allclose(clock.times, [2.75, 2.75, 3.875, 4.875, 4.875, np.inf], atol=5e-6)
+    assert (float(clock.penalty), int(clock.passed)) == (4.0, 5)
+    clock, _ = fly(*ways, (3, 4, 1), laps=2, course=three, missed=2.0)
+    np.testing.assert_allclose(clock.time, 5.875 + 4.0, atol=5e-6)
+    np.testing.assert_allclose(clock.lap_times(three), [3.875, 2.0], atol=5e-6)
+    for course, missed in ((three, None), (track(), 2.0)):
+        clock, _ = fly(*ways, laps=2, course=course, missed=missed)
+        assert (float(clock.penalty), int(clock.passed)) == (0.0, 0)
 
 
 def test_laps_count_the_same_gates_again():

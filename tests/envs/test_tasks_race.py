@@ -373,6 +373,36 @@ def test_laps_lead_through_the_same_gates_again_and_balls_are_passed_in_any_dire
     np.testing.assert_allclose(ways, [0.01 + 2 + back + 2, 0.01 + 2, 0.31 + back + 2, 0.31], atol=1e-4)
 
 
+def test_touched_and_missed_gates_cost_seconds_with_a_penalty(cases):
+    _, world, before, _, _ = cases
+    env = make_env(len(CASES), penalty=2.0)
+    pos, vel = (getattr(before.data.states, name) for name in ("pos", "vel"))
+    passed = before.data.plugins["task"].passed
+    state = place_drones(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=passed)
+    step = jax.jit(env.step)
+    after = step(state, state.action)
+    again = step(after, after.action)
+    for result in (after, again):  # a contact that lasts counts once
+        penalty = np.asarray(result.info["penalty"])[:, 0]
+        assert {name: penalty[k] for name, k in world.items() if penalty[k]} == {
+            "frame": 2.0,
+            "post": 2.0,
+            "another": 2.0,
+        }
+    disabled = np.asarray(after.info["disabled"])[:, 0]
+    assert {name for name, k in world.items() if disabled[k]} == {"obstacle", "floor", "outside", "over the top"}
+    gained = np.asarray(after.data.plugins["task"].passed - passed)[:, 0]
+    assert {name: gained[k] for name, k in world.items() if gained[k]} == {
+        "forwards": 1,
+        "last": 1,
+        "frame": 1,
+        "another": 2,
+    }
+    terms = jax.jit(vmap_worlds(lambda data: rules.dense(data, state.action[0], state.action[0])))
+    for result, cost in ((after, -20.0), (again, 0.0)):
+        np.testing.assert_allclose(terms(result.data)["penalty"][world["frame"]], cost)
+
+
 def test_a_track_file_is_raced_and_tunnels_are_refused():
     race = task.Race(track="split_s_gates")
     assert race.course.n_gates == 19

@@ -65,6 +65,8 @@ class Race(ProgressTask, OutcomeTask):
     checked at every physics step. The other drones continue, and do not collide with disabled drones. An episode ends
     when every drone is disabled or has passed all gates.
 
+    With ``penalty``, gates that are touched or missed cost seconds instead, and drones fly through their frames.
+
     | Level | Random in every episode |
     | --- | --- |
     | 0 | start of each drone, within 0.1 m |
@@ -86,6 +88,9 @@ class Race(ProgressTask, OutcomeTask):
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
     laps: int = setting(default=1, low=1, high=100)
     """Number of laps."""
+    penalty: float | None = setting(default=None, low=0.0)
+    """Seconds that each contact with a gate and each missed gate cost: a gate is missed if the gate after it is passed
+    instead; of two gates, none can be missed. None if a contact with a gate disables, and all gates must be passed."""
     seconds: float = 12.0
     """Length of an episode, s."""
     reward: Rewards = dense
@@ -105,6 +110,12 @@ class Race(ProgressTask, OutcomeTask):
     """True for obstacles that the drone was near before this environment step."""
     passed_before: Array = state((), dtype=np.int32)
     """Number of gates passed before this environment step."""
+    penalty_sum: Array | None = state((), optional=True)
+    """Sum of the penalties, s; None without."""
+    penalty_before: Array | None = state((), optional=True)
+    """Sum of the penalties before this environment step, s; None without."""
+    touches_gate: Array | None = state((), dtype=bool, optional=True)
+    """Whether the drone touched a gate in the last physics step; None without penalties."""
     nominal_pos: Array | None = state(("objects", 3), scope="world", optional=True)
     """Nominal positions of gates, then of upper ends of obstacles, m; None if objects are not displaced."""
     nominal_quat: Array | None = state(("gates", 4), scope="world", optional=True)
@@ -141,17 +152,27 @@ class Race(ProgressTask, OutcomeTask):
         openings = None if course.openings is None else Openings.of(course)
         # Balls have nothing to touch.
         framed = [gates] if openings is None else [gates[k] for k, (r,) in enumerate(openings.radii) if not r]
-        touched = framed if obstacles is None else [*framed, obstacles]
-        contacts = sim.scene.contact_fn(touched, drones=False)
+        fatal = [] if obstacles is None else [obstacles]
+        gate_contacts = None if self.penalty is None else sim.scene.contact_fn(framed, floor=False, drones=False)
+        contacts = sim.scene.contact_fn([*framed, *fatal] if gate_contacts is None else fatal, drones=False)
+        n_all = self.laps * course.n_gates
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
             pos = data.states.pos
             fails = jnp.any((pos < low) | (pos > high), axis=-1) | contacts(data).any
-            passed = race_of(data).passed + (rules.passes_gate(data) & ~(race_of(data).failure | fails))
-            return self.judge(
-                self.write(data, passed=passed, last_pos=pos), passed >= self.laps * course.n_gates, fails
-            )
+            record, passes = race_of(data), rules.passes_gate(data)
+            flies = ~(record.failure | fails)
+            passed = record.passed + (passes & flies)
+            if gate_contacts is not None:
+                skips = ~passes & flies & (passed + 1 < n_all) & rules.passes_gate(data, ahead=1)
+                skips &= course.n_gates > 2
+                touches = gate_contacts(data).any
+                hits = touches & ~record.touches_gate & flies & ~record.success
+                penalty_sum = record.penalty_sum + self.penalty * (1.0 * skips + hits)
+                data = self.write(data, penalty_sum=penalty_sum, touches_gate=touches)
+                passed = passed + 2 * skips
+            return self.judge(self.write(data, passed=passed, last_pos=pos), passed >= n_all, fails)
 
         numbers: dict[str, Any] = {
             "gates_visited": np.zeros(course.n_gates),
@@ -160,6 +181,8 @@ class Race(ProgressTask, OutcomeTask):
         if self.level >= 2:
             numbers["nominal_pos"] = np.zeros((course.n_gates + course.n_obstacles, 3))
             numbers["nominal_quat"] = np.zeros((course.n_gates, 4))
+        if self.penalty is not None:
+            numbers |= dict.fromkeys(("penalty_sum", "penalty_before", "touches_gate"), np.zeros(()))
         placements = [*collision_placements(sim), StagePlacement(judge, before="increment_steps")]
         fixed = {"gates": gates, "obstacles": obstacles, "openings": openings, "n_laps": self.laps}
         self.add_states(sim, placements, **fixed, **numbers)
@@ -199,6 +222,8 @@ class Race(ProgressTask, OutcomeTask):
 
     def before_step(self, data: SimData) -> SimData:
         visited_gates, visited_obstacles = visited_objects(data, self.sensor_range)
+        if self.penalty is not None:
+            data = self.write(data, penalty_before=race_of(data).penalty_sum)
         return self.write(
             super().before_step(data),
             gates_visited=visited_gates,
@@ -219,7 +244,8 @@ class Race(ProgressTask, OutcomeTask):
         return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:
-        return super().info(data) | {"gates_passed": race_of(data).passed}
+        penalty = {} if self.penalty is None else {"penalty": race_of(data).penalty_sum}
+        return super().info(data) | {"gates_passed": race_of(data).passed} | penalty
 
     def target(self, data: SimData) -> Array:
         return rules.next_gate(data)[0]

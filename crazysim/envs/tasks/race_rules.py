@@ -26,6 +26,9 @@ FUNNEL_RADIUS = 0.15
 """Radius, in the gate's plane, of a funnel in front of the gate, m. The radius grows by 1 m per metre of distance from
 the plane. Positions in the funnel have a straight way to the gate."""
 
+PENALTY_COST = 10.0
+"""Reward that a penalty of 1 s costs: that of 5 m of progress."""
+
 
 def race_of(data: SimData) -> Any:
     """Return the states of the race; see ``Race``."""
@@ -48,10 +51,10 @@ def obstacles_of(data: SimData) -> Array:
     return pos + np.array([0.0, 0.0, POLE_HEIGHT], pos.dtype)
 
 
-def next_gate(data: SimData) -> tuple[Array, Array]:
-    """Return position, m (..., 3), and attitude, xyzw (..., 4), of each drone's next gate, or of the last gate."""
+def next_gate(data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    """Return position, m (..., 3), and attitude, xyzw (..., 4), of the gate of ``gate_index``."""
     pos, quat = gates_of(data)
-    index = gate_index(data)
+    index = gate_index(data, ahead)
     return pick_entry(pos, index), pick_entry(quat, index)
 
 
@@ -62,13 +65,13 @@ def gate_index(data: SimData, ahead: int = 0) -> Array:
     return index if record.n_laps == 1 else index % n
 
 
-def passes_gate(data: SimData) -> Array:
-    """Whether the last physics step led forwards through the opening of the next gate. (...)"""
+def passes_gate(data: SimData, ahead: int = 0) -> Array:
+    """Whether the last physics step led forwards through the opening of the gate of ``gate_index``. (...)"""
     record = race_of(data)
-    pos, quat = next_gate(data)
+    pos, quat = next_gate(data, ahead)
     pos_before, pos_now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
     if record.openings is not None:
-        return record.openings.crosses(gate_index(data), pos_before, pos_now)[0] & ~record.success
+        return record.openings.crosses(gate_index(data, ahead), pos_before, pos_now)[0] & ~record.success
     crossed = (pos_before[..., 0] < 0) & (pos_now[..., 0] >= 0)
     fraction = pos_before[..., :1] / jnp.where(crossed[..., None], pos_before[..., :1] - pos_now[..., :1], 1)
     crossing = pos_before + fraction * (pos_now - pos_before)
@@ -134,7 +137,7 @@ def way_to_gate(pos: Array, size: Array | np.ndarray | None = None) -> Array:
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-    """Return rewards of progress and of gates, and costs of turning, of changing actions and of being disabled."""
+    """Return rewards of progress and of gates, and costs of turning, changing actions, penalties and being disabled."""
     record = race_of(data)
     reward_terms = {
         "progress": 2.0 * (record.remaining_way_before - remaining_way(data)),
@@ -143,6 +146,8 @@ def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         "action_rate": -0.01 * terms.action_rate(action, last_action),
         "disabled": -2.0 * record.failure,
     }
+    if record.penalty_sum is not None:
+        reward_terms["penalty"] = PENALTY_COST * (record.penalty_before - record.penalty_sum)
     return terms.only_where(~record.flight_over_before, reward_terms)
 
 

@@ -25,6 +25,10 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     )
     add("--policy", type=Path, metavar="FOLDER", help=policy_help)
     add("--laps", type=number(high=100, example=3), default=1, help="number of laps")
+    penalty_help = (
+        "seconds that a policy loses for each gate that it touches or misses; by default contacts end the flight"
+    )
+    add("--penalty", type=number(0.0, 1e3, 2.0, float), metavar="S", help=penalty_help)
     add("--drone", help="airframe of a plan: a name or the path of a TOML file; by default uzh_cpc")
     rates_help = "largest roll, pitch and yaw rate of a plan, rad/s; by default 15 15 3"
     add("--body-rate", type=size(15), nargs=3, metavar=("P", "Q", "R"), help=rates_help)
@@ -72,6 +76,7 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
     from crazysim.lab.racing.flight import flight_of_plan
     from crazysim.lab.racing.time_optimal import fly_open_loop, plan_race
 
+    require(options.penalty is None, "expected --penalty with --policy, got a plan. Leave it out.")
     track = load_track(options.track)
     plan = plan_race(
         track,
@@ -100,6 +105,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
     policy, config, _ = load_policy(options.policy)
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
+    course |= {} if options.penalty is None else {"penalty": options.penalty}
     env = dataclasses.replace(config, options=config.options | course).make_env(1)
     expect(isinstance(env.task, Race), "a policy of the task race", config.task)
     check_policy(policy, env)

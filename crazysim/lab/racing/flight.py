@@ -48,6 +48,8 @@ class RaceFlight:
     """The clock at the end."""
     reason: str = "the flight was over"
     """Why the flight ended, if not by the last gate."""
+    penalty: NDArray | None = None
+    """Sum of the penalties at the samples, s; None without. (n,)"""
 
 
 def flight_of_plan(plan: Plan, track: Track, laps: int = 1) -> RaceFlight:
@@ -70,21 +72,26 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
     """Fly one episode of the task ``race`` with a policy, until all gates are passed or it ends, and time it."""
     step = jax.jit(lambda state, memory: _policy_step(env, policy, state, memory))
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
-    states = [state.data.states]
+    states, records = [state.data.states], [race_of(state.data)]
     while len(states) <= env.max_steps and not state.done[0]:
         state, memory = step(state, memory)
         states.append(state.data.states)
+        records.append(race_of(state.data))
     times = np.arange(len(states)) / env.base.freq
     pos, quat = (np.array([getattr(s, name)[0, 0] for s in states], float) for name in ("pos", "quat"))
     task: Any = env.task
-    clock = time_flight(task.course, times, pos, task.laps)
+    clock, penalty = time_flight(task.course, times, pos, task.laps, task.penalty), None
+    if task.penalty is not None:  # the task counts contacts, too
+        penalty = np.array([record.penalty_sum[0, 0] for record in records])
+        clock = clock.replace(penalty=penalty[-1])
     if not np.all((pos[-1] >= task.course.low) & (pos[-1] <= task.course.high)):
         reason = "the drone left the arena"
-    elif race_of(state.data).failure[0, 0]:
-        reason = "the drone touched a gate, an obstacle or the floor"
+    elif records[-1].failure[0, 0]:
+        things = "a gate, an obstacle" if task.penalty is None else "an obstacle"
+        reason = f"the drone touched {things} or the floor"
     else:
         reason = "the time of the episode was over"
-    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason)
+    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason, penalty)
 
 
 def _policy_step(env: Env, policy: Any, state: EnvState, memory: Any) -> tuple[EnvState, Any]:
@@ -95,14 +102,15 @@ def _policy_step(env: Env, policy: Any, state: EnvState, memory: Any) -> tuple[E
 def summary(flight: RaceFlight) -> str:
     """Describe laps, splits and penalties in a few lines."""
     clock, n = flight.clock, flight.track.n_gates
-    laps, splits = np.asarray(clock.lap_times(flight.track)), np.asarray(clock.splits(flight.track))
+    laps = np.asarray(clock.lap_times(flight.track))
+    splits = np.reshape(_split_texts(np.asarray(clock.times)), (-1, n))
     lines = []
     for k, (lap, row) in enumerate(zip(laps, splits, strict=True)):
         passed = int(np.clip(int(clock.passed) - k * n, 0, n))
         if not passed:
             break
         time = f"{lap:.3f} s" if passed == n else f"{passed} of {n} gates"
-        lines.append(f"lap {k + 1}: {time}; from gate to gate " + " ".join(f"{x:.2f}" for x in row[:passed]))
+        lines.append(f"lap {k + 1}: {time}; from gate to gate " + " ".join(row[:passed]))
     if float(clock.penalty):
         lines.append(f"penalties: {float(clock.penalty):g} s")
     missed = f"gate {int(clock.passed) + 1} of {len(clock.times)} was not passed: {flight.reason}"
@@ -158,13 +166,25 @@ def film(flight: RaceFlight, path: str | Path, fps: float = 25, progress: bool =
 def clock_text(flight: RaceFlight, now: float) -> str:
     """Return the clock of a race at a time of the flight: time, lap, gates and the last split."""
     times, n = np.asarray(flight.clock.times), flight.track.n_gates
-    passed = int(np.sum(times <= now))
-    shown = min(now, float(flight.clock.time)) if bool(flight.clock.finished) else now
-    laps = len(times) // n
-    lines = [f"{shown:6.2f} s", f"lap {min(passed // n + 1, laps)} of {laps}, gate {passed} of {len(times)}"]
+    passed, laps = int(np.sum(times <= now)), len(times) // n
+    sample = np.searchsorted(flight.time, now, side="right") - 1
+    penalty = 0.0 if flight.penalty is None else flight.penalty[sample]
+    shown = f"{min(now, times[-1]):6.2f} s" + (f" + {penalty:.3g} s" if penalty else "")
+    lines = [shown, f"lap {min(passed // n + 1, laps)} of {laps}, gate {passed} of {len(times)}"]
     if passed:
-        lines.append(f"last gate {times[passed - 1]:.2f} s, split {np.diff(times, prepend=0.0)[passed - 1]:.2f} s")
+        lines.append(f"last gate {times[passed - 1]:.2f} s, split {_split_texts(times)[passed - 1]} s")
     return "\n".join(lines)
+
+
+def _split_texts(times: NDArray) -> list[str]:
+    # Times from gate to gate, s. A missed gate has the time of the gate after it.
+    with np.errstate(invalid="ignore"):  # gates that were not reached
+        splits = np.diff(times, prepend=0.0)
+    missed = np.append(splits[1:] == 0, False)
+    return [
+        "missed" if skip else f"{x or before:.2f}"
+        for skip, x, before in zip(missed, splits, np.roll(splits, 1), strict=True)
+    ]
 
 
 def page(flight: RaceFlight) -> str:

@@ -82,6 +82,24 @@ def test_a_policy_is_timed_in_the_task_race():
     assert "lap 1: " in summary(flight)
 
 
+def test_penalties_are_added_to_the_time_and_shown():
+    """The upper bar of a gate is hit, and a gate beside the way is missed."""
+    track = replace(
+        TWO_POINTS, openings=[SQUARE, SQUARE, 0.3], gates_pos=[(-0.2, 0, 0.83), (0.1, 1, 1), (0.5, 0, 1)],
+        gates_rpy=[(0, 0, 0)] * 3,
+    )  # fmt: skip
+    flight = fly_ahead(track, penalty=2.0)
+    times = np.asarray(flight.clock.times)
+    assert bool(flight.clock.finished)
+    assert float(flight.clock.time) == pytest.approx(times[-1] + 4.0)
+    text = summary(flight)
+    assert " missed " in text
+    assert "penalties: 4 s" in text
+    assert f"all gates after {times[-1] + 4:.3f} s" in text
+    assert clock_text(flight, times[0] + 0.1).startswith(f"{times[0] + 0.1:6.2f} s + 2 s\n")
+    assert clock_text(flight, 1e3).startswith(f"{times[-1]:6.2f} s + 4 s\n")
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
