@@ -41,6 +41,8 @@ class CollisionGeom:
     """Rows of the rotation matrix from the shape's frame; None for the identity."""
     name: str = dataclasses.field(default="", compare=False)
     """Name of the geom; empty if it has none."""
+    index: int = dataclasses.field(default=-1, compare=False)
+    """Index of the geom in MuJoCo's model."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,7 +215,7 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int 
     # The compiler stores attitudes as quaternions; their rounding would rotate axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
-    return CollisionGeom(_read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]
+    return CollisionGeom(_read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name, geom)  # type: ignore[arg-type]
 
 
 def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:

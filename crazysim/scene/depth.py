@@ -17,6 +17,7 @@ from crazysim import rotation
 from crazysim.arguments import check_flag, require_memory
 from crazysim.core.data import SimData, require_states
 from crazysim.errors import ConfigError, UnknownNameError, require
+from crazysim.scene.appearance import Appearance
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
@@ -182,6 +183,7 @@ def build_depth_fn(
     plugins: ListPlugins,
     kernels: RayKernels,
     baseline: float = 0.0,
+    appearance: Appearance | None = None,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits``; see ``Scene.depth_fn``.
 
@@ -196,6 +198,7 @@ def build_depth_fn(
         plugins: Function that returns the plugins of the simulation.
         kernels: Kernels that cast the rays if possible.
         baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
+        appearance: The scene's materials and lights, for ``Hits.color``; None for no colours.
     """
     require(
         isinstance(along, str) and along in ("axis", "ray"),
@@ -213,6 +216,7 @@ def build_depth_fn(
         pixel_rows[:, :3] = pixels.reshape(-1, 3)[tile_order]
         pixel_rows[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
+    pixel_angle = _pixel_angle(rays[0])
 
     ignored_drones = directions[..., 3].reshape(-1).astype(int)
 
@@ -222,6 +226,7 @@ def build_depth_fn(
             pos, rot = camera_pose(camera, data)
             poses.append((pos if camera.carrier == "world" else raise_to_floor(model, pos), rot))
         if data.states.pos.ndim == 2:
+            require(appearance is None, "expected data of all worlds for colours, got data of one world")
             origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
             direction = jnp.concatenate(
                 [_rotate_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
@@ -229,7 +234,9 @@ def build_depth_fn(
             hits = cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones)
             return untile_results(find_hidden(data, kernels, poses, hits))
         camera_poses = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        hits = cast_rays_in_worlds(model_without_mocap, data, camera_poses, directions, drones, kernels)
+        hits = cast_rays_in_worlds(
+            model_without_mocap, data, camera_poses, directions, drones, kernels, appearance, pixel_angle
+        )
         return untile_results(find_hidden(data, kernels, poses, hits))
 
     def find_hidden(data: SimData, kernels: RayKernels, poses: Sequence[tuple[Array, Array]], hits: Hits) -> Hits:
@@ -260,6 +267,7 @@ def build_depth_fn(
             normal=untile(hits.normal, 1),
             point=untile(hits.point, 1),
             body_index=untile(hits.body_index, 0),
+            color=None if hits.color is None else _unpack_color(untile(hits.color, 0)),
             is_hidden=None if hits.is_hidden is None else untile(hits.is_hidden, 0),
         )
 
@@ -295,6 +303,17 @@ def build_depth_fn(
         return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=worlds_per_batch)
 
     return depth
+
+
+def _unpack_color(packed: Array) -> Array:
+    return jax.lax.bitcast_convert_type(packed, np.uint8)[..., :3]
+
+
+def _pixel_angle(rays: np.ndarray) -> float:
+    # Between a ray in the middle of the image and its nearest neighbour.
+    middle = rays[rays.shape[0] // 2, rays.shape[1] // 2]
+    cosines = rays.reshape(-1, 3) @ middle
+    return float(np.arccos(np.sort(cosines)[-2])) if len(cosines) > 1 else 0.0
 
 
 def _rotate_directions(rot: Array, rays: np.ndarray) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -288,7 +288,7 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     """
     t = Tables(*tables)
     n_nodes, n_fixed, n_movable, n_movable_nodes = table_rows(t.counts, jnp.int32(0))
-    world, ray = _camera_ray(t, n_pixels, n_cameras, index)
+    world, ray = camera_ray(t, n_pixels, n_cameras, index)
     best = jnp.full_like(ray.origin[0], jnp.inf), jnp.int32(-1)
     best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed_geoms), ray, best, n_nodes)
 
@@ -305,7 +305,7 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     return _walk_hierarchy(read_node, hit_geom, ray, best, n_movable_nodes)
 
 
-def _camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
+def camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
     camera_number = lax.div(index, jnp.int32(n_pixels))
     world = lax.div(camera_number, jnp.int32(n_cameras))
     camera, pixel = camera_number - world * n_cameras, index - camera_number * n_pixels
@@ -320,7 +320,36 @@ def normal_at_hit(
 ) -> Components:
     """Return the unit normal where a ray meets its first geom, world frame; zero if it meets nothing.
 
+    For the arguments see ``surface_at_hit``.
+    """
+
+    def normal_in_world_frame(surface: Surface, row: Sequence[Array], *ray: Any) -> Components:
+        return world_vector(row, normal_in_frame(surface, row, *ray))
+
+    return surface_at_hit(normal_in_world_frame, 3, surfaces, n_pixels, n_cameras, index, *tables)
+
+
+def world_vector(row: Sequence[Array], vector: Components) -> Components:
+    """Return a vector in the frame of the geom with the given row in the world frame; see ``Target.table_row``."""
+    a, b, c = vector
+    x, y, z = (row[i] * a + row[i + 1] * b + row[i + 2] * c for i in (4, 7, 10))
+    return x, y, z
+
+
+def surface_at_hit(
+    describe: Callable[..., Any],
+    n_results: int,
+    surfaces: Sequence[Surface],
+    n_pixels: int,
+    n_cameras: int,
+    index: Array,
+    *tables: Array,
+) -> Any:
+    """Return ``describe(surface, row, origin, direction, distance)`` of the first geom that a ray meets, or zeros.
+
     Args:
+        describe: Function of a surface, of the row of its geom, and of a ray in the frame of the geom.
+        n_results: Number of its results.
         surfaces: ``Targets.surfaces``.
         n_pixels: Number of rays of a camera.
         n_cameras: Number of cameras of a world.
@@ -329,37 +358,37 @@ def normal_at_hit(
     """
     t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
     _, n_fixed, n_movable, _ = table_rows(t.counts, jnp.int32(0))
-    world, ray = _camera_ray(t, n_pixels, n_cameras, index)
+    world, ray = camera_ray(t, n_pixels, n_cameras, index)
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
 
-    def normal_in_world_frame(row: Sequence[Array], normal: Components) -> Components:
+    def describe_row(row: Sequence[Array], results: Any) -> Any:
         local_origin, local_direction = ray_in_frame(row, ray.origin, ray.direction)
         for k, surface in enumerate(surfaces):
 
-            def normal_of_surface(_: Components, surface: Surface = surface) -> Components:
-                local_normal = _normal_in_frame(surface, row, local_origin, local_direction, distance)
-                a, b, c = local_normal
-                x, y, z = (row[i] * a + row[i + 1] * b + row[i + 2] * c for i in (4, 7, 10))
-                return x, y, z
+            def describe_surface(_: Any, surface: Surface = surface) -> Any:
+                return describe(surface, row, local_origin, local_direction, distance)
 
-            normal = (
-                compute_where(code == k, normal_of_surface, normal) if len(surfaces) > 1 else normal_of_surface(normal)
+            results = (
+                compute_where(code == k, describe_surface, results) if len(surfaces) > 1 else describe_surface(results)
             )
-        return normal
+        return results
 
-    def normal_of_fixed_geom(normal: Components) -> Components:
-        return normal_in_world_frame(table_rows(t.fixed_geoms, geom), normal)
+    def describe_fixed_geom(results: Any) -> Any:
+        return describe_row(table_rows(t.fixed_geoms, fixed_row), results)
 
-    def normal_of_movable_geom(normal: Components) -> Components:
-        return normal_in_world_frame(table_rows(t.movable_geoms, world * n_movable + geom - n_fixed), normal)
+    def describe_movable_geom(results: Any) -> Any:
+        return describe_row(table_rows(t.movable_geoms, world * n_movable + movable_row), results)
 
-    zero = jnp.zeros_like(distance)
-    normal = compute_where((geom >= 0) & (geom < n_fixed), normal_of_fixed_geom, (zero, zero, zero))
-    return compute_where(geom >= n_fixed, normal_of_movable_geom, normal)
+    # Lanes that a branch does not concern read rows in it, too, which must exist.
+    fixed_row = _maximum(_minimum(geom, n_fixed - 1), jnp.int32(0))
+    movable_row = _maximum(geom - n_fixed, jnp.int32(0))
+    zeros = (jnp.zeros_like(distance),) * n_results
+    results = compute_where((geom >= 0) & (geom < n_fixed), describe_fixed_geom, zeros)
+    return compute_where(geom >= n_fixed, describe_movable_geom, results)
 
 
-def _normal_in_frame(
+def normal_in_frame(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> Components:
     if isinstance(surface, Shape) and surface.kind == "hfield":

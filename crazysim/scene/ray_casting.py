@@ -25,6 +25,7 @@ from crazysim.geometry import Shape, ray_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
+from crazysim.scene.appearance import Appearance
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 from crazysim.scene.first_hit import (
     IGNORES_NONE,
@@ -38,6 +39,7 @@ from crazysim.scene.first_hit import (
     normal_at_hit,
     ray_in_frame,
 )
+from crazysim.scene.hit_color import color_at_hit
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 T = TypeVar("T")
@@ -69,6 +71,8 @@ class Hits(PyTree):
     """Index of the body in ``names``; -1 where the ray meets nothing. (...)"""
     names: tuple[str, ...] = static()
     """Names of floor, objects and drones, in the order of ``body_index``."""
+    color: Array | None = None
+    """Colour of the surface, or of the sky, red, green and blue, uint8; None if it was not requested. (..., 3)"""
     is_hidden: Array | None = None
     """Whether the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
 
@@ -280,7 +284,14 @@ def _hit_rows(
 
 
 def cast_rays_in_worlds(
-    model: CollisionModel, data: SimData, camera_poses: Array, pixels: np.ndarray, drones: bool, kernels: RayKernels
+    model: CollisionModel,
+    data: SimData,
+    camera_poses: Array,
+    pixels: np.ndarray,
+    drones: bool,
+    kernels: RayKernels,
+    appearance: Appearance | None = None,
+    pixel_angle: float = 0.0,
 ) -> Hits:
     """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
@@ -296,6 +307,8 @@ def cast_rays_in_worlds(
         pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
         drones: Whether rays meet drones.
+        appearance: The scene's materials and lights, for colours; None for no colours.
+        pixel_angle: Angle between neighbouring pixels in the middle of the image, rad; for colours.
     """
     ignored = np.unique(pixels[..., 3])
     targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
@@ -316,8 +329,15 @@ def cast_rays_in_worlds(
     direction = sum(axes[..., k] * pixel_direction[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
     origin = jnp.repeat(camera_poses[..., :3], n_pixels, axis=1)
     names = body_names(model, data.core.n_drones if drones else 0)
+    color = None
+    if appearance is not None:
+        paint = appearance.paint(targets.all_geoms, pixel_angle, camera_poses.dtype)
+        settings = tuple(appearance.lights), appearance.has_sky, appearance.has_haze, targets.surfaces
+        color_fn = functools.partial(color_at_hit, *settings, n_pixels, n_cameras)
+        (packed,), _ = kernels._map_indices(color_fn, n, [*paint, *tables, *hit_table])
+        color = packed.reshape(n_worlds, -1)  # unpacked when its pixels are in the order of the image
     if not targets.all_geoms:
-        return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names)
+        return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names, color)
     # Distance and normal again in JAX, for their derivatives.
     fixed_rows = jnp.broadcast_to(
         tables.fixed_geoms[: len(targets.fixed_geoms)], (n_worlds, len(targets.fixed_geoms), 16)
@@ -333,7 +353,7 @@ def cast_rays_in_worlds(
         kernel_normal = map_indices(ray_fn, n, [*tables, *hit_table], platform, compile_now=False)
         normal = _replace_derivative(jnp.stack(kernel_normal, axis=-1).reshape(normal.shape), normal)
     body_indices = jnp.asarray([*(target.body_index for target in targets.all_geoms), -1], jnp.int32)
-    return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names)
+    return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names, color)
 
 
 @dataclasses.dataclass

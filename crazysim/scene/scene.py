@@ -16,12 +16,13 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.arguments import check_arguments
+from crazysim.arguments import check_arguments, check_flag
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.scene import build, collision, contact_report, depth, mjx
+from crazysim.scene.appearance import Appearance
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.object_poses import ListPlugins
@@ -330,6 +331,7 @@ class Scene:
         drones: bool = True,
         hide_own: bool = True,
         along: depth.Along = "axis",
+        color: bool = False,
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
@@ -348,6 +350,7 @@ class Scene:
             hide_own: Whether a drone is invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
+            color: Whether to return ``Hits.color``, the colours that MuJoCo's renderer draws, without shadows.
         """
         if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
@@ -365,6 +368,7 @@ class Scene:
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
             camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
+            Appearance(self.mj_model) if check_flag("color", color) else None,
         )  # fmt: skip
 
     def splat_fn(

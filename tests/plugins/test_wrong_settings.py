@@ -69,10 +69,11 @@ def measure_without_sensors(env):
 
 SENSORS = [
     (lambda: Camera(outputs=()), "outputs of 'camera'"),
-    (lambda: Camera(outputs=("rgb",)), "got ('rgb',)"),
+    (lambda: Camera(outputs=("hue",)), "got ('hue',)"),
     (lambda: Camera(outputs=[[1], [2, 3]]), "outputs"),
     (lambda: Lidar(outputs=[[1], [2, 3]]), "outputs"),
     (lambda: Lidar(outputs=("depth",)), "lidar without 'depth'"),
+    (lambda: Lidar(outputs=("rgb",)), "and 'rgb'"),
     (lambda: Lidar(elevation=()), "elevation and azimuth"),
     (lambda: Camera(fovy=180.0), "fovy of Camera"),
     (lambda: Camera(noise=0.1), "StereoNoise"),

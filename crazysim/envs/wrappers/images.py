@@ -9,7 +9,7 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError, expect, require, short_repr
-from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor
+from crazysim.plugins.sensors.image_sensor import OUTPUTS, ImageSensor, as_observation
 from crazysim.plugins.sensors.sensor import rate_in
 
 
@@ -52,7 +52,7 @@ class CameraImages(Wrapper):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of an image by the name of its observation: (height, width), or (height, width, 3) for normals."""
+        """Shape of an image by the name of its observation: (height, width), and 3 for normals and colours."""
         return {name: self.camera.image_size + OUTPUTS[output] for output, name in self.names.items()}
 
     def describe_images(self) -> dict[str, dict[str, Any]]:
@@ -70,5 +70,5 @@ class CameraImages(Wrapper):
                 record = camera.initial_record(self._take_images, data, self._period)
             state, images = self.remember(state, record), record.images
         dtype, shape = data.states.pos.dtype, data.states.pos.shape[:2]
-        flat = {self.names[name]: image.reshape(*shape, -1).astype(dtype) for name, image in images.items()}
+        flat = {self.names[k]: as_observation(x, dtype).reshape(*shape, -1) for k, x in images.items()}
         return state.replace(images=state.record.images | flat)

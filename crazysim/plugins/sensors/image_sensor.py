@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
 from crazysim import rotation
@@ -29,13 +30,19 @@ from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
 
-OUTPUTS: dict[str, tuple[int, ...]] = {"depth": (), "distance": (), "normal": (3,), "segmentation": ()}
+OUTPUTS: dict[str, tuple[int, ...]] = {"depth": (), "distance": (), "normal": (3,), "segmentation": (), "rgb": (3,)}
 """Shape of a pixel of each output of an image."""
 UNFUSED_REASON = "images are taken by kernels with a lane for each ray"
 
 Images = dict[str, Array]
-"""Images by output, (n_worlds, n_drones, height, width), and (n_worlds, n_drones, height, width, 3) for normals."""
+"""Images by output, (n_worlds, n_drones, height, width), and (n_worlds, n_drones, height, width, 3) for normals and
+colours."""
 ImageFn = Callable[[SimData], Images]
+
+
+def as_observation(image: Array, dtype: DTypeLike) -> Array:
+    """Return an image as numbers for a policy: colours from 0 to 1, other values unchanged. (n_pixels,)"""
+    return (image.astype(dtype) * (1 / 255 if image.dtype == np.uint8 else 1)).reshape(-1)
 
 
 class ImageData(PyTree):
@@ -43,12 +50,12 @@ class ImageData(PyTree):
 
     images: dict[str, Array] = leaf("drone", None)
     """Last image of each output; nothing within ``far`` before the first image. (n_worlds, n_drones, height, width),
-    for normals (n_worlds, n_drones, height, width, 3)"""
+    for normals and colours (n_worlds, n_drones, height, width, 3)"""
     taken_step: Array = leaf("world")
     """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
     transit: dict[str, Array] = leaf("drone", None)
     """The last images of each output that were taken, newest first; empty without latency. (n_worlds, n_drones, n_rows,
-    height, width), for normals (n_worlds, n_drones, n_rows, height, width, 3)"""
+    height, width), for normals and colours (n_worlds, n_drones, n_rows, height, width, 3)"""
 
 
 class ImageSensor(Plugin):
@@ -66,8 +73,8 @@ class ImageSensor(Plugin):
     """Roll, pitch and yaw of the sensor's frame (x ahead, y left, z up) in the body frame, rad. (3,)"""
     outputs: Sequence[str] = ("depth",)
     """Images to take, some of ``"depth"`` (along the axis of the sensor, m), ``"distance"`` (along the ray, m),
-    ``"normal"`` (of the surface, unit, sensor frame) and ``"segmentation"`` (index in ``segment_names``, -1 for
-    nothing)."""
+    ``"normal"`` (of the surface, unit, sensor frame), ``"segmentation"`` (index in ``segment_names``, -1 for nothing)
+    and ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8; a lidar has none)."""
     drones: bool = True
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
@@ -142,8 +149,8 @@ class ImageSensor(Plugin):
         sensor |= {"freq": self.freq, "latency": float(self.latency)}
         formats = {}
         for name in self.outputs:
-            unit = {"normal": "1", "segmentation": "index"}.get(name, "m")
-            far = {"normal": 0.0, "segmentation": -1}.get(name, self.far)
+            unit = {"normal": "1", "segmentation": "index", "rgb": "1"}.get(name, "m")
+            far = {"normal": 0.0, "segmentation": -1, "rgb": 0.0}.get(name, self.far)
             formats[name] = {"height": height, "width": width, "unit": unit, "far": far, "output": name} | sensor
         return formats
 
@@ -175,7 +182,8 @@ class ImageSensor(Plugin):
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
-        cast_rays, rot = sim.scene.depth_fn(camera, drones=self.drones, along="ray"), camera.rot
+        color = "rgb" in self.outputs
+        cast_rays, rot = sim.scene.depth_fn(camera, drones=self.drones, along="ray", color=color), camera.rot
 
         def take_images(data: SimData) -> Images:
             hits, quat = cast_rays(data), data.states.quat[..., None, None, :]
@@ -199,7 +207,7 @@ class ImageSensor(Plugin):
                     parts = [sum(float(rot[i, k]) * normal[..., i] for i in range(3)) for k in range(3)]
                     images[name] = jnp.stack(parts, axis=-1)  # type: ignore[arg-type]
                 else:
-                    images[name] = hits.body_index
+                    images[name] = hits.color if name == "rgb" else hits.body_index
             return images
 
         return take_images
@@ -260,8 +268,9 @@ class ImageSensor(Plugin):
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
         for name in self.outputs:
-            value, dtype = (-1, np.int32) if name == "segmentation" else (self.far, sim.data.states.pos.dtype)
-            value = 0.0 if name == "normal" else value
+            number = sim.data.states.pos.dtype
+            special = {"segmentation": (-1, np.int32), "normal": (0.0, number), "rgb": (0, np.uint8)}
+            value, dtype = special.get(name, (self.far, number))
             images[name] = device_array(np.full(shape + OUTPUTS[name], value), dtype)
             if n:
                 transit[name] = device_array(np.full((*shape[:2], n, *shape[2:], *OUTPUTS[name]), value), dtype)
@@ -283,7 +292,7 @@ class ImageSensor(Plugin):
         return [StagePlacement(stage, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        return {name: image.reshape(-1) for name, image in self.read(data).images.items()}
+        return {name: as_observation(image, data.states.pos.dtype) for name, image in self.read(data).images.items()}
 
     def age(self, data: SimData) -> Array:
         """Return the time since the last images were taken, s; infinite before the first ones. (n_worlds, 1)"""

@@ -56,8 +56,10 @@ class Lidar(ImageSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if "depth" in self.outputs:
-            raise ConfigError("expected outputs of a lidar without 'depth', since it has no axis. Use 'distance'.")
+        if {"depth", "rgb"} & {*self.outputs}:
+            raise ConfigError(
+                "expected outputs of a lidar without 'depth', since it has no axis, and 'rgb'. Use 'distance'."
+            )
         if 0 in self.image_size:
             raise ConfigError(f"expected at least one elevation and azimuth, got {self.image_size} of them")
 

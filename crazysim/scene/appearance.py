@@ -1,0 +1,138 @@
+"""Materials, lights, textures and sky of a compiled scene, as tables for the colours of rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.typing import DTypeLike
+
+from crazysim.scene.first_hit import Target
+from crazysim.scene.hit_color import MAX_LEVELS, Light, Paint, View
+from crazysim.scene.visual_geoms import DEFAULT_COLOR
+
+DEFAULT_SHINE = 0.0, 0.5, 0.5
+"""MuJoCo's emission, specular and shininess of geoms without a material (``mjv_initGeom``)."""
+SHININESS_SCALE = 128.0
+"""OpenGL's exponent of highlights for a shininess of 1."""
+AMBIENT_WITHOUT_LIGHTS = 0.3
+"""MuJoCo's ambient light in scenes without lights."""
+SKY_RADIUS = 0.7
+"""Distance at which MuJoCo draws the sky, divided by ``zfar``."""
+TEXTURED_KINDS = ("plane", "box")
+"""Kinds of geoms on which textures are drawn; other geoms have the mean colour of their texture."""
+
+
+class Appearance:
+    """Materials, lights, textures and sky of a compiled scene."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+        data = mujoco.MjData(model)
+        for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
+            update(model, data)
+        # Headlight, then lights of the kinds that MuJoCo's renderer knows.
+        head, spot = model.vis.headlight, mujoco.mjtLightType.mjLIGHT_SPOT
+        kinds = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int(spot)
+        lights = [k for k in range(model.nlight) if model.light_active[k] and int(model.light_type[k]) in kinds]
+        self.lights = [Light(False, int(model.light_type[k]) == int(spot)) for k in lights]
+        """Lights of the scene, the headlight first."""
+        rows = [
+            [*data.light_xpos[k], *data.light_xdir[k], *model.light_ambient[k], *model.light_diffuse[k],
+             *model.light_specular[k], *model.light_attenuation[k], model.light_exponent[k],
+             np.cos(np.deg2rad(model.light_cutoff[k]))] for k in lights
+        ]  # fmt: skip
+        if head.active:
+            self.lights.insert(0, Light(True, False))
+            rows.insert(0, [*np.zeros(6), *head.ambient, *head.diffuse, *head.specular, 1, 0, 0, 0, -1])
+        self._light_rows = np.array(rows).reshape(-1, 20)
+        # Sky, and haze before it where a plane is infinite.
+        skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
+        self.has_sky = len(skies) > 0
+        """Whether rays that meet nothing have the colour of the sky."""
+        self._sky = _read_texture(model, skies[0]) if self.has_sky else np.zeros((1, 1, 3))
+        is_infinite = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & ~model.geom_size[:, :2].any(axis=1)
+        plane = int(np.argmax(is_infinite))
+        self.has_haze = bool(self.has_sky and is_infinite.any() and data.geom_xmat[plane, 8] > 1 - 1e-6)
+        """Whether a level plane disappears in haze at the horizon."""
+        self._plane_height = float(data.geom_xpos[plane, 2]) if self.has_haze else 0.0
+
+    def paint(self, targets: Sequence[Target], pixel_angle: float, dtype: DTypeLike) -> Paint:
+        """Return the tables of the scene.
+
+        Args:
+            targets: ``Targets.all_geoms``.
+            pixel_angle: Angle between neighbouring pixels in the middle of the image, rad.
+        """
+        model, size = self._model, self._sky.shape[1]
+        sides = self._sky.reshape(-1, size, size, 3)
+        images = [sides if len(sides) == 6 else np.repeat(sides, 6, axis=0)]
+        looks, textures, levels = np.zeros((len(targets), 9)), np.zeros((len(targets), 2), np.int32), [[0, 1, 1]]
+        rows_of_texture: dict[int, tuple[int, int]] = {}
+        for target, look, rows in zip(targets, looks, textures, strict=True):
+            geom, material, texture = target.geom.index, int(model.geom_matid[target.geom.index]), -1
+            rgba, shine, repeat, half = model.geom_rgba[geom], DEFAULT_SHINE, np.ones(2), model.geom_size[geom, :2]
+            if material >= 0:
+                rgba = model.mat_rgba[material] if np.array_equal(rgba, DEFAULT_COLOR) else rgba
+                shine = model.mat_emission[material], model.mat_specular[material], model.mat_shininess[material]
+                texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
+                repeat = np.where(model.mat_texrepeat[material] > 0, model.mat_texrepeat[material], 1.0)
+                repeat = repeat * np.where(model.mat_texuniform[material] & (half > 0), half, 1.0)
+            kind = target.geom.shape.kind
+            shift = 0.5 * (kind == "plane" and not half.all())
+            look[:] = *rgba[:3], *shine[:2], SHININESS_SCALE * shine[2], *repeat, shift
+            is_flat = texture >= 0 and int(model.tex_type[texture]) == int(mujoco.mjtTexture.mjTEXTURE_2D)
+            if texture >= 0 and not (is_flat and kind in TEXTURED_KINDS):
+                look[:3] *= _read_texture(model, texture).mean(axis=(0, 1))
+            elif texture >= 0:
+                if texture not in rows_of_texture:
+                    reduced = _reduced_images(_read_texture(model, texture))
+                    rows_of_texture[texture] = len(levels), len(reduced)
+                    for image in reduced:
+                        levels.append([sum(x.size for x in images) // 3, image.shape[1], image.shape[0]])
+                        images.append(image)
+                rows[:] = rows_of_texture[texture]
+        texels = np.concatenate([np.rint(255 * x).reshape(-1, 3) for x in images]).astype(np.int32)
+        tables = (
+            looks,
+            textures,
+            levels,
+            texels @ [[1], [1 << 8], [1 << 16]],
+            self._light_rows,
+            [self._view(pixel_angle)],
+        )
+        # Empty tables get a row of zeros, since an array without rows has no memory.
+        arrays = [np.asarray(x if len(x) else np.zeros((1, np.shape(x)[1]))) for x in tables]
+        return Paint(*(jnp.asarray(x, np.int32 if x.dtype.kind == "i" else dtype) for x in arrays))
+
+    def _view(self, pixel_angle: float) -> View:
+        vis, far = self._model.vis, self._model.vis.map.zfar * self._model.stat.extent
+        share = vis.map.haze
+        slope = np.arctan2(1, share)
+        densest = np.sqrt(0.5) * share * np.sin(slope) / np.sin(0.75 * np.pi - slope)
+        ambient = 0.0 if self.lights else AMBIENT_WITHOUT_LIGHTS
+        radius = far * SKY_RADIUS if self.has_sky else far
+        haze = vis.rgba.haze[:3].tolist()
+        return View(pixel_angle, radius, ambient, self._sky.shape[1], self._plane_height, *haze, share, densest)
+
+
+def _read_texture(model: mujoco.MjModel, texture: int) -> np.ndarray:
+    shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
+    first = int(model.tex_adr[texture])
+    texels = model.tex_data[first : first + np.prod(shape)].reshape(shape)[..., :3] / 255
+    if int(model.tex_colorspace[texture]) == int(mujoco.mjtColorSpace.mjCOLORSPACE_SRGB):
+        return np.where(texels <= 0.04045, texels / 12.92, ((texels + 0.055) / 1.055) ** 2.4)
+    return texels
+
+
+def _reduced_images(image: np.ndarray) -> list[np.ndarray]:
+    images = [image]
+    while max(image.shape[:2]) > 1 and len(images) < MAX_LEVELS:
+        height, width = (max(n // 2, 1) for n in image.shape[:2])
+        rows, columns = image.shape[0] // height, image.shape[1] // width
+        blocks = image[: rows * height, : columns * width].reshape(height, rows, width, columns, 3)
+        image = blocks.mean(axis=(1, 3))
+        images.append(image)
+    return images

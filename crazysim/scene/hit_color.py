@@ -1,0 +1,298 @@
+"""The colour of a ray at its first hit, by the rules of MuJoCo's renderer: a function of one ray, for kernels.
+
+MuJoCo lights the vertices of its triangles with OpenGL's fixed functions; this function lights every pixel with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.core.branches import compute_where, table_rows
+from crazysim.geometry.points import Components
+from crazysim.rotation import safe_sqrt
+from crazysim.scene.first_hit import Surface, Tables, camera_ray, normal_in_frame, surface_at_hit, world_vector
+
+MAX_LEVELS = 12
+"""Largest number of images of a texture, each half as wide as the one before."""
+MIN_COSINE = 1e-3
+"""Cosine of the steepest angle of incidence for which the size of a pixel on the surface is computed."""
+
+
+class Light(NamedTuple):
+    """What the kernel must know about a light when it is compiled."""
+
+    is_headlight: bool
+    """Whether it shines along the axis of the camera."""
+    is_spot: bool
+    """Whether it shines from a point, not from one direction."""
+
+
+class LightRow(NamedTuple):
+    """A light in a table."""
+
+    pos: Any
+    dir: Any
+    """Direction in which it shines, unit."""
+    ambient: Any
+    diffuse: Any
+    specular: Any
+    attenuation: Any
+    """Coefficients of 1, the distance and its square."""
+    exponent: Any
+    """Exponent of the cosine between its axis and a ray of light."""
+    cutoff: Any
+    """Cosine of the largest angle between its axis and a ray of light."""
+
+    @classmethod
+    def read(cls, table: Array, index: int) -> LightRow:
+        row = table_rows(table, jnp.int32(index))
+        return cls(*(row[k : k + 3] for k in range(0, 18, 3)), *row[18:])
+
+
+class View(NamedTuple):
+    """Numbers of a scene that concern all rays."""
+
+    pixel_angle: Any
+    """Angle between neighbouring pixels in the middle of the image, rad."""
+    radius: Any
+    """Distance from the camera's vertical axis at which the sky hides everything, m."""
+    ambient: Any
+    """Ambient light of a scene without lights."""
+    sky_size: Any
+    """Width of a side of the sky, texels."""
+    plane_height: Any
+    """Height of the plane that disappears in haze, m."""
+    haze_red: Any
+    haze_green: Any
+    haze_blue: Any
+    haze: Any
+    """Share of the radius over which the haze extends."""
+    densest: Any
+    """Height at which the haze is densest, between 0 at its beginning and 1 at the horizon."""
+
+
+class Paint(NamedTuple):
+    """Colours of a scene, as tables in memory."""
+
+    looks: Array
+    """Red, green, blue, emission, specular, exponent of highlights, repetitions of the texture along both axes, and its
+    shift, of each geom. (n_geoms, 9)"""
+    textures: Array
+    """First row in ``levels`` and number of rows of the texture of each geom; 0 rows for none. (n_geoms, 2)"""
+    levels: Array
+    """First texel, width and height of each image of a texture, from large to small. (n_levels, 3)"""
+    texels: Array
+    """Colours, 8 bits each, red lowest; the six sides of the sky come first. (n_texels, 1)"""
+    lights: Array
+    """See ``LightRow``. (n_lights, 20)"""
+    view: Array
+    """See ``View``. (1, 10)"""
+
+
+def color_at_hit(
+    lights: Sequence[Light],
+    has_sky: bool,
+    has_haze: bool,
+    surfaces: Sequence[Surface],
+    n_pixels: int,
+    n_cameras: int,
+    index: Array,
+    *tables: Array,
+) -> list[Array]:
+    """Return the colour of a ray, 8 bits each for red (lowest), green and blue. () each
+
+    Args:
+        lights: Lights in the order of ``Paint.lights``.
+        has_sky: Whether rays that meet nothing have the colour of the sky; they are black otherwise.
+        has_haze: Whether a plane disappears in haze at the horizon.
+        surfaces: ``Targets.surfaces``.
+        n_pixels: Number of rays of a camera.
+        n_cameras: Number of cameras of a world.
+        index: Index of the ray, as in ``first_hit``. ()
+        *tables: Fields of ``Paint`` and ``Tables``, then the two results of ``first_hit``. (n_rays, 1) each
+    """
+    n_paint = len(Paint._fields)
+    paint, t, (distances, geoms) = Paint(*tables[:n_paint]), Tables(*tables[n_paint:-2]), tables[-2:]
+    ray = camera_ray(t, n_pixels, n_cameras, index)[1]
+    pose = table_rows(t.camera_poses, lax.div(index, jnp.int32(n_pixels)))
+    back = pose[5], pose[8], pose[11]
+    (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
+    view = View(*table_rows(paint.view, jnp.int32(0)))
+    row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
+
+    def shade(_: Components) -> Components:
+        *normal, u, v, u_rate, v_rate = surface_at_hit(
+            _normal_and_texture_position, 7, surfaces, n_pixels, n_cameras, index, *tables[n_paint:]
+        )
+        *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, row)
+        point = [o + distance * d for o, d in zip(ray.origin, ray.direction, strict=True)]
+        to_eye = [-d for d in ray.direction]
+        steepness = _dot(normal, to_eye)
+        color = [c * (emission + view.ambient) for c in own_color]
+        for k, light in enumerate(lights):
+            parts = _light(
+                light, LightRow.read(paint.lights, k), point, normal, to_eye, steepness, back, specular, exponent
+            )
+            color = [a + b * own + c for a, own, (b, c) in zip(color, own_color, parts, strict=True)]
+        color = [jnp.minimum(c, 1.0) for c in color]
+        first_level, n_levels = table_rows(paint.textures, row)
+
+        def draw_texture(color: Components) -> Components:
+            cosine = _dot(ray.direction, back)
+            footprint = distance * view.pixel_angle * cosine * cosine / jnp.maximum(steepness, MIN_COSINE)
+            # The image whose texels are nearest to the size of a pixel.
+            _, width, height = table_rows(paint.levels, first_level)
+            rate = footprint * jnp.maximum(u_rate * u_scale * width, v_rate * v_scale * height)
+            level = sum(jnp.where(rate > 2 ** (k + 0.5), jnp.int32(1), 0) for k in range(MAX_LEVELS - 1))
+            level = first_level + jnp.minimum(level, n_levels - 1)
+            texel = _interpolate(paint, level, u * u_scale - shift, v * v_scale - shift)
+            return tuple(c * k for c, k in zip(color, texel, strict=True))  # type: ignore[return-value]
+
+        return compute_where(n_levels > 0, draw_texture, tuple(color))  # type: ignore[arg-type]
+
+    x, y, z = ray.direction
+    level_share = safe_sqrt(x * x + y * y)
+    reach = jnp.where(geom >= 0, distance, jnp.inf) * level_share
+    zero = jnp.zeros_like(distance)
+    color = zero, zero, zero
+    is_far = ~(reach < view.radius)
+    if has_sky:
+        color = compute_where(is_far, lambda _: _sky_color(paint, view, ray.direction), color)
+    color = compute_where(~is_far, shade, color)
+    if has_haze:
+        color = _add_haze(view, ray.origin[2], z, level_share, reach, color)
+    # OpenGL rounds colours to the nearest of 255 steps.
+    red, green, blue = ((255 * jnp.clip(c, 0.0, 1.0) + 0.5).astype(jnp.int32) for c in color)
+    return [red + green * 256 + blue * 65536]
+
+
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _normal_and_texture_position(
+    surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
+) -> tuple[Array, ...]:
+    # The texture covers a side of a box, or a plane, once; of an infinite plane it covers 2 m.
+    normal = normal_in_frame(surface, row, origin, direction, distance)
+    position = [jnp.zeros_like(distance)] * 4
+    if surface in ("plane", "box"):
+        x, y, z = (o + distance * d for o, d in zip(origin, direction, strict=True))
+        half = row[13:16]
+        pairs = [(x, half[0]), (y, half[1])]
+        if surface == "box":
+            is_x_side, is_z_side = jnp.abs(normal[0]) > 0.5, jnp.abs(normal[2]) > 0.5
+            second = (jnp.where(is_z_side, y, z), jnp.where(is_z_side, half[1], half[2]))
+            pairs = [(jnp.where(is_x_side, y, x), jnp.where(is_x_side, half[1], half[0])), second]
+        (u, u_rate, u_start), (v, v_rate, v_start) = (
+            (
+                0.5 * p / jnp.where(size > 0, size, 1.0),
+                0.5 / jnp.where(size > 0, size, 1.0),
+                jnp.where(size > 0, 0.5, 0.0),
+            )
+            for p, size in pairs
+        )
+        position = [u_start + u, v_start - v, u_rate, v_rate]
+    return *world_vector(row, normal), *position
+
+
+def _light(
+    light: Light,
+    row: LightRow,
+    point: Sequence[Array],
+    normal: Sequence[Array],
+    to_eye: Sequence[Array],
+    steepness: Array,
+    back: Sequence[Array],
+    specular: Array,
+    exponent: Array,
+) -> list[tuple[Array, Array]]:
+    # Per channel: light that the surface's colour multiplies, and its highlight.
+    strength: Any = 1.0
+    if light.is_headlight:
+        to_light = back
+    elif light.is_spot:
+        offset = [a - b for a, b in zip(row.pos, point, strict=True)]
+        distance = jnp.sqrt(jnp.maximum(_dot(offset, offset), 1e-12))
+        to_light = [x / distance for x in offset]
+        cosine = -_dot(to_light, row.dir)
+        falloff = row.attenuation[0] + distance * (row.attenuation[1] + distance * row.attenuation[2])
+        strength = jnp.where(cosine >= row.cutoff, _power(jnp.maximum(cosine, 0.0), row.exponent) / falloff, 0.0)
+    else:
+        to_light = [-x for x in row.dir]
+    cosine = _dot(normal, to_light)
+    # Of the direction midway between light and eye, which is their sum with the length sqrt(2 + 2 l.e).
+    square = jnp.maximum(2 + 2 * _dot(to_light, to_eye), 1e-6)
+    highlight_cosine = jnp.clip((cosine + steepness) * lax.rsqrt(square), 0.0, 1.0)
+    highlight = jnp.where(cosine > 0, strength * specular * _power(highlight_cosine, exponent), 0.0)
+    cosine = strength * jnp.maximum(cosine, 0.0)
+    return [
+        (strength * a + cosine * d, highlight * s)
+        for a, d, s in zip(row.ambient, row.diffuse, row.specular, strict=True)
+    ]
+
+
+def _power(x: Array, exponent: Array) -> Array:
+    # exp(exponent log x) for x from 0 to 1, with the series of atanh. Powers of small x are too large, by at most 0.02
+    # for exponents from 1.
+    y = (x - 1) / (x + 1)
+    z = y * y
+    series = y * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * (1 / 9 + z * (1 / 11 + z / 13))))))
+    return jnp.exp(2 * exponent * series)
+
+
+def _interpolate(paint: Paint, level: Array, u: Array, v: Array) -> Components:
+    first, width, height = table_rows(paint.levels, level)
+
+    def neighbours(u: Array, size: Array) -> tuple[Array, Array, Array]:
+        x = (u - jnp.floor(u)) * size - 0.5
+        low = jnp.floor(x)
+        k = low.astype(jnp.int32)
+        return jnp.where(k < 0, size - 1, jnp.minimum(k, size - 1)), jnp.where(k + 1 >= size, 0, k + 1), x - low
+
+    (left, right, right_share), (top, bottom, bottom_share) = neighbours(u, width), neighbours(v, height)
+    upper, lower = (
+        [a + right_share * (b - a) for a, b in zip(_texel(paint, k + left), _texel(paint, k + right), strict=True)]
+        for k in (first + top * width, first + bottom * width)
+    )
+    return tuple(a + bottom_share * (b - a) for a, b in zip(upper, lower, strict=True))  # type: ignore[return-value]
+
+
+def _texel(paint: Paint, index: Array) -> list[Array]:
+    (packed,) = table_rows(paint.texels, index)
+    bytes_of_color = packed & 255, (packed >> 8) & 255, (packed >> 16) & 255
+    return [x.astype(paint.view.dtype) * (1 / 255) for x in bytes_of_color]
+
+
+def _sky_color(paint: Paint, view: View, direction: Components) -> Components:
+    # A side of the cube by the largest component; MuJoCo's sky has y up, and OpenGL's cubes are left-handed.
+    x, y, z = direction[0], direction[2], -direction[1]
+    ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
+    is_x, is_y = (ax >= ay) & (ax >= az), (ay > ax) & (ay >= az)
+    side = jnp.where(is_x, jnp.where(x < 0, 1, 0), jnp.where(is_y, jnp.where(y < 0, 3, 2), jnp.where(z < 0, 5, 4)))
+    across = jnp.where(is_x, jnp.where(x < 0, z, -z), jnp.where(~is_y & (z < 0), -x, x))
+    down = jnp.where(is_y, jnp.where(y < 0, -z, z), -y)
+    scale = 0.5 / jnp.maximum(jnp.maximum(ax, ay), az)
+    size = view.sky_size
+    column, row = (jnp.clip((0.5 + scale * p) * size, 0.0, size - 1).astype(jnp.int32) for p in (across, down))
+    width = size.astype(jnp.int32)
+    red, green, blue = _texel(paint, (side.astype(jnp.int32) * width + row) * width + column)
+    return red, green, blue
+
+
+def _add_haze(
+    view: View, height: Array, rise: Array, level_share: Array, reach: Array, color: Components
+) -> Components:
+    # A cone around the camera, from the plane up to the horizon; its transparency falls, then rises.
+    elevation = (height - view.plane_height) / view.radius
+    depth = -rise / jnp.maximum((elevation * level_share - rise * view.haze), 1e-12)
+    share = jnp.where(1 - depth < view.densest, (1 - depth) / view.densest, depth / (1 - view.densest))
+    is_behind = (elevation > 0) & (rise < 0) & (depth < 1) & (reach >= view.radius * (1 - view.haze * depth))
+    share = jnp.where(is_behind, jnp.clip(share, 0.0, 1.0), 0.0)
+    haze = view.haze_red, view.haze_green, view.haze_blue
+    red, green, blue = (c + share * (h - c) for c, h in zip(color, haze, strict=True))
+    return red, green, blue

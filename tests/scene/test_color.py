@@ -1,0 +1,128 @@
+"""Colours of rays against the images of MuJoCo's renderer, in random scenes."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import Camera, Sim
+from crazysim.scene.ray_casting import RayKernels
+
+WIDTH, HEIGHT = 96, 72
+KINDS = ("box", "sphere", "capsule", "cylinder", "ellipsoid")
+
+
+def text(*numbers):
+    return " ".join(f"{x:.4f}" for x in np.concatenate([np.ravel(x) for x in numbers]))
+
+
+def random_light(rng):
+    kind = rng.choice(["directional", "spot"])
+    return f"""<light type="{kind}" pos="{text(rng.uniform([0, -4, 3], [8, 4, 6]))}" castshadow="false"
+        dir="{text(0.4 * rng.normal(size=2), -1)}" diffuse="{text(rng.uniform(0.1, 0.6, 3))}"
+        specular="{text(rng.uniform(0, 0.5, 3))}" ambient="{text(rng.uniform(0, 0.1, 3))}"
+        cutoff="{text(rng.uniform(30, 80))}" exponent="{text(rng.uniform(0, 10))}"
+        attenuation="{text(1, rng.uniform(0, 0.2), rng.uniform(0, 0.05))}"/>"""
+
+
+def random_scene(rng, has_textures):
+    """Return MJCF of 20 objects above a floor, with two lights and a camera."""
+    materials, geoms = "", ""
+    for k in range(20):
+        kind, color = rng.choice(KINDS), text(rng.uniform(0, 1, 3), 1)
+        texture = f"""texture="{rng.choice(["noise", "checker"])}" texuniform="{rng.choice(["true", "false"])}"
+            texrepeat="{text(rng.uniform(0.5, 3, 2))}" """
+        materials += f"""<material name="{k}" rgba="{color}" specular="{text(rng.uniform())}"
+            shininess="{text(rng.uniform())}" emission="{rng.choice([0, 0.3])}"
+            {texture if has_textures and kind == "box" else ""}/>"""
+        geoms += f"""<geom type="{kind}" size="{text(rng.uniform(0.15, 0.6, 3))}" quat="{text(rng.normal(size=4))}"
+            pos="{text(rng.uniform([1, -3, 0.2], [8, 3, 3.5]))}" {f'material="{k}"' if k % 4 else f'rgba="{color}"'}/>
+            """
+    floor = 'texture="checker" texrepeat="1 1" texuniform="true"' if has_textures else ""
+    axes = 0.15 * rng.normal(size=(2, 3)) + [[0, -1, 0], [0.1, 0, 1]]
+    return f"""<mujoco><statistic center="0 0 1" extent="3"/>
+      <visual><map zfar="60"/><rgba haze="0.9 0.9 0.2 1"/><quality numslices="64" numstacks="64" numquads="20"/>
+        <headlight ambient="{text(rng.uniform(0, 0.3, 3))}" diffuse="{text(rng.uniform(0, 0.4, 3))}"/></visual>
+      <asset><texture name="sky" type="skybox" builtin="gradient" rgb1=".6 .8 .9" rgb2=".9 .3 .2" width="64"
+          height="384"/>
+        <texture name="checker" type="2d" builtin="checker" rgb1=".9 .2 .1" rgb2=".1 .3 .8" width="128" height="64"/>
+        <texture name="noise" type="2d" builtin="gradient" mark="random" random="0.02" markrgb="1 1 0" rgb1=".9 .2 .9"
+          rgb2=".1 .8 .1" width="64" height="32"/>
+        <material name="floor" rgba="{text(rng.uniform(0.2, 1, 3), 1)}" specular="0" {floor}/>{materials}</asset>
+      <worldbody>{random_light(rng)}{random_light(rng)}<geom type="plane" size="0 0 .05" material="floor"/>{geoms}
+        <camera name="eye" pos="{text(rng.uniform([-3, -1, 0.5], [-1, 1, 2.5]))}" xyaxes="{text(axes)}"
+          fovy="{text(rng.uniform(40, 80))}"/></worldbody></mujoco>"""
+
+
+def mujoco_image(model):
+    """Return the image of the camera, without drones, shadows, and several samples for a pixel."""
+    data = mujoco.MjData(model)
+    data.mocap_pos[:, 2] = -100
+    mujoco.mj_forward(model, data)
+    model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
+    renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+    for _ in range(2):  # MuJoCo centres infinite planes on the camera of the previous update
+        renderer.update_scene(data, "eye")
+    image = renderer.render().astype(int)
+    renderer.close()
+    return image
+
+
+def edge_mask(hits):
+    """Whether a pixel or one of its eight neighbours is on the other side of an edge."""
+    features = np.concatenate(
+        [2 * hits.normal[0, 0], 5 * np.log(np.minimum(hits.distance[0, 0], 1e3))[..., None]], axis=-1
+    )
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    windows = np.lib.stride_tricks.sliding_window_view(features, (3, 3), (0, 1))
+    mask[1:-1, 1:-1] = np.ptp(windows, axis=(-1, -2)).max(axis=-1) > 1
+    return mask
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("has_textures", [False, True])
+@pytest.mark.parametrize("seed", range(2))
+def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, has_textures):
+    """The bounds of the mean difference and of 99% of pixels away from edges are less than a person notices."""
+    path = tmp_path / "scene.xml"
+    path.write_text(random_scene(np.random.default_rng(seed), has_textures))
+    sim = Sim(1, xml_path=path)
+    hits = jax.device_get(jax.jit(sim.scene.depth_fn("eye", WIDTH, HEIGHT, drones=False, color=True))(sim.data))
+    error = np.abs(hits.color[0, 0] - mujoco_image(sim.mj_model))
+    is_inside = ~edge_mask(hits)
+    assert is_inside.mean() > 0.5
+    assert len(np.unique(hits.color[0, 0].reshape(-1, 3), axis=0)) > 500
+    assert error.mean() <= 4
+    assert (error[is_inside].max(axis=-1) <= 16).mean() >= 0.99
+    if (seed, has_textures) != (0, True):
+        return
+    # Without a kernel, the colours differ by rounding alone.
+    sim.scene.ray_kernels = RayKernels(None)
+    plain = jax.jit(sim.scene.depth_fn("eye", WIDTH, HEIGHT, drones=False, color=True))(sim.data).color
+    difference = np.abs(np.asarray(plain, int) - hits.color)
+    assert (difference <= 1).mean() > 0.999
+
+
+def test_a_camera_sees_the_colors_of_moving_objects_and_other_drones():
+    sim = Sim(2, 2, control="attitude")
+    ball = sim.scene.add("sphere", pos=[1.5, 0, 1], radius=0.3, rgba=(0, 0, 1, 1))
+    sim.data = ball.set_pose(sim.data, np.array([[[1.5, 0, 1.0]], [[-9, 0, 1.0]]]))
+    pos = np.broadcast_to([[0.0, 0, 1], [0.5, 0.1, 1]], (2, 2, 3))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos)))
+    camera = Camera(48, 32, outputs=("rgb", "depth", "segmentation"))
+    images = jax.device_get(jax.jit(camera.image_fn(sim))(sim.data))
+    assert images["rgb"].shape == (2, 2, 32, 48, 3)
+    assert images["rgb"].dtype == np.uint8
+    names = camera.segment_names(sim)
+    is_ball, is_drone, is_sky = (
+        images["segmentation"] == k for k in (names.index("sphere:0"), names.index("drone:1"), -1)
+    )
+    red, green, blue = np.moveaxis(images["rgb"].astype(int), -1, 0)
+    assert is_ball[0].sum() > 20
+    assert not is_ball[1].any()
+    assert (blue > 2 * np.maximum(red, green))[is_ball].all()
+    assert not (blue > 2 * np.maximum(red, green))[~is_ball].any()
+    assert is_drone[:, 0].any()
+    assert (images["rgb"][is_sky] > 150).all()
+    # In the upper half of the image, the sky becomes darker with the height.
+    assert (np.diff(red[1, 1, :15, 0]) >= 0).all()
