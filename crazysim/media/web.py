@@ -6,6 +6,7 @@ import contextlib
 import http.server
 import io
 import socket
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,17 @@ FPS = 30
 FOV = 50.0
 """Initial vertical field of view, degrees."""
 
+CAPTION_HEIGHT = 0.35
+"""Height of a caption above the middle of the flight, as a multiple of the distance of the camera."""
+
 
 @check_arguments
-def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = None) -> str:
+def page(
+    flight: Flight,
+    world: int | None = None,
+    lights: ArrayLike | None = None,
+    caption: Callable[[float], str] | None = None,
+) -> str:
     """Make an HTML page of one world of a flight with drones, obstacles, setpoints and trails.
 
     The page contains the viewer and the flight, so that it can be opened as a file, without server or network.
@@ -35,6 +44,7 @@ def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = No
         world: Index of the world in the simulation; None for the first recorded world.
         lights: Colour of the light on each drone at each of the flight's times, 0 to 1; None for no lights.
             (n, n_drones, 3)
+        caption: Function from a time, s, to a text above the scene; None for no text.
 
     Raises:
         ImportError: If viser is not installed.
@@ -47,7 +57,7 @@ def page(flight: Flight, world: int | None = None, lights: ArrayLike | None = No
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints the address of this temporary server
         server = start_guarded_server(viser, Access("127.0.0.1", free_port()))
         try:
-            return _record_scene(server, flight, k, lights).as_html()
+            return _record_scene(server, flight, k, lights, caption).as_html()
         finally:
             server.stop()
 
@@ -111,11 +121,13 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
             server.serve_forever()
 
 
-def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
+def _record_scene(
+    server: Any, flight: Flight, k: int, lights: NDArray | None, caption: Callable[[float], str] | None
+) -> Any:
     scene = server.scene
     scene.set_up_direction("+z")
-    camera = server.initial_camera
-    camera.fov, (camera.position, camera.look_at) = np.deg2rad(FOV), initial_camera_pose(flight, k)
+    camera, (camera_pos, middle) = server.initial_camera, initial_camera_pose(flight, k)
+    camera.fov, camera.position, camera.look_at = np.deg2rad(FOV), camera_pos, middle
 
     colors = choose_drone_colors(flight.n_drones, None)
     for drone in range(flight.n_drones):
@@ -130,10 +142,15 @@ def _record_scene(server: Any, flight: Flight, k: int, lights: NDArray | None) -
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
     pictures = (_take_picture(flight, k, float(time), lights, colors) for time in times)
     browser_scene = BrowserScene(server, list(flight.shapes), next(pictures))
+    if caption is not None:
+        above = middle + CAPTION_HEIGHT * np.array([0.0, 0.0, np.linalg.norm(camera_pos - middle)])
+        label = scene.add_label("/caption", caption(0.0), position=above, anchor="bottom-center")
     recording = server.get_scene_serializer()
     for picture, duration in zip(pictures, np.diff(times), strict=True):
         recording.insert_sleep(float(duration))
         browser_scene.update(picture)
+        if caption is not None:
+            label.text = caption(picture.time)
     return recording
 
 

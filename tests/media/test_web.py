@@ -118,6 +118,12 @@ def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
         program.stdout.close()
 
 
+def test_a_caption_is_asked_for_at_each_sample(flight):
+    times = []
+    assert "<html" in page(flight, 1, caption=lambda time: times.append(time) or "text")
+    np.testing.assert_allclose(times, np.linspace(0, 1, 31))
+
+
 def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, capsys):
     """The file needs no server and has the requested world, here with a drone and a box at rest."""
     flight.save(tmp_path / "flight.journal")

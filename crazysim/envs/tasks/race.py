@@ -152,9 +152,10 @@ class Race(ProgressTask, OutcomeTask):
         openings = None if course.openings is None else Openings.of(course)
         # Balls have nothing to touch.
         framed = [gates] if openings is None else [gates[k] for k, (r,) in enumerate(openings.radii) if not r]
-        fatal = [] if obstacles is None else [obstacles]
-        gate_contacts = None if self.penalty is None else sim.scene.contact_fn(framed, floor=False, drones=False)
-        contacts = sim.scene.contact_fn([*framed, *fatal] if gate_contacts is None else fatal, drones=False)
+        fatal = [*(framed if self.penalty is None else []), *([] if obstacles is None else [obstacles])]
+        contacts, gate_contacts = sim.scene.contact_fn(fatal, drones=False), None
+        if self.penalty is not None and framed:
+            gate_contacts = sim.scene.contact_fn(framed, floor=False, drones=False)
         n_all = self.laps * course.n_gates
 
         @stage("drone")
@@ -164,10 +165,10 @@ class Race(ProgressTask, OutcomeTask):
             record, passes = race_of(data), rules.passes_gate(data)
             flies = ~(record.failure | fails)
             passed = record.passed + (passes & flies)
-            if gate_contacts is not None:
+            if self.penalty is not None:
                 skips = ~passes & flies & (passed + 1 < n_all) & rules.passes_gate(data, ahead=1)
                 skips &= course.n_gates > 2
-                touches = gate_contacts(data).any
+                touches = jnp.zeros_like(passes) if gate_contacts is None else gate_contacts(data).any
                 hits = touches & ~record.touches_gate & flies & ~record.success
                 penalty_sum = record.penalty_sum + self.penalty * (1.0 * skips + hits)
                 data = self.write(data, penalty_sum=penalty_sum, touches_gate=touches)

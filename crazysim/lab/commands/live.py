@@ -61,10 +61,12 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly drones live, and print the figures."""
+    from crazysim.envs.tasks.race import Race
     from crazysim.lab.live import Browser, CommandServer, Fleet, Gamepad, Live, Pilot, RemoteCommands, Window
     from crazysim.lab.live.circles import Circles
     from crazysim.lab.live.piloting import Sticks, keyboard_sticks
     from crazysim.lab.live.policy_pilot import typed_lines
+    from crazysim.lab.racing.live_clock import LiveClock
     from crazysim.sim.sim import Sim
 
     # Viewers, and who commands the drones.
@@ -98,6 +100,8 @@ def run(options: argparse.Namespace) -> None:
         # Commands of a policy, a client or the demonstration.
         if policy_pilot is not None:
             policy_pilot.add_to(live)
+            if isinstance(policy_pilot.env.task, Race):
+                LiveClock(policy_pilot.env.task).add_to(live)
             policy_pilot.listen(live, typed_lines())
             print(f"type a goal as x y z, m{policy_pilot.arena and ': '}{policy_pilot.arena}", flush=True)
         elif options.commands:

@@ -42,11 +42,13 @@ class Interaction:
     on_click: Callable[[Self, int, NDArray], object] | None
     """Function that is called with the loop, the world and the point, m, when the ground is clicked in a viewer; None
     for none."""
+    note: Callable[[Self], str] | None
+    """Function from the loop to a text that viewers show after the status; None for none."""
 
     def __init__(self, sim: Sim):
         self.sim = sim
         self.keyboard, self.widgets, self.slider_values, self.quantities = Keyboard(), [], {}, {}
-        self.selected, self.on_click, self.goals = (0, 0), None, None
+        self.selected, self.on_click, self.goals, self.note = (0, 0), None, None, None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed_body: tuple[int, str, int] | None = None
         self._slider_index = 0

@@ -284,13 +284,14 @@ class Live(Interaction, Closeable):
 
     @property
     def status(self) -> str:
-        """Time, speed, pause and recording as text, for viewers."""
+        """Time, speed, pause, recording and the note as text, for viewers."""
         now, (last_time, last_n_steps, factor) = perf_counter(), self._factor_sample
         if now - last_time > 0.5:
             factor = (self.n_steps_run - last_n_steps) * self._dt / (now - last_time)
             self._factor_sample = (now, self.n_steps_run, factor)
         parts = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
         parts += ["paused"] * self._paused + ["recording"] * self.is_recording
+        parts += [] if self.note is None else self.note(self).split("\n")
         return ", ".join(parts)
 
     def _run_once(self) -> float:

@@ -156,19 +156,24 @@ def film(flight: RaceFlight, path: str | Path, fps: float = 25, progress: bool =
     camera = {"lookat": (low + high) / 2, "distance": distance, "azimuth": 90, "elevation": -40}
 
     def draw(sim: Sim, world: int) -> None:
-        draw_text(sim, clock_text(flight, float(sim.time[world, 0])))
+        draw_text(sim, clock_text_at(flight, float(sim.time[world, 0])))
 
     view = View(width=1280, height=720, cam_config=camera, trail=1.5, ring_width=25, draw=draw)
     with Film(path, view, fps=fps, progress=progress) as recording:
         return recording.play(sim, recorded)
 
 
-def clock_text(flight: RaceFlight, now: float) -> str:
-    """Return the clock of a race at a time of the flight: time, lap, gates and the last split."""
-    times, n = np.asarray(flight.clock.times), flight.track.n_gates
-    passed, laps = int(np.sum(times <= now)), len(times) // n
+def clock_text_at(flight: RaceFlight, now: float) -> str:
+    """Return ``clock_text`` at a time of the flight, s."""
     sample = np.searchsorted(flight.time, now, side="right") - 1
-    penalty = 0.0 if flight.penalty is None else flight.penalty[sample]
+    penalty = 0.0 if flight.penalty is None else float(flight.penalty[sample])
+    return clock_text(flight.clock, flight.track, now, penalty)
+
+
+def clock_text(clock: RaceClock, track: Track, now: float, penalty: float = 0.0) -> str:
+    """Describe the clock of a race at a time, s: time and penalties, lap, gates and the last split."""
+    times, n = np.asarray(clock.times), track.n_gates
+    passed, laps = int(np.sum(times <= now)), len(times) // n
     shown = f"{min(now, times[-1]):6.2f} s" + (f" + {penalty:.3g} s" if penalty else "")
     lines = [shown, f"lap {min(passed // n + 1, laps)} of {laps}, gate {passed} of {len(times)}"]
     if passed:
@@ -193,7 +198,7 @@ def page(flight: RaceFlight) -> str:
     Raises:
         ImportError: If viser is not installed.
     """
-    return web.page(media_flight(flight)[1])
+    return web.page(media_flight(flight)[1], caption=lambda now: clock_text_at(flight, now))
 
 
 def plot(flight: RaceFlight, path: str | Path) -> None:

@@ -9,7 +9,9 @@ import pytest
 
 from crazysim.__main__ import main
 from crazysim.envs import Track, load_track, make
-from crazysim.lab.racing.flight import clock_text, flight_of_plan, flight_of_policy, summary, track_simulation
+from crazysim.lab.live import Live, PolicyPilot
+from crazysim.lab.racing.flight import clock_text_at, flight_of_plan, flight_of_policy, summary, track_simulation
+from crazysim.lab.racing.live_clock import LiveClock
 from crazysim.lab.racing.time_optimal import plan_race
 
 FILE = """
@@ -61,10 +63,10 @@ def test_the_clock_of_a_film_shows_lap_gate_and_split(path):
     flight = flight_of_plan(plan_race(track, laps=2), track, laps=2)
     times = np.asarray(flight.clock.times)
     assert bool(flight.clock.finished)
-    assert clock_text(flight, 0.0) == "  0.00 s\nlap 1 of 2, gate 0 of 4"
-    text = clock_text(flight, float(times[2]) + 1e-3)
+    assert clock_text_at(flight, 0.0) == "  0.00 s\nlap 1 of 2, gate 0 of 4"
+    text = clock_text_at(flight, float(times[2]) + 1e-3)
     assert f"lap 2 of 2, gate 3 of 4\nlast gate {times[2]:.2f} s, split {times[2] - times[1]:.2f} s" in text
-    assert clock_text(flight, 1e3).startswith(f"{times[3]:6.2f} s"), "the clock stops"
+    assert clock_text_at(flight, 1e3).startswith(f"{times[3]:6.2f} s"), "the clock stops"
     model = track_simulation(track, "uzh_cpc").mj_model
     assert sum(name.startswith("gate") for name in (model.body(k).name for k in range(model.nbody))) >= 2
 
@@ -96,8 +98,28 @@ def test_penalties_are_added_to_the_time_and_shown():
     assert " missed " in text
     assert "penalties: 4 s" in text
     assert f"all gates after {times[-1] + 4:.3f} s" in text
-    assert clock_text(flight, times[0] + 0.1).startswith(f"{times[0] + 0.1:6.2f} s + 2 s\n")
-    assert clock_text(flight, 1e3).startswith(f"{times[-1]:6.2f} s + 4 s\n")
+    assert clock_text_at(flight, times[0] + 0.1).startswith(f"{times[0] + 0.1:6.2f} s + 2 s\n")
+    assert clock_text_at(flight, 1e3).startswith(f"{times[-1]:6.2f} s + 4 s\n")
+
+
+def test_the_clock_runs_in_the_live_loop():
+    """The text of viewers, and after a jump backwards only the gates that had been passed."""
+    env = make("race", track=TWO_POINTS, control="state", engine="interpret", penalty=1.0)
+    pilot = PolicyPilot(env, lambda obs: jnp.zeros((1, 1, env.actions.size)).at[..., 0].set(1.0))
+    with Live(env.sim, env.base.freq, speed="max", snapshot_s=0.1) as live:
+        pilot.add_to(live)
+        clock = LiveClock(env.task)
+        clock.add_to(live)
+        assert "lap 1 of 1, gate 0 of 2" in live.status
+        live.run(2.0)
+        times = np.asarray(clock.clock.times)
+        expected = np.asarray(fly_ahead(TWO_POINTS, penalty=1.0).clock.times)
+        np.testing.assert_allclose(times, expected, atol=0.02)  # an environment draws another start
+        assert f"{times[1]:.2f} s, lap 1 of 1, gate 2 of 2, last gate {times[1]:.2f} s, split" in live.status
+        live.go_to(float(times.mean()))
+        assert "gate 1 of 2" in live.status
+        live.advance(50)
+        np.testing.assert_allclose(clock.clock.times, times, atol=1e-5)
 
 
 @pytest.mark.parametrize(
