@@ -28,7 +28,7 @@ TEXTURED_KINDS = ("plane", "box")
 class Appearance:
     """Materials, lights, textures and sky of a compiled scene."""
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, shadows: bool):
         self._model = model
         data = mujoco.MjData(model)
         for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
@@ -37,7 +37,10 @@ class Appearance:
         head, spot = model.vis.headlight, mujoco.mjtLightType.mjLIGHT_SPOT
         kinds = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int(spot)
         lights = [k for k in range(model.nlight) if model.light_active[k] and int(model.light_type[k]) in kinds]
-        self.lights = [Light(False, int(model.light_type[k]) == int(spot)) for k in lights]
+        self.lights = [
+            Light(False, int(model.light_type[k]) == int(spot), shadows and bool(model.light_castshadow[k]))
+            for k in lights
+        ]
         """Lights of the scene, the headlight first."""
         rows = [
             [*data.light_xpos[k], *data.light_xdir[k], *model.light_ambient[k], *model.light_diffuse[k],
@@ -114,8 +117,17 @@ class Appearance:
         densest = np.sqrt(0.5) * share * np.sin(slope) / np.sin(0.75 * np.pi - slope)
         ambient = 0.0 if self.lights else AMBIENT_WITHOUT_LIGHTS
         radius = far * SKY_RADIUS if self.has_sky else far
-        haze = vis.rgba.haze[:3].tolist()
-        return View(pixel_angle, radius, ambient, self._sky.shape[1], self._plane_height, *haze, share, densest)
+        numbers = (
+            pixel_angle,
+            radius,
+            ambient,
+            self._sky.shape[1],
+            self._plane_height,
+            *vis.rgba.haze[:3],
+            share,
+            densest,
+        )
+        return View._make(numbers)
 
 
 def _read_texture(model: mujoco.MjModel, texture: int) -> np.ndarray:

@@ -287,9 +287,26 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         *tables: Fields of ``Tables``.
     """
     t = Tables(*tables)
-    n_nodes, n_fixed, n_movable, n_movable_nodes = table_rows(t.counts, jnp.int32(0))
+    counts = table_rows(t.counts, jnp.int32(0))
     world, ray = camera_ray(t, n_pixels, n_cameras, index)
-    best = jnp.full_like(ray.origin[0], jnp.inf), jnp.int32(-1)
+    return first_hit_of_ray(surfaces, t, counts, world, ray, jnp.full_like(ray.origin[0], jnp.inf))
+
+
+def first_hit_of_ray(
+    surfaces: Sequence[Surface], t: Tables, counts: Sequence[Array], world: Array, ray: Ray, limit: Array
+) -> BestHit:
+    """Return the distance to the first geom that any ray in a world meets, and its index; see ``first_hit``.
+
+    Args:
+        surfaces: ``Targets.surfaces``.
+        t: Geoms of all worlds.
+        counts: The row of ``Tables.counts``.
+        world: Index of the world. ()
+        ray: The ray.
+        limit: Distance beyond which nothing is met, m. ()
+    """
+    n_nodes, n_fixed, n_movable, n_movable_nodes = counts
+    best = limit, jnp.int32(-1)
     best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed_geoms), ray, best, n_nodes)
 
     def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:

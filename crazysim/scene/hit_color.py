@@ -5,7 +5,7 @@ MuJoCo lights the vertices of its triangles with OpenGL's fixed functions; this 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,10 +14,21 @@ from jax import Array, lax
 from crazysim.core.branches import compute_where, table_rows
 from crazysim.geometry.points import Components
 from crazysim.rotation import safe_sqrt
-from crazysim.scene.first_hit import Surface, Tables, camera_ray, normal_in_frame, surface_at_hit, world_vector
+from crazysim.scene.first_hit import (
+    Ray,
+    Surface,
+    Tables,
+    camera_ray,
+    first_hit_of_ray,
+    normal_in_frame,
+    surface_at_hit,
+    world_vector,
+)
 
 MAX_LEVELS = 12
 """Largest number of images of a texture, each half as wide as the one before."""
+SHADOW_OFFSET = 1e-3
+"""Distance from a surface at which rays to lights begin, m: more than the rounding of positions."""
 MIN_COSINE = 1e-3
 """Cosine of the steepest angle of incidence for which the size of a pixel on the surface is computed."""
 
@@ -29,6 +40,8 @@ class Light(NamedTuple):
     """Whether it shines along the axis of the camera."""
     is_spot: bool
     """Whether it shines from a point, not from one direction."""
+    casts_shadow: bool = False
+    """Whether objects shade it."""
 
 
 class LightRow(NamedTuple):
@@ -117,11 +130,13 @@ def color_at_hit(
     """
     n_paint = len(Paint._fields)
     paint, t, (distances, geoms) = Paint(*tables[:n_paint]), Tables(*tables[n_paint:-2]), tables[-2:]
-    ray = camera_ray(t, n_pixels, n_cameras, index)[1]
+    counts = table_rows(t.counts, jnp.int32(0))
+    world, ray = camera_ray(t, n_pixels, n_cameras, index)
     pose = table_rows(t.camera_poses, lax.div(index, jnp.int32(n_pixels)))
     back = pose[5], pose[8], pose[11]
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     view = View(*table_rows(paint.view, jnp.int32(0)))
+    zero = jnp.zeros_like(distance)
     row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
 
     def shade(_: Components) -> Components:
@@ -132,13 +147,27 @@ def color_at_hit(
         point = [o + distance * d for o, d in zip(ray.origin, ray.direction, strict=True)]
         to_eye = [-d for d in ray.direction]
         steepness = _dot(normal, to_eye)
-        color = [c * (emission + view.ambient) for c in own_color]
+
+        def without_shadow(strength: Array, to_light: Components, limit: Array) -> Array:
+            def trace_to_light(strength: Array) -> Array:
+                x, y, z = (p + SHADOW_OFFSET * n for p, n in zip(point, normal, strict=True))
+                shadow_ray = Ray((x, y, z), to_light, ray.ignored_drone)
+                return jnp.where(first_hit_of_ray(surfaces, t, counts, world, shadow_ray, limit)[1] < 0, strength, 0.0)
+
+            is_facing = (strength > 0) & (_dot(normal, to_light) > 0)
+            return compute_where(is_facing, trace_to_light, jnp.where(is_facing, strength, 0.0))
+
+        # OpenGL limits the sum of all lights without shadows, and each light with shadows, which MuJoCo adds to it.
+        color, shaded_color = [c * (emission + view.ambient) for c in own_color], [zero] * 3
         for k, light in enumerate(lights):
-            parts = _light(
-                light, LightRow.read(paint.lights, k), point, normal, to_eye, steepness, back, specular, exponent
-            )
-            color = [a + b * own + c for a, own, (b, c) in zip(color, own_color, parts, strict=True)]
-        color = [jnp.minimum(c, 1.0) for c in color]
+            row_of_light = LightRow.read(paint.lights, k)
+            parts = _light(light, row_of_light, point, normal, to_eye, back, specular, exponent, without_shadow)
+            part = [a * own + b for own, (a, b) in zip(own_color, parts, strict=True)]
+            if light.casts_shadow:
+                shaded_color = [a + jnp.minimum(b, 1.0) for a, b in zip(shaded_color, part, strict=True)]
+            else:
+                color = [a + b for a, b in zip(color, part, strict=True)]
+        color = [jnp.minimum(a, 1.0) + b for a, b in zip(color, shaded_color, strict=True)]
         first_level, n_levels = table_rows(paint.textures, row)
 
         def draw_texture(color: Components) -> Components:
@@ -154,17 +183,16 @@ def color_at_hit(
 
         return compute_where(n_levels > 0, draw_texture, tuple(color))  # type: ignore[arg-type]
 
-    x, y, z = ray.direction
+    x, y, rise = ray.direction
     level_share = safe_sqrt(x * x + y * y)
     reach = jnp.where(geom >= 0, distance, jnp.inf) * level_share
-    zero = jnp.zeros_like(distance)
     color = zero, zero, zero
     is_far = ~(reach < view.radius)
     if has_sky:
         color = compute_where(is_far, lambda _: _sky_color(paint, view, ray.direction), color)
     color = compute_where(~is_far, shade, color)
     if has_haze:
-        color = _add_haze(view, ray.origin[2], z, level_share, reach, color)
+        color = _add_haze(view, ray.origin[2], rise, level_share, reach, color)
     # OpenGL rounds colours to the nearest of 255 steps.
     red, green, blue = ((255 * jnp.clip(c, 0.0, 1.0) + 0.5).astype(jnp.int32) for c in color)
     return [red + green * 256 + blue * 65536]
@@ -206,28 +234,27 @@ def _light(
     point: Sequence[Array],
     normal: Sequence[Array],
     to_eye: Sequence[Array],
-    steepness: Array,
-    back: Sequence[Array],
+    back: Components,
     specular: Array,
     exponent: Array,
+    without_shadow: Callable[[Array, Components, Array], Array],
 ) -> list[tuple[Array, Array]]:
     # Per channel: light that the surface's colour multiplies, and its highlight.
-    strength: Any = 1.0
-    if light.is_headlight:
-        to_light = back
-    elif light.is_spot:
+    strength, distance = jnp.ones_like(point[0]), jnp.full_like(point[0], jnp.inf)
+    to_light: Any = back if light.is_headlight else [-x for x in row.dir]
+    if light.is_spot:
         offset = [a - b for a, b in zip(row.pos, point, strict=True)]
         distance = jnp.sqrt(jnp.maximum(_dot(offset, offset), 1e-12))
         to_light = [x / distance for x in offset]
         cosine = -_dot(to_light, row.dir)
         falloff = row.attenuation[0] + distance * (row.attenuation[1] + distance * row.attenuation[2])
         strength = jnp.where(cosine >= row.cutoff, _power(jnp.maximum(cosine, 0.0), row.exponent) / falloff, 0.0)
-    else:
-        to_light = [-x for x in row.dir]
+    if light.casts_shadow:
+        strength = without_shadow(strength, tuple(to_light), distance)
     cosine = _dot(normal, to_light)
     # Of the direction midway between light and eye, which is their sum with the length sqrt(2 + 2 l.e).
     square = jnp.maximum(2 + 2 * _dot(to_light, to_eye), 1e-6)
-    highlight_cosine = jnp.clip((cosine + steepness) * lax.rsqrt(square), 0.0, 1.0)
+    highlight_cosine = jnp.clip((cosine + _dot(normal, to_eye)) * lax.rsqrt(square), 0.0, 1.0)
     highlight = jnp.where(cosine > 0, strength * specular * _power(highlight_cosine, exponent), 0.0)
     cosine = strength * jnp.maximum(cosine, 0.0)
     return [

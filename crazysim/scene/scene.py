@@ -332,6 +332,7 @@ class Scene:
         hide_own: bool = True,
         along: depth.Along = "axis",
         color: bool = False,
+        shadows: bool = True,
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
@@ -350,7 +351,8 @@ class Scene:
             hide_own: Whether a drone is invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
-            color: Whether to return ``Hits.color``, the colours that MuJoCo's renderer draws, without shadows.
+            color: Whether to return ``Hits.color``, the colours that MuJoCo's renderer draws.
+            shadows: Whether lights of the scene cast shadows, by a second ray of each pixel.
         """
         if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
@@ -368,7 +370,7 @@ class Scene:
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
             camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
-            Appearance(self.mj_model) if check_flag("color", color) else None,
+            Appearance(self.mj_model, check_flag("shadows", shadows)) if check_flag("color", color) else None,
         )  # fmt: skip
 
     def splat_fn(

@@ -16,17 +16,21 @@ def text(*numbers):
     return " ".join(f"{x:.4f}" for x in np.concatenate([np.ravel(x) for x in numbers]))
 
 
-def random_light(rng):
+def random_light(rng, has_shadows):
     kind = rng.choice(["directional", "spot"])
-    return f"""<light type="{kind}" pos="{text(rng.uniform([0, -4, 3], [8, 4, 6]))}" castshadow="false"
+    return f"""<light type="{kind}" pos="{text(rng.uniform([0, -4, 5], [8, 4, 7]))}"
+        castshadow="{str(has_shadows).lower()}"
         dir="{text(0.4 * rng.normal(size=2), -1)}" diffuse="{text(rng.uniform(0.1, 0.6, 3))}"
-        specular="{text(rng.uniform(0, 0.5, 3))}" ambient="{text(rng.uniform(0, 0.1, 3))}"
+        specular="{text(rng.uniform(0, 0.5, 3))}" ambient="{text(rng.uniform(0, 0.1, 3) * (not has_shadows))}"
         cutoff="{text(rng.uniform(30, 80))}" exponent="{text(rng.uniform(0, 10))}"
         attenuation="{text(1, rng.uniform(0, 0.2), rng.uniform(0, 0.05))}"/>"""
 
 
-def random_scene(rng, has_textures):
-    """Return MJCF of 20 objects above a floor, with two lights and a camera."""
+def random_scene(rng, has_textures, has_shadows):
+    """Return MJCF of 20 objects above a floor, with two lights and a camera.
+
+    Lights are above all objects, since those behind a light cast shadows here, but not in MuJoCo.
+    """
     materials, geoms = "", ""
     for k in range(20):
         kind, color = rng.choice(KINDS), text(rng.uniform(0, 1, 3), 1)
@@ -41,7 +45,8 @@ def random_scene(rng, has_textures):
     floor = 'texture="checker" texrepeat="1 1" texuniform="true"' if has_textures else ""
     axes = 0.15 * rng.normal(size=(2, 3)) + [[0, -1, 0], [0.1, 0, 1]]
     return f"""<mujoco><statistic center="0 0 1" extent="3"/>
-      <visual><map zfar="60"/><rgba haze="0.9 0.9 0.2 1"/><quality numslices="64" numstacks="64" numquads="20"/>
+      <visual><map zfar="10" shadowclip="5" shadowscale="1"/><rgba haze="0.9 0.9 0.2 1"/>
+        <quality numslices="64" numstacks="64" numquads="20"/>
         <headlight ambient="{text(rng.uniform(0, 0.3, 3))}" diffuse="{text(rng.uniform(0, 0.4, 3))}"/></visual>
       <asset><texture name="sky" type="skybox" builtin="gradient" rgb1=".6 .8 .9" rgb2=".9 .3 .2" width="64"
           height="384"/>
@@ -49,29 +54,32 @@ def random_scene(rng, has_textures):
         <texture name="noise" type="2d" builtin="gradient" mark="random" random="0.02" markrgb="1 1 0" rgb1=".9 .2 .9"
           rgb2=".1 .8 .1" width="64" height="32"/>
         <material name="floor" rgba="{text(rng.uniform(0.2, 1, 3), 1)}" specular="0" {floor}/>{materials}</asset>
-      <worldbody>{random_light(rng)}{random_light(rng)}<geom type="plane" size="0 0 .05" material="floor"/>{geoms}
+      <worldbody>{random_light(rng, has_shadows)}{random_light(rng, has_shadows)}
+        <geom type="plane" size="0 0 .05" material="floor"/>{geoms}
         <camera name="eye" pos="{text(rng.uniform([-3, -1, 0.5], [-1, 1, 2.5]))}" xyaxes="{text(axes)}"
           fovy="{text(rng.uniform(40, 80))}"/></worldbody></mujoco>"""
 
 
-def mujoco_image(model):
-    """Return the image of the camera, without drones, shadows, and several samples for a pixel."""
+def mujoco_images(model):
+    """Return the images of the camera with and without shadows, without drones, and with one sample for a pixel."""
     data = mujoco.MjData(model)
     data.mocap_pos[:, 2] = -100
     mujoco.mj_forward(model, data)
-    model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
+    model.vis.quality.offsamples = 0
     renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
     for _ in range(2):  # MuJoCo centres infinite planes on the camera of the previous update
         renderer.update_scene(data, "eye")
     image = renderer.render().astype(int)
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+    image_without_shadows = renderer.render().astype(int)
     renderer.close()
-    return image
+    return image, image_without_shadows
 
 
-def edge_mask(hits):
+def edge_mask(hits, shadow):
     """Whether a pixel or one of its eight neighbours is on the other side of an edge."""
     features = np.concatenate(
-        [2 * hits.normal[0, 0], 5 * np.log(np.minimum(hits.distance[0, 0], 1e3))[..., None]], axis=-1
+        [2 * hits.normal[0, 0], 5 * np.log(np.minimum(hits.distance[0, 0], 1e3))[..., None], shadow / 16], axis=-1
     )
     mask = np.ones((HEIGHT, WIDTH), bool)
     windows = np.lib.stride_tricks.sliding_window_view(features, (3, 3), (0, 1))
@@ -80,21 +88,27 @@ def edge_mask(hits):
 
 
 @pytest.mark.usefixtures("opengl")
-@pytest.mark.parametrize("has_textures", [False, True])
-@pytest.mark.parametrize("seed", range(2))
-def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, has_textures):
-    """The bounds of the mean difference and of 99% of pixels away from edges are less than a person notices."""
+@pytest.mark.parametrize("look", ["plain", "textures", "shadows"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, look):
+    """The bounds of the mean difference and of 99% of pixels away from edges are less than a person notices.
+
+    Edges of shadows are edges, too.
+    """
     path = tmp_path / "scene.xml"
-    path.write_text(random_scene(np.random.default_rng(seed), has_textures))
+    path.write_text(random_scene(np.random.default_rng(seed), look == "textures", look == "shadows"))
     sim = Sim(1, xml_path=path)
     hits = jax.device_get(jax.jit(sim.scene.depth_fn("eye", WIDTH, HEIGHT, drones=False, color=True))(sim.data))
-    error = np.abs(hits.color[0, 0] - mujoco_image(sim.mj_model))
-    is_inside = ~edge_mask(hits)
+    expected, without_shadows = mujoco_images(sim.mj_model)
+    error = np.abs(hits.color[0, 0] - expected)
+    shadow = without_shadows - expected
+    assert (shadow > 8).mean() > 0.02 or look != "shadows"
+    is_inside = ~edge_mask(hits, shadow)
     assert is_inside.mean() > 0.5
     assert len(np.unique(hits.color[0, 0].reshape(-1, 3), axis=0)) > 500
     assert error.mean() <= 4
     assert (error[is_inside].max(axis=-1) <= 16).mean() >= 0.99
-    if (seed, has_textures) != (0, True):
+    if seed > 1:
         return
     # Without a kernel, the colours differ by rounding alone.
     sim.scene.ray_kernels = RayKernels(None)

@@ -3,7 +3,7 @@
 The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           noise=None, distortion=None, drones=True, freq=None, latency=0.0, name="camera")
+           noise=None, distortion=None, shadows=True, drones=True, freq=None, latency=0.0, name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.arguments import check_flag
 from crazysim.core.settings import setting
 from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
 from crazysim.plugins.sensors.image_sensor import ImageSensor
@@ -50,6 +51,8 @@ class Camera(ImageSensor):
     """Errors of depths and distances, such as ``StereoNoise()`` for a RealSense D435; None for none."""
     distortion: Distortion | None = None
     """Distortion of the lens; ``fovy`` is the field of view without it. None for none."""
+    shadows: bool = True
+    """Whether lights cast shadows in colours, by a second ray of each pixel."""
     name: str = "camera"
 
     @property
@@ -69,6 +72,10 @@ class Camera(ImageSensor):
     @property
     def has_errors(self) -> bool:
         return self.noise is not None
+
+    @property
+    def has_shadows(self) -> bool:
+        return check_flag("shadows", self.shadows)
 
     @property
     def far_ratio(self) -> np.ndarray:

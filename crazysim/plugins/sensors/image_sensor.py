@@ -114,6 +114,11 @@ class ImageSensor(Plugin):
         return False
 
     @property
+    def has_shadows(self) -> bool:
+        """Whether lights of the scene cast shadows in colours."""
+        return False
+
+    @property
     def baseline(self) -> float:
         """Distance to a second imager, on the right, m, whose view ``measure`` needs; 0 for none."""
         return 0.0
@@ -182,8 +187,9 @@ class ImageSensor(Plugin):
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
-        color = "rgb" in self.outputs
-        cast_rays, rot = sim.scene.depth_fn(camera, drones=self.drones, along="ray", color=color), camera.rot
+        color_settings = {"color": "rgb" in self.outputs, "shadows": self.has_shadows}
+        cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
+        rot = camera.rot
 
         def take_images(data: SimData) -> Images:
             hits, quat = cast_rays(data), data.states.quat[..., None, None, :]
