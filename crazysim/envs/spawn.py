@@ -36,7 +36,9 @@ def flying(
     for command_level in ("attitude", "body_rate"):
         ctrl = getattr(controls, command_level)
         if ctrl is not None and ctrl.prev_ang_vel is not None:
-            controls = controls.replace(**{command_level: ctrl.replace(prev_ang_vel=ang_vel)})
+            memory = ctrl.controller.memory.replace(prev_ang_vel=ang_vel)
+            controller = ctrl.controller.replace(memory=memory)
+            controls = controls.replace(**{command_level: ctrl.replace(controller=controller)})
     return data.replace(states=states, controls=controls)
 
 

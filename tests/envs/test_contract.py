@@ -389,9 +389,12 @@ class AtRest(Hover):
         return flying(super().spawn(data, key), jnp.array([0.0, 0.0, 1.0]))
 
 
-@pytest.mark.parametrize("control", ["state", "attitude", "rotor_vel"])
-def test_a_zero_action_hovers(control):
-    env = DroneEnv(make("hover", 1, control=control, engine="interpret").sim, AtRest())
+@pytest.mark.parametrize(
+    ("control", "controller"),
+    [("state", "auto"), ("attitude", "auto"), ("attitude", "crazyflow"), ("rotor_vel", "auto")],
+)
+def test_a_zero_action_hovers(control, controller):
+    env = DroneEnv(make("hover", 1, control=control, controller=controller, engine="interpret").sim, AtRest())
 
     @jax.jit
     def fly(key):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +78,8 @@ class Race(ProgressTask, OutcomeTask):
     name = "race"
     outcomes = ("finished", "disabled")
     film_view = {"elevation": -50}
+    check_freq: ClassVar[int | None] = None
+    """Rate at which gates, contacts and limits are checked, Hz; None for every physics step."""
 
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3, as in the table above."""
@@ -148,32 +150,31 @@ class Race(ProgressTask, OutcomeTask):
             obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=feet, height=POLE_HEIGHT)
         if self.level >= 1:
             _repeat_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
-        low, high = (np.asarray(x, float).astype(sim.data.states.pos.dtype) for x in (course.low, course.high))
         openings = None if course.openings is None else Openings.of(course)
         # Balls have nothing to touch.
         framed = [gates] if openings is None else [gates[k] for k, (r,) in enumerate(openings.radii) if not r]
         fatal = [*(framed if self.penalty is None else []), *([] if obstacles is None else [obstacles])]
-        contacts, gate_contacts = sim.scene.contact_fn(fatal, drones=False), None
+        touches_any, touches_gate = self.touch_fn(sim, fatal, True), None
         if self.penalty is not None and framed:
-            gate_contacts = sim.scene.contact_fn(framed, floor=False, drones=False)
+            touches_gate = self.touch_fn(sim, framed, False)
         n_all = self.laps * course.n_gates
+        period = 1 if self.check_freq is None else sim.freq // self.check_freq
 
-        @stage("drone")
+        @stage("drone", when=None if period == 1 else lambda data: (data.core.steps + 1) % period == 0)
         def judge(data: SimData) -> SimData:
-            pos = data.states.pos
-            fails = jnp.any((pos < low) | (pos > high), axis=-1) | contacts(data).any
+            fails = self.leaves_arena(data) | touches_any(data)
             record, passes = race_of(data), rules.passes_gate(data)
             flies = ~(record.failure | fails)
             passed = record.passed + (passes & flies)
             if self.penalty is not None:
                 skips = ~passes & flies & (passed + 1 < n_all) & rules.passes_gate(data, ahead=1)
                 skips &= course.n_gates > 2
-                touches = jnp.zeros_like(passes) if gate_contacts is None else gate_contacts(data).any
+                touches = jnp.zeros_like(passes) if touches_gate is None else touches_gate(data)
                 hits = touches & ~record.touches_gate & flies & ~record.success
                 penalty_sum = record.penalty_sum + self.penalty * (1.0 * skips + hits)
                 data = self.write(data, penalty_sum=penalty_sum, touches_gate=touches)
                 passed = passed + 2 * skips
-            return self.judge(self.write(data, passed=passed, last_pos=pos), passed >= n_all, fails)
+            return self.judge(self.write(data, passed=passed, last_pos=data.states.pos), passed >= n_all, fails)
 
         numbers: dict[str, Any] = {
             "gates_visited": np.zeros(course.n_gates),
@@ -207,8 +208,7 @@ class Race(ProgressTask, OutcomeTask):
             data, start = self._displace_objects(data, x)
         if self.level >= 1:
             data = data.replace(params=_randomize_inertia(data.params, 2 * x["inertia"] - 1))
-        offset = (2 * x["start"] - 1) * np.array(START_JITTER, dtype)
-        pos = start + start_offsets(n_drones).astype(dtype) + offset[..., :3]
+        pos, rpy = self.place_start(start + start_offsets(n_drones).astype(dtype), x["start"])
         vel = jnp.zeros((), dtype)
         # Practice starts behind any gate.
         if self.practice:
@@ -218,8 +218,29 @@ class Race(ProgressTask, OutcomeTask):
             pos_behind, vel = _pos_behind_gate(data, passed, x["behind"])
             pos = jnp.where(passed[..., None] > 0, pos_behind, pos)
             data = self.write(data, passed=passed)
-        data = flying(data, pos, rotation.from_rpy(offset[..., 3:]), vel)
+        data = flying(data, pos, rotation.from_rpy(rpy), vel)
         return self.write(data, last_pos=data.states.pos)
+
+    def place_start(self, start: Array | np.ndarray, x: Array) -> tuple[Array, Array]:
+        """Return positions, m, and roll, pitch and yaw, rad, of starts from random numbers. (n_drones, 3) each
+
+        Args:
+            start: Nominal starts, m. (n_drones, 3)
+            x: Random numbers in [0, 1). (n_drones, 6)
+        """
+        offset = (2 * x - 1) * np.array(START_JITTER, x.dtype)
+        return jnp.asarray(start) + offset[..., :3], offset[..., 3:]
+
+    def touch_fn(self, sim: Sim, objects: Sequence[Handle], floor: bool) -> Callable[[SimData], Array]:
+        """Return ``touches(data)``: whether a drone touches gates or obstacles, or the floor if it counts."""
+        contacts = sim.scene.contact_fn(objects, floor=floor, drones=False)
+        return lambda data: contacts(data).any
+
+    def leaves_arena(self, data: SimData) -> Array:
+        """Whether a drone is outside of the limits of the arena. (..., n_drones)"""
+        pos = data.states.pos
+        low, high = (np.asarray(limit, float).astype(pos.dtype) for limit in (self.course.low, self.course.high))
+        return jnp.any((pos < low) | (pos > high), axis=-1)
 
     def before_step(self, data: SimData) -> SimData:
         visited_gates, visited_obstacles = visited_objects(data, self.sensor_range)

@@ -19,11 +19,21 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("race", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    add("track", help="name of a track, such as split_s_gates, or a YAML file; list prints all names")
+    track_help = "name of a track, such as split_s_gates, or a YAML file; list prints all names"
+    add("track", nargs="?", help=f"{track_help}; not with --controller")
     policy_help = (
         "folder of a training run of the task race, whose policy flies; by default a time-optimal plan is flown"
     )
     add("--policy", type=Path, metavar="FOLDER", help=policy_help)
+    controller_help = (
+        "controller files of lsy_drone_racing, folders of training runs, or folders of both, to rank in its race; what "
+        "is written shows the first run of a single controller"
+    )
+    add("--controller", type=Path, nargs="+", metavar="PATH", help=controller_help)
+    add("--level", type=int, choices=range(4), default=2, help="level of the race of controllers")
+    add("--runs", type=number(high=1000, example=20), default=20, help="runs of each controller")
+    add("--seed", type=number(0, example=1), default=1, help="seed of the first run of each controller")
+    add("--ranking", type=Path, metavar="FILE", help="ranking to write, .json or .md")
     add("--laps", type=number(high=100, example=3), default=1, help="number of laps")
     penalty_help = (
         "seconds that a policy loses for each gate that it touches or misses; by default contacts end the flight"
@@ -50,12 +60,22 @@ def run(options: argparse.Namespace) -> int:
         (options.plot, PICTURE_SUFFIXES),
         (options.film, (".mp4", ".gif")),
         (options.page, (".html",)),
+        (options.ranking, (".json", ".md")),
     ):
         if path is not None:
             check_writable(path, suffixes)
     from crazysim.lab.racing import flight as flights
 
-    flight = _fly_plan(options) if options.policy is None else _fly_policy(options)
+    if options.controller is not None:
+        flight, status = _rank(options)
+    else:
+        require(
+            options.track is not None, "expected a TRACK or --controller PATH, got neither. Use crazysim race list."
+        )
+        flight = _fly_plan(options) if options.policy is None else _fly_policy(options)
+        status = 0 if bool(flight.clock.finished) else 1
+    if flight is None:
+        return status
     print(flights.summary(flight))
     if options.plot is not None:
         flights.plot(flight, options.plot)
@@ -66,7 +86,27 @@ def run(options: argparse.Namespace) -> int:
     for path in (options.plot, options.film, options.page):
         if path is not None:
             print(f"wrote {path}")
-    return 0 if bool(flight.clock.finished) else 1
+    return status
+
+
+def _rank(options: argparse.Namespace) -> tuple[RaceFlight | None, int]:
+    from crazysim.lab.racing import ranking
+    from crazysim.lab.racing.controllers import Run
+
+    given = [name for name in ("track", "policy", "drone", "body_rate", "floor") if getattr(options, name) is not None]
+    require(
+        not given, f"expected none of the settings of plans with --controller, got {', '.join(given)}. Leave it out."
+    )
+    runs: list[Run] = []
+    scores = ranking.rank(options.controller, options.level, options.runs, options.seed, runs.append)
+    print(ranking.table(scores))
+    if options.ranking is not None:
+        ranking.write(scores, options.ranking, options.level, options.runs, options.seed)
+        print(f"wrote {options.ranking}")
+    flight = runs[0].flight if runs and len(scores) == 1 else None
+    files = [path for path in (options.plot, options.film, options.page) if path is not None]
+    require(flight or not files, "expected one controller that flies for --plot, --film and --page. Name one file.")
+    return flight, int(any(score.error for score in scores))
 
 
 def _fly_plan(options: argparse.Namespace) -> RaceFlight:
