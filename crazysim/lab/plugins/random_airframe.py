@@ -19,7 +19,7 @@ from crazysim.rotation import safe_norm
 
 LOGARITHMIC = ("mass", "agility", "lag", "torque")
 """Ranges in which the logarithm is uniform: their ends differ by an order of magnitude."""
-RANGES = (*LOGARITHMIC, "thrust_to_weight", "slower_down", "length", "width", "flatness", "drag")
+RANGES = (*LOGARITHMIC, "thrust_to_weight", "slower_down", "length", "width", "flatness", "drag", "sag")
 """Settings that are ranges (low, high), in the order of ``RandomAirframe.drawn``."""
 CRAZYFLIE_MASS, CRAZYFLIE_ARM = 0.0306, 0.028
 """Mass, kg, and distance of the rotors from both axes, m, of the quadrotor from which sizes are scaled with the cube
@@ -104,8 +104,11 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
     """Moment of inertia about z over the sum of the other two, 1 for a plate. (2,)"""
     drag: Param = param(default=(0.0, 0.5), core=(2,), low=0.0)
     """Linear drag over the mass, 1/s. (2,)"""
+    sag: Param = param(default=(0.0, 0.15), core=(2,), low=0.0, high=0.9)
+    """Loss of the battery's voltage at full load over that without load, 1. ``thrust_to_weight`` is reached with it.
+    (2,)"""
     drawn: Array = state((len(RANGES),))
-    """Drawn numbers, in the order of ``RANGES``. (n_worlds, n_drones, 10)"""
+    """Drawn numbers, in the order of ``RANGES``. (n_worlds, n_drones, 11)"""
     is_applied: bool = dataclasses.field(default=False, kw_only=True, repr=False, metadata={"static": True})
     """Whether the data that holds this record has the numbers as drawn."""
     name: str = "airframe"
@@ -133,7 +136,7 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
     def with_drawn_numbers(self, data: SimData) -> SimData:
         if self.is_applied:
             return data
-        mass, agility, lag, torque, ratio, slower, length, width, flatness, drag = [
+        mass, agility, lag, torque, ratio, slower, length, width, flatness, drag, _ = [
             self.drawn[..., k : k + 1] for k in range(len(RANGES))
         ]
         size = CRAZYFLIE_ARM * jnp.cbrt(mass / CRAZYFLIE_MASS)
@@ -152,6 +155,14 @@ class RandomAirframe(Plugin, requires=_needs_a_quadrotor):
             drag=drag * mass,
         )
         return self.write(data, self.replace(is_applied=True)).replace(params=params)
+
+    def influence(self, data: SimData) -> SimData:
+        p, sag = data.params, self.drawn[..., -1:]
+        # Speeds are proportional to the voltage. Thrust and torque rise with their square; the states keep the speeds
+        # at the voltage of full load. The power is proportional to the third power of the speeds.
+        load = jnp.mean((data.states.rotor_vel / p.rotor_vel_max) ** 3, axis=-1, keepdims=True)
+        factor = ((1 - sag * load) / (1 - sag))[..., None] ** 2
+        return data.replace(params=p.replace(rpm2thrust=factor * p.rpm2thrust, rpm2torque=factor * p.rpm2torque))
 
     def observations(self, data: SimData) -> dict[str, Array]:
         return {name: self.drawn[..., k : k + 1] for k, name in enumerate(RANGES)}

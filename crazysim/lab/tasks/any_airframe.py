@@ -28,8 +28,8 @@ MIDDLE = np.array([0.0, 0.0, 10.0])
 NOISE = {"pos": 0.01, "attitude": 0.01, "vel": 0.03, "ang_vel": 0.05}
 """Standard deviations of the errors of the observed state, m, rad, m/s, rad/s: an assumption about estimators that fuse
 motion capture."""
-MAX_WAY = 3.0
-"""Distance of a moving goal from ``MIDDLE`` along an axis, m, at which it turns back."""
+MAX_RATE = 2.0
+"""Largest angular velocity of moving goals, which move on ellipses around ``MIDDLE``, rad/s."""
 
 
 class AnyAirframe(GoalTask):
@@ -59,16 +59,14 @@ class AnyAirframe(GoalTask):
         "discount": 0.995,
         "init_std": 0.4,
         "entropy": 0.006,
-        # Goals turn back at once, which no drone follows, so that they do not move in evaluations.
-        "practice": {"speed": 1.0},
     }
 
     drawn: bool = True
     """Whether airframes are drawn; False for the airframe of the simulation."""
     tumbling: float = setting(default=0.5, low=0.0, high=1.0)
     """Fraction of starts with any attitude."""
-    speed: float = setting(default=0.0, low=0.0)
-    """Largest component of the velocity of goals, of which half move, m/s; 1 in the training."""
+    speed: float = setting(default=2.0, low=0.0)
+    """Largest component of the velocity of a goal at the start, m/s. Half of the goals move."""
     delay: float = setting(default=0.01, low=0.0, high=1.0)
     """Largest delay of commands, s."""
     wind: float = setting(default=2.0, low=0.0)
@@ -81,6 +79,8 @@ class AnyAirframe(GoalTask):
     """Factor of ``NOISE``."""
     goal_vel: Array = state((3,))
     """Velocity of the goal, world frame, m/s."""
+    goal_rate: Array = state((1,))
+    """Angular velocity of the goal on its ellipse around ``MIDDLE``, rad/s."""
     goal_yaw: Array = state((1,))
     """Yaw of the goal, rad."""
 
@@ -90,7 +90,14 @@ class AnyAirframe(GoalTask):
             sim.add(RandomAirframe())
         sim.add(Latency(np.zeros(batch, int), max_delay=n_steps))
         # Delays are rounded down, so that each has the same probability.
-        sim.add(Randomize(delay=(0, np.nextafter(n_steps + 1, 0)), wind=(0.0, self.wind), optional=("wind",)))
+        sim.add(
+            Randomize(
+                delay=(0, np.nextafter(n_steps + 1, 0)),
+                wind=(0.0, self.wind),
+                rotor_thrust=(0.9, 1.0),
+                optional=("wind",),
+            )
+        )
         self.add_states(sim)
 
     def actions(self, sim: Sim) -> Actions:
@@ -99,7 +106,7 @@ class AnyAirframe(GoalTask):
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, attitude=3, goal=3, goal_vel=3, yaw=1,
-                 tumbling=1, moving=1)  # fmt: skip
+                 tumbling=1, moving=1, rate=1)  # fmt: skip
         tumbles = x["tumbling"] < self.tumbling
         tilt = rotation.from_rpy(scale_symmetric(x["rpy"], np.array([0.2, 0.2, np.pi])))
         quat = jnp.where(tumbles, random_attitude(x["attitude"]), tilt)
@@ -111,13 +118,15 @@ class AnyAirframe(GoalTask):
         )
         rotor_vel = jnp.broadcast_to(hover_rotor_states(drawn_data(data).params), data.states.rotor_vel.shape)
         data = data.replace(states=data.states.replace(rotor_vel=rotor_vel))
-        goal_vel = jnp.where(x["moving"] < 0.5, scale_symmetric(x["goal_vel"], self.speed), 0.0)
-        return self.write(data, goal=goal, goal_vel=goal_vel, goal_yaw=scale_symmetric(x["yaw"], np.pi))
+        moves = x["moving"] < 0.5
+        goal_vel = jnp.where(moves, scale_symmetric(x["goal_vel"], self.speed), 0.0)
+        goal_rate = jnp.where(moves, MAX_RATE * (0.25 + 0.75 * x["rate"]), 0.0)
+        goal_yaw = scale_symmetric(x["yaw"], np.pi)
+        return self.write(data, goal=goal, goal_vel=goal_vel, goal_rate=goal_rate, goal_yaw=goal_yaw)
 
     def after_substep(self, data: SimData) -> SimData:
         record = self.read(data)
-        way = record.goal - MIDDLE
-        goal_vel = jnp.where(jnp.abs(way) < MAX_WAY, record.goal_vel, -jnp.sign(way) * jnp.abs(record.goal_vel))
+        goal_vel = record.goal_vel - record.goal_rate**2 * (record.goal - MIDDLE) / data.core.freq
         return self.write(data, goal=record.goal + goal_vel / data.core.freq, goal_vel=goal_vel)
 
     def observe(self, data: SimData) -> dict[str, Array]:

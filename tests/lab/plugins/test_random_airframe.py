@@ -50,7 +50,8 @@ def test_quadrotors_have_the_drawn_qualities(sim):
 
 
 def test_a_drawn_quadrotor_flies_as_one_with_these_parameters(sim):
-    few = Sim(4, control="rotor_vel", rng_key=3, engine="interpret", plugins=[RandomAirframe(), Randomize(mass=0.1)])
+    plugins = [RandomAirframe(sag=0.0), Randomize(mass=0.1)]
+    few = Sim(4, control="rotor_vel", rng_key=3, engine="interpret", plugins=plugins)
     few.reset()
     own = Sim(4, control="rotor_vel", engine="interpret")
     own.data = own.data.replace(params=drawn_data(few.data).params)
@@ -61,6 +62,19 @@ def test_a_drawn_quadrotor_flies_as_one_with_these_parameters(sim):
         flown.step(30)
     for x, y in zip(jax.tree.leaves(few.data.states), jax.tree.leaves(own.data.states), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
+
+
+def test_the_voltage_sags_with_the_third_power_of_the_speeds(sim):
+    """The largest thrust is reached with full load; without load the voltage is ``1 / (1 - sag)`` times as high."""
+    data = drawn_data(sim.data)
+    sag = np.asarray(data.plugins["airframe"].drawn)[..., RANGES.index("sag")]
+    for speed, voltage in ((0.0, 1 / (1 - sag)), (0.5, (1 - sag / 8) / (1 - sag)), (1.0, np.ones_like(sag))):
+        rotor_vel = speed * np.asarray(data.params.rotor_vel_max).max() * np.ones_like(data.states.rotor_vel)
+        at_speed = data.replace(states=data.states.replace(rotor_vel=rotor_vel))
+        params = at_speed.plugins["airframe"].influence(at_speed).params
+        for name in ("rpm2thrust", "rpm2torque"):
+            before, after = (np.asarray(getattr(p, name))[..., 0, 2] for p in (data.params, params))
+            np.testing.assert_allclose(after, voltage**2 * before, rtol=1e-5)
 
 
 def test_every_episode_has_another_quadrotor():
