@@ -44,6 +44,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--body-rate", type=size(15), nargs=3, metavar=("P", "Q", "R"), help=rates_help)
     add("--floor", type=number(-1e3, 1e3, 0.5, float), help="smallest height of a plan, m; by default none")
     add("--dt", type=size(0.04), default=0.04, help="time between changes of the thrusts of a plan, s")
+    add("--rotor-lag", action="store_true", help="plan with the lag of the airframe's rotors")
     add("--plot", type=Path, metavar="FILE", help="plot to write, .png")
     add("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
     add("--page", type=Path, metavar="FILE", help="page to write, .html, which plays the flight in a browser")
@@ -125,6 +126,7 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
         body_rate=options.body_rate or (15.0, 15.0, 3.0),
         floor=options.floor,
         dt=options.dt,
+        rotor_lag=options.rotor_lag,
     )
     deviation = np.linalg.norm(fly_open_loop(plan)[:, :3] - plan.pos, axis=-1).max()
     print(
@@ -141,7 +143,9 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     from crazysim.train.interface import check_policy
     from crazysim.train.training import load_policy
 
-    given = [name for name in ("drone", "body_rate", "floor") if getattr(options, name) is not None]
+    given = [
+        name for name in ("drone", "body_rate", "floor", "rotor_lag") if getattr(options, name) not in (None, False)
+    ]
     require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
     policy, config, _ = load_policy(options.policy)
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}

@@ -61,9 +61,12 @@ class Plan:
     ang_vel: Floats
     """Angular velocities, body frame, rad/s. (n + 1, 3)"""
     thrust: Floats
-    """Thrusts of the rotors until the next time, N. (n, n_rotors)"""
+    """Thrusts of the rotors until the next time, with rotor lag those that are commanded, N. (n, n_rotors)"""
     airframe: Airframe
     """Airframe for which the flight was planned."""
+    rotor_vel: Floats | None = None
+    """Speeds of the rotors, which follow the commanded ``thrust`` with their lag, rpm; None if they follow at once.
+    (n + 1, n_rotors)"""
 
     @property
     def duration(self) -> float:
@@ -80,22 +83,25 @@ def plan_race(
     body_rate: Sequence[float] = (15.0, 15.0, 3.0),
     floor: float | None = 0.0,
     dt: float = 0.04,
+    rotor_lag: bool = False,
 ) -> Plan:
     """Plan the fastest flight through all gates of a track that the rotors of an airframe can fly.
 
     The flight starts at rest, level, at ``track.start`` with any heading, and ends level and at rest at
     ``track.finish``, or at the last gate if there is none. Drones pass polygons along the gates' x axes and come within
     the radius of waypoints; they are points, so that openings need a margin for their size. The model is the
-    simulator's ``first_principles`` without rotor lag: a rigid body with linear drag, and rotors with momentum and any
-    thrust from ``thrust_min`` to ``thrust_max``. Thrusts are constant for about ``dt``, and the durations of the legs
-    between gates are free (direct multiple shooting, Bock and Plitt 1984, with IPOPT). The search begins from the
-    fastest flight of a point mass whose thrust turns at a limited rate, which begins from straight lines.
+    simulator's ``first_principles``: a rigid body with linear drag, and rotors with momentum and any thrust from
+    ``thrust_min`` to ``thrust_max``, which they reach at once or, with ``rotor_lag``, as the simulator's. Thrusts are
+    constant for about ``dt``, and the durations of the legs between gates are free (direct multiple shooting, Bock and
+    Plitt 1984, with IPOPT). The search begins from the fastest flight of a point mass whose thrust turns at a limited
+    rate, which begins from straight lines.
 
     Args:
         laps: Number of laps; each begins behind the last gate of the lap before.
         body_rate: Largest roll, pitch and yaw rate, rad/s. (3,)
         floor: Smallest height, m; None for no limit.
         dt: Time between changes of the thrusts, s.
+        rotor_lag: Whether rotors follow with the airframe's lag; they then turn as at hover at the start.
 
     Raises:
         ConfigError: If no flight was found.
@@ -108,13 +114,13 @@ def plan_race(
     first_principles.Params.create(loaded)
     course = _Course(track, laps, -FAR if floor is None else floor)
     guess = _plan_point_mass(course, loaded)
-    return _plan_drone(course, loaded, rates, dt, *guess)
+    return _plan_drone(course, loaded, rates, dt, rotor_lag, *guess)
 
 
 def fly_open_loop(plan: Plan, substeps: int = 20) -> Floats:
     """Fly the thrusts of a plan with the simulator's dynamics from its start, without control, and return the states.
 
-    Rotors follow at once. Positions then differ from the plan's by the errors of both integrations.
+    Rotors follow as in the plan. Positions then differ from the plan's by the errors of both integrations.
 
     Args:
         substeps: Number of steps (RK4) between two times of the plan.
@@ -122,13 +128,13 @@ def fly_open_loop(plan: Plan, substeps: int = 20) -> Floats:
     Returns:
         Position, m, velocity, m/s, attitude, xyzw, and angular velocity, rad/s. (n + 1, 13)
     """
-    rotor_vel = plan.airframe.rotor_vel(plan.thrust)
+    commands, has_lag = plan.airframe.rotor_vel(plan.thrust), plan.rotor_vel is not None
 
     def derivative(x: jax.Array, speeds: jax.Array) -> jax.Array:
-        vel, quat, ang_vel = x[3:6], x[6:10], x[10:13]
-        _, acc, ang_acc, _ = first_principles.dynamics(x[:3], quat, vel, ang_vel, speeds, speeds, params=params)
+        vel, quat, ang_vel, rotor_vel = x[3:6], x[6:10], x[10:13], x[13:] if has_lag else speeds
+        derivatives = first_principles.dynamics(x[:3], quat, vel, ang_vel, speeds, rotor_vel, params=params)
         turn = rotation.multiply(quat, jnp.append(ang_vel / 2, 0.0))
-        return jnp.concatenate([vel, acc, turn, ang_acc])
+        return jnp.concatenate([*derivatives[:2], turn, *derivatives[2 : 3 + has_lag]])
 
     def step(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         speeds, h = inputs[0], inputs[1] / substeps
@@ -137,11 +143,12 @@ def fly_open_loop(plan: Plan, substeps: int = 20) -> Floats:
             x = x.at[6:10].divide(jnp.linalg.norm(x[6:10]))
         return x, x
 
-    start = np.concatenate([plan.pos[0], plan.vel[0], plan.quat[0], plan.ang_vel[0]])
+    speeds = [] if plan.rotor_vel is None else plan.rotor_vel[0]
+    start = np.concatenate([plan.pos[0], plan.vel[0], plan.quat[0], plan.ang_vel[0], speeds])
     with jax.enable_x64(True):
         params = first_principles.Params.create(plan.airframe)
-        _, states = jax.jit(lambda x, y: jax.lax.scan(step, x, y))(start, (rotor_vel, np.diff(plan.time)))
-    return np.concatenate([start[None], np.asarray(states)])
+        _, states = jax.jit(lambda x, y: jax.lax.scan(step, x, y))(start, (commands, np.diff(plan.time)))
+    return np.concatenate([start[None], np.asarray(states)])[:, :13]
 
 
 class _Course:
@@ -287,7 +294,7 @@ def _plan_point_mass(course: _Course, airframe: Airframe) -> tuple[Floats, Float
 
 
 def _plan_drone(
-    course: _Course, airframe: Airframe, rates: Floats, dt: float, guess_time: Floats, guess: Floats
+    course: _Course, airframe: Airframe, rates: Floats, dt: float, lag: bool, guess_time: Floats, guess: Floats
 ) -> Plan:
     ca, n_rotors = _import_casadi(), airframe.n_rotors
     mass = float(airframe.value("rigid_body.mass"))
@@ -302,60 +309,85 @@ def _plan_drone(
     size = np.linalg.norm(force, axis=0)
     quat, ang_vel = _turn_along(force / size, time)
     states = np.concatenate([motion[:6], quat, np.clip(ang_vel, -rates[:, None], rates[:, None])])
-    thrust = np.clip(np.tile(mass * size[:-1] / n_rotors, (n_rotors, 1)), weakest, strongest)
+    thrust = np.clip(np.tile(mass * size / n_rotors, (n_rotors, 1)), weakest, strongest)
+    # With lag, speeds of the rotors, as shares of the largest, are states, and commanded speeds are the inputs.
+    inputs, input_low, input_high = thrust[:, :-1], weakest, strongest
+    if lag:
+        scale = float(airframe.rotor_vel(strongest)[0])
+        speeds = airframe.rotor_vel(thrust.T).T / scale
+        speeds[:, 0] = airframe.rotor_vel(mass * GRAVITY_MAGNITUDE / n_rotors) / scale
+        states, inputs, input_high = np.concatenate([states, speeds]), speeds[:, :-1], 1.0
+        input_low = float(airframe.rotor_vel(weakest)[0]) / scale
     # Level and at rest at both ends, with any heading.
-    low, high = course.bounds(ends, 13)
+    low, high = course.bounds(ends, len(states))
     low[6:10], high[6:10] = -1.1, 1.1
-    low[10:], high[10:] = -rates[:, None], rates[:, None]
+    low[10:13], high[10:13] = -rates[:, None], rates[:, None]
+    low[13:, 0] = high[13:, 0] = states[13:, 0]
     still = [0, -1] if course.finish is not None else [0]
     rows = np.ix_([6, 7, 10, 11, 12], still)
     low[rows] = high[rows] = 0.0
     program = _Program(ca)
     x = program.variable(states, low, high)
-    u = program.variable(thrust, weakest, strongest)
+    u = program.variable(inputs, input_low, input_high)
     legs = program.variable(1.05 * durations[:, None], 0.02, FAR)
-    step = _step_function(ca, airframe).map(len(leg))
+    step = _step_function(ca, airframe, scale if lag else None).map(len(leg))
     program.add(x[:, 1:] - step(x[:, :-1], u, (legs[leg.tolist()] / counts[leg].astype(float)).T), 0.0, 0.0)
     program.add(ca.sumsqr(x[6:10, 0]), 1.0, 1.0)
     course.constrain(program, x, ends, balls=True)
-    states, thrust, durations = program.solve(ca.sum1(legs), f"{airframe.name!r}")
+    states, inputs, durations = program.solve(ca.sum1(legs), f"{airframe.name!r}")
     time = np.concatenate([[0.0], np.cumsum((durations[:, 0] / counts)[leg])])
-    pos, vel, quat, ang_vel = np.split(states.T, [3, 6, 10], axis=-1)
-    return Plan(time, pos, vel, quat, ang_vel, thrust.T, airframe)
+    pos, vel, quat, ang_vel, speeds = np.split(states.T, [3, 6, 10, 13], axis=-1)
+    if not lag:
+        return Plan(time, pos, vel, quat, ang_vel, inputs.T, airframe)
+    thrust = np.polynomial.polynomial.polyval(scale * inputs.T, np.atleast_2d(airframe.value("rotors.thrust_curve"))[0])
+    return Plan(time, pos, vel, quat, ang_vel, thrust, airframe, scale * speeds)
 
 
-def _step_function(ca: Any, airframe: Airframe, substeps: int = 2) -> Any:
-    # State after a time with constant thrusts, by RK4. With two substeps, open-loop flights end within centimetres.
-    x, u, h = ca.SX.sym("x", 13), ca.SX.sym("u", airframe.n_rotors), ca.SX.sym("h")
-    vel, quat, ang_vel = x[3:6], x[6:10], x[10:13]
+def _step_function(ca: Any, airframe: Airframe, scale: float | None) -> Any:
+    # State after a time with constant inputs, by RK4, with so many substeps that open-loop flights end within
+    # centimetres. Inputs are thrusts or, with a scale of rotor speeds, commanded speeds, which the rotors follow.
+    n_rotors, substeps = airframe.n_rotors, 2 if scale is None else 4
+    x, inputs, h = ca.SX.sym("x", 13 if scale is None else 13 + n_rotors), ca.SX.sym("u", n_rotors), ca.SX.sym("h")
+    vel, quat, ang_vel, u = x[3:6], x[6:10], x[10:13], inputs
     q, w = quat[:3], quat[3]
     # Columns of the rotation matrix are the body's axes.
     identity = np.eye(3)
     axes = [e + 2 * w * ca.cross(q, e) + 2 * ca.cross(q, ca.cross(q, e)) for e in map(ca.DM, identity)]
     rot = ca.horzcat(*axes)
-    drag = rot @ airframe.matrix("drag.coefficients") @ rot.T @ vel
-    acc = (axes[2] * ca.sum1(u) + drag) / float(airframe.value("rigid_body.mass")) - GRAVITY_MAGNITUDE * identity[2]
     arms = airframe.mixing_matrix * [[airframe.arm], [airframe.arm], [1.0]]
     thrust_curve, torque_curve = (np.atleast_2d(airframe.value(f"rotors.{x}_curve"))[0] for x in ("thrust", "torque"))
-    spin_inertia, momentum = airframe.value("rotors.inertia"), airframe.inertia @ ang_vel
-    ratio = torque_curve[2] / thrust_curve[2]
-    drag_torque = ratio * u
-    if np.any(spin_inertia) or not np.allclose(torque_curve, ratio * thrust_curve):
+    spin = RPM_TO_RAD_S * airframe.value("rotors.yaw_torque_sign") * airframe.value("rotors.inertia")
+    k0, k1, k2 = thrust_curve
+    ratio, momentum, reaction = torque_curve[2] / k2, airframe.inertia @ ang_vel, 0.0
+    if scale is not None:
+        rotor_vel, command = scale * x[13:], scale * inputs
+        u = k0 + k1 * rotor_vel + k2 * rotor_vel**2
+        a0, b0, a1, b1 = map(ca.DM, np.broadcast_to(airframe.value("rotors.lag"), (n_rotors, 4)).T)
+        rise, both = command - rotor_vel, command + rotor_vel
+        rotor_acc = rise * ca.if_else(rise > 0, a0 + b0 * both, a1 + b1 * both)
+        reaction = ca.dot(spin, rotor_acc)
+    elif np.any(spin) or not np.allclose(torque_curve, ratio * thrust_curve):
         # The slope of the speed is infinite at no thrust, so that it is left out where nothing depends on it.
-        k0, k1, k2 = thrust_curve
         rotor_vel = (-k1 + ca.sqrt(k1**2 - 4 * k2 * (k0 - u))) / (2 * k2)
+    else:
+        rotor_vel = None
+    drag_torque = ratio * u
+    if rotor_vel is not None:
         drag_torque = torque_curve[0] + torque_curve[1] * rotor_vel + torque_curve[2] * rotor_vel**2
-        spin = ca.sum1(-RPM_TO_RAD_S * airframe.value("rotors.yaw_torque_sign") * spin_inertia * rotor_vel)
-        momentum = momentum + ca.vertcat(0, 0, spin)
-    turning = ca.vertcat(arms[:2] @ u, arms[2:] @ drag_torque)
+        momentum = momentum + ca.vertcat(0, 0, -ca.dot(spin, rotor_vel))
+    drag = rot @ airframe.matrix("drag.coefficients") @ rot.T @ vel
+    acc = (axes[2] * ca.sum1(u) + drag) / float(airframe.value("rigid_body.mass")) - GRAVITY_MAGNITUDE * identity[2]
+    turning = ca.vertcat(arms[:2] @ u, arms[2:] @ drag_torque + reaction)
     torque = turning - ca.cross(ang_vel, momentum)
     turn = 0.5 * ca.vertcat(w * ang_vel + ca.cross(q, ang_vel), -ca.dot(q, ang_vel))
-    rate = ca.Function("rate", [x, u], [ca.vertcat(vel, acc, turn, np.linalg.inv(airframe.inertia) @ torque)])
+    derivative = [vel, acc, turn, np.linalg.inv(airframe.inertia) @ torque]
+    derivative += [] if scale is None else [rotor_acc / scale]
+    rate = ca.Function("rate", [x, inputs], [ca.vertcat(*derivative)])
     y, d = x, h / substeps
     for _ in range(substeps):
-        y = _step_rk4(rate, y, u, d)
+        y = _step_rk4(rate, y, inputs, d)
     y = ca.vertcat(y[:6], y[6:10] / ca.norm_2(y[6:10]), y[10:])
-    return ca.Function("step", [x, u, h], [y])
+    return ca.Function("step", [x, inputs, h], [y])
 
 
 def _step_rk4(rate: Any, x: Any, u: Any, h: Any) -> Any:

@@ -58,6 +58,24 @@ def test_a_plan_keeps_its_limits_and_crosses_its_gates_in_the_simulators_dynamic
     np.testing.assert_allclose(flown[-1, 3:6], 0, atol=0.01)
 
 
+@pytest.mark.long("plans with the speeds of the rotors")
+def test_rotors_with_lag_take_longer_and_fly_as_in_the_simulator():
+    """Commands stay within their limits; four steps of RK4 a node leave a drift of millimetres."""
+    track, rates = climb(3.0, 5.0, finish=6.0), (12.0, 12.0, 3.0)
+    without, plan = (plan_race(track, "uzh_5inch", body_rate=rates, rotor_lag=lag) for lag in (False, True))
+    # At most by the time in which the rotors reach full thrust, and that in which they stop: a few times the lag.
+    assert without.duration < plan.duration < without.duration + 4 * 0.033
+    airframe = plan.airframe
+    assert plan.thrust.max() <= airframe.value("rotors.thrust_max") * (1 + 1e-6)
+    assert plan.thrust.min() >= airframe.value("rotors.thrust_min") * (1 - 1e-6)
+    np.testing.assert_allclose(plan.rotor_vel[0], airframe.rotor_vel(0.75 * G / 4), rtol=1e-3)
+    np.testing.assert_allclose(fly_open_loop(plan)[:, :3], plan.pos, atol=5e-3)
+    # From the speeds before, each rotor approaches its command by exp(-t / 0.033 s).
+    command, h = airframe.rotor_vel(plan.thrust), np.diff(plan.time)[:, None]
+    expected = command + (plan.rotor_vel[:-1] - command) * np.exp(-h * 30.303)
+    np.testing.assert_allclose(plan.rotor_vel[1:], expected, atol=1e-3 * airframe.rotor_vel_limits.max())
+
+
 @pytest.mark.long("plans eight gates")
 def test_a_drone_with_other_curves_crosses_the_gates_of_two_laps():
     """Torque curves with linear terms, corners cut at fast sideways motion, and the last gate as the end."""
