@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3741,
     "geometry": 940,
-    "lab": 17245,
+    "lab": 17270,
     "media": 1087,
     "plugins": 4887,
     "scene": 2871,
