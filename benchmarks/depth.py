@@ -1,4 +1,4 @@
-"""Rays per second of depth images, and the time to the first image; or the time of a step with a range finder.
+"""Rays per second of depth images, and the time to the first image; images in colour; or a step with a range finder.
 
 One JSON line for each number of poles, fixed and movable, with rates by wall time (median) and by processor time
 (least). To compare with another version, run this file alternately with and without the folder of that version in
@@ -7,7 +7,10 @@ PYTHONPATH.
 With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
 ``fraction_that_meets`` is the fraction of the four horizontal rays that meet something.
 
+With ``--colors``, images of a ``Camera`` per second: depth, and colours with and without shadows.
+
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
+                               [--colors]
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import numpy as np
 from jax import Array
 from measure import engine_name, medians, report, round_digits, seconds
 
-from crazysim import RangeFinder, Sim, __version__
+from crazysim import Camera, RangeFinder, Sim, __version__
 
 HALF_WIDTH = 10.0
 """Half the side of the square in which the poles stand, m."""
@@ -36,11 +39,12 @@ def main() -> None:
     parser.add_argument("--poles", type=int, nargs="+", default=(0, 30, 1000))
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--range-finder", action="store_true", help="time a step with a range finder, not images")
+    parser.add_argument("--colors", action="store_true", help="compare images in colour with depth images")
     args = parser.parse_args()
     for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
         sim = make_scene(args.worlds, n_poles, movable, args.device)
-        if args.range_finder:
-            report_range_finder(sim, n_poles, movable, args)
+        if args.range_finder or args.colors:
+            (report_range_finder if args.range_finder else report_colors)(sim, n_poles, movable, args)
             continue
         render = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
         start_time = time.perf_counter()
@@ -54,6 +58,23 @@ def main() -> None:
             height=args.size[1], first_s=round_digits(first_s), rays_per_s=round_digits(n_rays / render_s),
             rays_per_processor_s=round_digits(n_rays / processor_s), crazysim=__version__,
         )  # fmt: skip
+
+
+def report_colors(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
+    cameras = {
+        "depth": Camera(*args.size),
+        "rgb": Camera(*args.size, outputs=("rgb",), shadows=False),
+        "rgb_with_shadows": Camera(*args.size, outputs=("rgb",)),
+    }
+    calls = {name: partial(jax.jit(camera.image_fn(sim)), sim.data) for name, camera in cameras.items()}
+    jax.block_until_ready([call() for call in calls.values()])
+    rates = medians({name: partial(seconds, call) for name, call in calls.items()}, args.repeats)
+    busy = {name: min(processor_seconds(call) for _ in range(args.repeats)) for name, call in calls.items()}
+    report(
+        args.device, benchmark="colors", n_poles=n_poles, movable=movable, n_worlds=args.worlds, width=args.size[0],
+        height=args.size[1], images_per_s={k: round_digits(args.worlds / x) for k, x in rates.items()},
+        images_per_processor_s={k: round_digits(args.worlds / x) for k, x in busy.items()}, crazysim=__version__,
+    )  # fmt: skip
 
 
 def report_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
