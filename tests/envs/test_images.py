@@ -18,6 +18,7 @@ from crazysim.envs import (
     make,
 )
 from crazysim.envs.state import EnvState
+from crazysim.train.convolution import find_images
 
 SIZE = {"width": 8, "height": 6}
 DEPTH = {"depth": "depth"}
@@ -101,6 +102,25 @@ def test_adapters_have_the_images_in_their_spaces():
     obs_after_reset, _ = env.reset(options={"reset_mask": np.array([True, False])})
     np.testing.assert_array_equal(obs_after_reset["depth"][1], obs["depth"][1])
     env.reset()
+
+
+def test_colors_are_observed_as_numbers_from_0_to_1(base):
+    camera = Camera(**SIZE, outputs=("rgb", "gray", "depth"))
+    env = CameraImages(base, camera)
+    state = jax.jit(env.reset)(jax.random.key(3))
+    images = jax.jit(camera.image_fn(base.sim))(state.data)
+    assert images["gray"].dtype == images["rgb"].dtype == np.uint8
+    for name in ("rgb", "gray"):
+        expected = np.asarray(images[name], np.float32).reshape(3, 1, -1) / 255
+        # The two programs may round to neighbouring steps.
+        np.testing.assert_allclose(state.obs[f"camera.{name}"], expected, atol=1.01 / 255)
+        assert 0.05 < expected.std() < 0.5
+    brightness = np.asarray(images["rgb"]) @ np.array([0.299, 0.587, 0.114])
+    np.testing.assert_allclose(images["gray"], brightness, atol=0.51)
+    image = next(
+        x for x in find_images({k: x.shape[-1] for k, x in state.obs.items()}, env.image_formats()) if x.channels > 1
+    )
+    assert (image.shape, image.is_depth) == ((6, 8, 3), False)
 
 
 def test_wrappers_around_images_leave_them_as_they_are():

@@ -30,8 +30,14 @@ from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
 
-OUTPUTS: dict[str, tuple[int, ...]] = {"depth": (), "distance": (), "normal": (3,), "segmentation": (), "rgb": (3,)}
+OUTPUTS: dict[str, tuple[int, ...]] = {
+    "depth": (), "distance": (), "normal": (3,), "segmentation": (), "rgb": (3,), "gray": (),
+}  # fmt: skip
 """Shape of a pixel of each output of an image."""
+COLORS = "rgb", "gray"
+"""Outputs that are colours, uint8."""
+LUMA = 0.299, 0.587, 0.114
+"""Weights of red, green and blue in grey (ITU-R BT.601)."""
 UNFUSED_REASON = "images are taken by kernels with a lane for each ray"
 
 Images = dict[str, Array]
@@ -73,8 +79,9 @@ class ImageSensor(Plugin):
     """Roll, pitch and yaw of the sensor's frame (x ahead, y left, z up) in the body frame, rad. (3,)"""
     outputs: Sequence[str] = ("depth",)
     """Images to take, some of ``"depth"`` (along the axis of the sensor, m), ``"distance"`` (along the ray, m),
-    ``"normal"`` (of the surface, unit, sensor frame), ``"segmentation"`` (index in ``segment_names``, -1 for nothing)
-    and ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8; a lidar has none)."""
+    ``"normal"`` (of the surface, unit, sensor frame), ``"segmentation"`` (index in ``segment_names``, -1 for
+    nothing), ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8) and ``"gray"`` (its brightness, uint8). A lidar
+    has no depths along an axis and no colours."""
     drones: bool = True
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
@@ -154,9 +161,15 @@ class ImageSensor(Plugin):
         sensor |= {"freq": self.freq, "latency": float(self.latency)}
         formats = {}
         for name in self.outputs:
-            unit = {"normal": "1", "segmentation": "index", "rgb": "1"}.get(name, "m")
-            far = {"normal": 0.0, "segmentation": -1, "rgb": 0.0}.get(name, self.far)
-            formats[name] = {"height": height, "width": width, "unit": unit, "far": far, "output": name} | sensor
+            unit = {"normal": "1", "segmentation": "index"} | dict.fromkeys(COLORS, "1")
+            far = {"normal": 0.0, "segmentation": -1} | dict.fromkeys(COLORS, 0.0)
+            formats[name] = {
+                "height": height,
+                "width": width,
+                "unit": unit.get(name, "m"),
+                "far": far.get(name, self.far),
+                "output": name,
+            } | sensor
         return formats
 
     def segment_names(self, sim: Simulation) -> tuple[str, ...]:
@@ -187,7 +200,7 @@ class ImageSensor(Plugin):
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
-        color_settings = {"color": "rgb" in self.outputs, "shadows": self.has_shadows}
+        color_settings = {"color": bool({*COLORS} & {*self.outputs}), "shadows": self.has_shadows}
         cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
         rot = camera.rot
 
@@ -212,6 +225,9 @@ class ImageSensor(Plugin):
                     # By components: a GPU may round matrix products to 10 bits.
                     parts = [sum(float(rot[i, k]) * normal[..., i] for i in range(3)) for k in range(3)]
                     images[name] = jnp.stack(parts, axis=-1)  # type: ignore[arg-type]
+                elif name == "gray":
+                    parts = [weight * hits.color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
+                    images[name] = jnp.round(sum(parts)).astype(np.uint8)
                 else:
                     images[name] = hits.color if name == "rgb" else hits.body_index
             return images
@@ -275,7 +291,7 @@ class ImageSensor(Plugin):
         images, transit = {}, {}
         for name in self.outputs:
             number = sim.data.states.pos.dtype
-            special = {"segmentation": (-1, np.int32), "normal": (0.0, number), "rgb": (0, np.uint8)}
+            special = {"segmentation": (-1, np.int32), "normal": (0.0, number)} | dict.fromkeys(COLORS, (0, np.uint8))
             value, dtype = special.get(name, (self.far, number))
             images[name] = device_array(np.full(shape + OUTPUTS[name], value), dtype)
             if n:
