@@ -21,7 +21,7 @@ BUDGET = {
     "geometry": 940,
     "lab": 17270,
     "media": 1087,
-    "plugins": 4887,
+    "plugins": 4892,
     "scene": 2871,
     "sim": 914,
     "train": 2499,
