@@ -184,16 +184,18 @@ def camera_scene(n_drones: int = 1) -> Sim:
 def cameras() -> None:
     """What a camera in one scene sees: in colour, each output, stereo noise, and a lens."""
     sim, size = camera_scene(), (160, 120)
-    clean = Camera(*size, outputs=("depth", "normal", "segmentation"), max_depth=6.0)
+    clean = Camera(*size, outputs=("rgb", "gray", "depth", "normal", "segmentation"), max_depth=6.0)
     images = jax.jit(clean.image_fn(sim))(sim.data)
     stereo = Camera(*size, max_depth=6.0, noise=sensors.StereoNoise())
     lens = Camera(*size, max_depth=6.0, distortion=sensors.Distortion(k1=-0.25, k2=0.05))
     noisy, bent = (jax.jit(camera.image_fn(sim))(sim.data)["depth"][0, 0] for camera in (stereo, lens))
-    figure, axes = plt.subplots(2, 3, figsize=(8.4, 4.4), layout="constrained")
+    figure, axes = plt.subplots(2, 4, figsize=(11.2, 4.4), layout="constrained")
     depths = {"vmin": 0, "vmax": 6, "cmap": "viridis_r"}
     segments = np.asarray(images["segmentation"][0, 0])
     panels = [
-        ("sim.render, in colour", sim.render("rgb_array", camera="fpv_cam:0", width=320, height=240), {}),
+        ("sim.render, by MuJoCo", sim.render("rgb_array", camera="fpv_cam:0", width=size[0], height=size[1]), {}),
+        ('"rgb"', images["rgb"][0, 0], {}),
+        ('"gray"', images["gray"][0, 0], {"cmap": "gray", "vmin": 0, "vmax": 255}),
         ('"depth", m', images["depth"][0, 0], depths),
         ('"normal", as red, green and blue', 0.5 + 0.5 * np.asarray(images["normal"][0, 0]), {}),
         ('"segmentation"', np.ma.masked_less(segments, 0), {"cmap": "tab10", "interpolation": "nearest"}),
