@@ -39,6 +39,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "seconds that a policy loses for each gate that it touches or misses; by default contacts end the flight"
     )
     add("--penalty", type=number(0.0, 1e3, 2.0, float), metavar="S", help=penalty_help)
+    battery_help = "state of charge at the start, up to 1, of a battery that sags, for a policy; by default none"
+    add("--battery", type=number(0.05, 1.0, 0.9, float), metavar="C", help=battery_help)
     add("--drone", help="airframe of a plan: a name or the path of a TOML file; by default uzh_cpc")
     rates_help = "largest roll, pitch and yaw rate of a plan, rad/s; by default 15 15 3"
     add("--body-rate", type=size(15), nargs=3, metavar=("P", "Q", "R"), help=rates_help)
@@ -94,7 +96,8 @@ def _rank(options: argparse.Namespace) -> tuple[RaceFlight | None, int]:
     from crazysim.lab.racing import ranking
     from crazysim.lab.racing.controllers import Run
 
-    given = [name for name in ("track", "policy", "drone", "body_rate", "floor") if getattr(options, name) is not None]
+    settings = ("track", "policy", "penalty", "battery", "drone", "body_rate", "floor")
+    given = [name for name in settings if getattr(options, name) is not None]
     require(
         not given, f"expected none of the settings of plans with --controller, got {', '.join(given)}. Leave it out."
     )
@@ -117,7 +120,8 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
     from crazysim.lab.racing.flight import flight_of_plan
     from crazysim.lab.racing.time_optimal import fly_open_loop, plan_race
 
-    require(options.penalty is None, "expected --penalty with --policy, got a plan. Leave it out.")
+    given = [f"--{name}" for name in ("penalty", "battery") if getattr(options, name) is not None]
+    require(not given, f"expected {' and '.join(given)} with --policy, got a plan. Leave it out.")
     track = load_track(options.track)
     plan = plan_race(
         track,
@@ -140,6 +144,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
 
     from crazysim.envs.tasks.race import Race
     from crazysim.lab.racing.flight import flight_of_policy
+    from crazysim.plugins.effects.battery import Battery
     from crazysim.train.interface import check_policy
     from crazysim.train.training import load_policy
 
@@ -150,7 +155,8 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     policy, config, _ = load_policy(options.policy)
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
     course |= {} if options.penalty is None else {"penalty": options.penalty}
-    env = dataclasses.replace(config, options=config.options | course).make_env(1)
+    effects = [] if options.battery is None else [Battery(charge=options.battery)]
+    env = dataclasses.replace(config, options=config.options | course).make_env(1, effects=effects)
     expect(isinstance(env.task, Race), "a policy of the task race", config.task)
     check_policy(policy, env)
     return flight_of_policy(env, policy)

@@ -50,6 +50,8 @@ class RaceFlight:
     """Why the flight ended, if not by the last gate."""
     penalty: NDArray | None = None
     """Sum of the penalties at the samples, s; None without. (n,)"""
+    battery: NDArray | None = None
+    """Voltage, V, and state of charge of a ``Battery`` at the samples; None without. (n, 2)"""
 
 
 def flight_of_plan(plan: Plan, track: Track, laps: int = 1) -> RaceFlight:
@@ -72,11 +74,12 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
     """Fly one episode of the task ``race`` with a policy, until all gates are passed or it ends, and time it."""
     step = jax.jit(lambda state, memory: _policy_step(env, policy, state, memory))
     state, memory = jax.jit(env.reset)(jax.random.key(seed)), initial_memory(policy, env)
-    states, records = [state.data.states], [race_of(state.data)]
+    states, records, batteries = [state.data.states], [race_of(state.data)], [state.data.plugins.get("battery")]
     while len(states) <= env.max_steps and not state.done[0]:
         state, memory = step(state, memory)
         states.append(state.data.states)
         records.append(race_of(state.data))
+        batteries.append(state.data.plugins.get("battery"))
     times = np.arange(len(states)) / env.base.freq
     pos, quat = (np.array([getattr(s, name)[0, 0] for s in states], float) for name in ("pos", "quat"))
     task: Any = env.task
@@ -84,6 +87,9 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
     if task.penalty is not None:  # the task counts contacts, too
         penalty = np.array([record.penalty_sum[0, 0] for record in records])
         clock = clock.replace(penalty=penalty[-1])
+    battery = None
+    if "battery" in env.sim.data.plugins:
+        battery = np.array([[float(x.voltage[0, 0, 0]), float(x.charge[0, 0, 0])] for x in batteries])
     if not np.all((pos[-1] >= task.course.low) & (pos[-1] <= task.course.high)):
         reason = "the drone left the arena"
     elif records[-1].failure[0, 0]:
@@ -91,7 +97,7 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
         reason = f"the drone touched {things} or the floor"
     else:
         reason = "the time of the episode was over"
-    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason, penalty)
+    return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason, penalty, battery)
 
 
 def _policy_step(env: Env, policy: Any, state: EnvState, memory: Any) -> tuple[EnvState, Any]:
@@ -113,6 +119,9 @@ def summary(flight: RaceFlight) -> str:
         lines.append(f"lap {k + 1}: {time}; from gate to gate " + " ".join(row[:passed]))
     if float(clock.penalty):
         lines.append(f"penalties: {float(clock.penalty):g} s")
+    if flight.battery is not None:
+        voltage, charge = flight.battery.T
+        lines.append(f"battery: {voltage[0]:.1f} V at the start, at least {voltage.min():.1f} V, {charge[-1]:.1%} left")
     missed = f"gate {int(clock.passed) + 1} of {len(clock.times)} was not passed: {flight.reason}"
     end = f"all gates after {float(clock.time):.3f} s" if bool(clock.finished) else missed
     return "\n".join([*lines, f"{end}; the flight ends after {flight.time[-1]:.3f} s"])

@@ -346,7 +346,7 @@ def _plan_drone(
 def _step_function(ca: Any, airframe: Airframe, scale: float | None) -> Any:
     # State after a time with constant inputs, by RK4, with so many substeps that open-loop flights end within
     # centimetres. Inputs are thrusts or, with a scale of rotor speeds, commanded speeds, which the rotors follow.
-    n_rotors, substeps = airframe.n_rotors, 2 if scale is None else 4
+    n_rotors, substeps = airframe.n_rotors, 2 if scale is None else 6
     x, inputs, h = ca.SX.sym("x", 13 if scale is None else 13 + n_rotors), ca.SX.sym("u", n_rotors), ca.SX.sym("h")
     vel, quat, ang_vel, u = x[3:6], x[6:10], x[10:13], inputs
     q, w = quat[:3], quat[3]

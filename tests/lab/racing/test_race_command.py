@@ -1,18 +1,25 @@
 """``crazysim race``: what it prints and writes."""
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim.__main__ import main
 from crazysim.envs import Track, load_track, make
+from crazysim.envs.statistics import RunningStats
 from crazysim.lab.live import Live, PolicyPilot
 from crazysim.lab.racing.flight import clock_text_at, flight_of_plan, flight_of_policy, summary, track_simulation
 from crazysim.lab.racing.live_clock import LiveClock
 from crazysim.lab.racing.time_optimal import plan_race
+from crazysim.train import checkpoint
+from crazysim.train.config import TrainConfig
+from crazysim.train.export import describe
+from crazysim.train.networks import Policy
+from crazysim.train.training import POLICY_FILE
 
 FILE = """
 initState: { pos: [0, 0, 1] }
@@ -51,6 +58,41 @@ def test_the_command_prints_laps_and_splits_and_draws(path, tmp_path, capsys):
     assert lap < duration
     assert f"the flight ends after {duration:.3f} s" in text
     assert all(file.stat().st_size > 10_000 for file in files)
+
+
+@pytest.fixture(scope="module")
+def hovering(tmp_path_factory):
+    """Return the folder of a run whose policy hovers, on a track of two gates."""
+    folder = tmp_path_factory.mktemp("run")
+    options = {"track": "split_s_gates", "seconds": 0.1, "engine": "interpret", "drone": "uzh_5inch"}
+    env = make("race", **options)
+    shapes = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    n = sum(x.shape[-1] for x in shapes.values())
+    policy = Policy(RunningStats.create(n), [(jnp.zeros((n, 4)), jnp.zeros(4))])
+    config = TrainConfig.create("race", config={"hidden": []}, options=options)
+    checkpoint.save(folder / POLICY_FILE, policy, describe(env) | {"settings": asdict(config)})
+    return folder
+
+
+@pytest.mark.parametrize("options", [[], ["--penalty", "2"], ["--battery", "0.9", "--laps", "2"]])
+def test_a_policy_that_misses_a_gate_ends_with_status_one(hovering, options, capsys):
+    assert main(["race", "split_s_gates", "--policy", str(hovering), *options]) == 1
+    n = 38 if "--laps" in options else 19
+    text = capsys.readouterr().out
+    assert f"gate 1 of {n} was not passed: the time of the episode was over" in text
+    if "--battery" in options:  # four cells at rest, and sag by some ampere at hover
+        start, least, left = map(
+            float, re.search(r"battery: ([\d.]+) V at the start, at least ([\d.]+) V, ([\d.]+)%", text).groups()
+        )
+        assert 15 < least < start < 16.4
+        assert 89.9 < left <= 90
+    else:
+        assert "battery" not in text
+
+
+def test_law_09_options_of_policies_are_refused_for_plans(path, capsys):
+    assert main(["race", str(path), "--penalty", "1", "--battery", "1"]) == 2
+    assert "expected --penalty and --battery with --policy" in capsys.readouterr().err
 
 
 def test_the_tracks_are_listed(capsys):

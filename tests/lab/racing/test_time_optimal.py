@@ -60,7 +60,7 @@ def test_a_plan_keeps_its_limits_and_crosses_its_gates_in_the_simulators_dynamic
 
 @pytest.mark.long("plans with the speeds of the rotors")
 def test_rotors_with_lag_take_longer_and_fly_as_in_the_simulator():
-    """Commands stay within their limits; four steps of RK4 a node leave a drift of millimetres."""
+    """Commands stay within their limits; six steps of RK4 a node leave a drift of millimetres."""
     track, rates = climb(3.0, 5.0, finish=6.0), (12.0, 12.0, 3.0)
     without, plan = (plan_race(track, "uzh_5inch", body_rate=rates, rotor_lag=lag) for lag in (False, True))
     # At most by the time in which the rotors reach full thrust, and that in which they stop: a few times the lag.

@@ -215,6 +215,11 @@ def test_presets_have_the_numbers_of_their_data_sheets():
     assert abs(IMU.bmi088().gyro.noise * np.sqrt(47) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu9250().gyro.noise * np.sqrt(92) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu6050().gyro.noise * np.sqrt(100) / DEGREE - 0.05) < 0.005
+    assert abs(IMU.icm42688p().gyro.noise / DEGREE - 2.8e-3) < 1e-6
+    fast, _ = build(IMU.icm42688p())
+    fast.data = with_states(fast.data, ang_vel=[40.0, 0, 0])
+    fast.step(5)
+    assert abs(read(fast, "gyro").max() / DEGREE - 2000) < 0.1, "its range of 34.9 rad/s, within a step of its 16 bits"
     np.testing.assert_allclose(IMU.bmi088().accel.noise / STANDARD_GRAVITY, [160e-6, 160e-6, 190e-6])
     sim, _ = build(IMU.bmi088(gyro=Triad(), pos=(0.01, 0, 0)), 400)
     sim.data = with_states(sim.data, pos=[0, 0, -0.001])
