@@ -6,7 +6,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,6 @@ from crazysim.errors import require
 if TYPE_CHECKING:
     from crazysim.envs.env import Env
     from crazysim.train.config import TrainConfig
-    from crazysim.train.networks import Policy
 
 
 class DefaultsFormatter(argparse.HelpFormatter):
@@ -108,22 +107,32 @@ def require_screen(remedy: str) -> None:
 
 
 def load_policy_and_env(
-    folder: Path, device: str | None, n_worlds: int, task: str | None = None, drone: str | None = None
-) -> tuple[Policy, TrainConfig, Env]:
+    folder: Path,
+    device: str | None,
+    n_worlds: int,
+    task: str | None = None,
+    drone: str | None = None,
+    policies: Sequence[Path] = (),
+) -> tuple[Any, TrainConfig, Env]:
     """Return the policy of a run, its configuration, and an environment with the observations of the policy.
 
     Args:
         folder: Folder of the run, or, for the task ``any``, a checkpoint of rl-tools or the name of the task for the
-            policy of the package.
+            policy of the package. With ``policies`` the task.
         device: Device of the environment; None for the device of the training.
         task: Reference of the task, if it has moved since training; None for the reference in the run.
         drone: Airframe that a policy for any flies; None for airframes that are drawn.
+        policies: Folders of runs whose policies fly the drones of a world, in their order; empty for one policy.
     """
     from crazysim.train.config import TrainConfig
     from crazysim.train.export import find_weights, raptor_policy
     from crazysim.train.interface import check_policy
+    from crazysim.train.policies import MultiPolicy
     from crazysim.train.training import load_policy
 
+    if policies:
+        config = TrainConfig.create(str(folder)).with_device(device)
+        return MultiPolicy.of([load_policy(x)[0] for x in policies]), config, config.make_env(n_worlds)
     if (weights := find_weights(folder)) is not None:
         config = TrainConfig.create("any", options={} if drone is None else {"drone": drone, "drawn": False})
         env = config.with_device(device).make_env(n_worlds)

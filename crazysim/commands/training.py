@@ -93,14 +93,17 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--drone", "--airframe", metavar="NAME|FILE", help=drone_help)
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
-    add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder, or any.mp4")
+    add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder, or TASK.mp4")
     add("--worlds", type=number(), default=4, help="number of worlds side by side")
     add("--seed", type=seed, default=1, help="seed of the initial states")
     _add_task_and_device(add)
 
 
 def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
-    folder_help = "folder of the run; or any, the package's policy, or a checkpoint of rl-tools (.tar) of its shape"
+    folder_help = (
+        "folder of the run; or any, the package's policy, or a checkpoint of rl-tools (.tar) of its shape; or, with "
+        "--policies, a task, such as head_to_head"
+    )
     parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     parser.add_argument("folder", type=Path, help=folder_help)
@@ -113,6 +116,8 @@ def _add_task_and_device(add: Any) -> None:
     drone_help = "airframe that a policy for any flies; by default another one in every world"
     add("--drone", "--airframe", metavar="NAME|FILE", help=drone_help)
     add("--device", help="device: cpu, gpu; by default the training's")
+    policies_help = "folders of runs whose policies fly the drones of a world together; the last one flies the rest"
+    add("--policies", nargs="+", type=Path, default=[], metavar="FOLDER", help=policies_help)
 
 
 def parse_seeds(text: str) -> Sequence[int]:
@@ -238,21 +243,30 @@ def _exit(*_: object) -> NoReturn:
     raise SystemExit(128 + signal.SIGTERM)
 
 
+def _load(options: argparse.Namespace) -> tuple[Any, ...]:
+    names = ("folder", "device", "worlds", "task", "drone", "policies")
+    return load_policy_and_env(*[getattr(options, name) for name in names])
+
+
 def evaluate(options: argparse.Namespace) -> None:
     """Evaluate a policy, and print and plot the results."""
     import jax
 
-    from crazysim.train.evaluation import describe_flight, evaluate
+    from crazysim.train.evaluation import describe_flight, evaluate, evaluate_each
     from crazysim.train.show import plot_episode
 
     if options.plot is not None:
         check_writable(options.plot, PICTURE_SUFFIXES)
-    policy, config, env = load_policy_and_env(
-        options.folder, options.device, options.worlds, options.task, options.drone
-    )
+    policy, config, env = _load(options)
     key = None if options.seed is None else jax.random.key(options.seed)
-    metrics = evaluate(env, policy, key)
-    print(f"{config.title}, {options.worlds:,} starts: {describe_flight(metrics, env.task.unit)}")
+    title = f"{config.title}, {options.worlds:,} starts"
+    if options.policies:
+        for folder, metrics in zip(options.policies, evaluate_each(env, policy, key), strict=True):
+            reward = metrics.pop("reward")
+            rates = ", ".join(f"{name} {x:.1%}" for name, x in metrics.items())
+            print(f"{title}, {folder}: {rates}, mean return {reward:.4g}")
+    else:
+        print(f"{title}: {describe_flight(evaluate(env, policy, key), env.task.unit)}")
     if options.plot is not None:
         plot_episode(env, policy, options.plot, key)
         print(f"wrote {options.plot}")
@@ -327,7 +341,7 @@ def export(options: argparse.Namespace) -> None:
 def render(options: argparse.Namespace) -> None:
     from crazysim.train.show import film
 
-    policy, _, env = load_policy_and_env(options.folder, options.device, options.worlds, options.task, options.drone)
-    path = options.film or (options.folder / "policy.mp4" if options.folder.is_dir() else Path("any.mp4"))
+    policy, config, env = _load(options)
+    path = options.film or (options.folder / "policy.mp4" if options.folder.is_dir() else Path(f"{config.title}.mp4"))
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")

@@ -71,6 +71,7 @@ TASKS: dict[str, Entry] = {
     "deliver": Entry("crazysim.lab.tasks.deliver:Deliver", "crazysim/Deliver-v0"),
     "race": Entry("crazysim.envs.tasks.race:Race", "crazysim/Race-v0"),
     "multi_race": Entry("crazysim.envs.tasks.race:Race", "crazysim/MultiRace-v0", n_drones=2),
+    "head_to_head": Entry("crazysim.lab.tasks.head_to_head:HeadToHead", "crazysim/HeadToHead-v0"),
     "race_by_camera": Entry("crazysim.envs.tasks.race_by_camera:RaceByCamera", "crazysim/RaceByCamera-v0"),
     "avoid": Entry("crazysim.envs.tasks.avoid:Avoid", "crazysim/Avoid-v0"),
     "forest": Entry("crazysim.envs.tasks.forest:Forest", "crazysim/Forest-v0"),

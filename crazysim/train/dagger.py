@@ -29,11 +29,11 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, DivergedError, require, require_callable
 from crazysim.train.convolution import images_of
-from crazysim.train.evaluation import as_tree
 from crazysim.train.hyperparameters import check_hyperparameters, check_seed
 from crazysim.train.interface import Interface, check_callable, describe_env, sizes_of
 from crazysim.train.networks import Network, Policy, Weights, choose_network, forward, init_weights
 from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
+from crazysim.train.policies import as_tree
 from crazysim.train.seeds import (
     Step,
     for_each_seed,

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.random import check_key
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import TERM_PREFIX, Obs, terms_of
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.train.interface import check_policy
-from crazysim.train.networks import Policies, Policy
+from crazysim.train.policies import MultiPolicy, act, as_tree, initial_memory
 
 EVALUATION_SEED = 0x5EED
 """Seed of the held-out initial states. Training keys are made with ``fold_in``, so they differ from the key of this
@@ -28,39 +27,6 @@ seed."""
 
 def held_out_key() -> Array:
     return jax.random.key(EVALUATION_SEED)
-
-
-class _FunctionPolicy(PyTree):
-    """Policy that is a plain function, which JAX treats as static."""
-
-    fn: Callable[[Obs], Array] = static()
-    """Function from observations to actions."""
-
-    def __call__(self, obs: Obs) -> Array:
-        return self.fn(obs)
-
-
-def as_tree(policy: Callable[[Obs], Array]) -> Any:
-    """Return a policy as a pytree, which compiled functions can take as an argument."""
-    return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
-
-
-def act(policy: Callable[[Obs], Array], obs: Obs, memory: Any) -> tuple[Array, Any]:
-    """Return the actions of a policy with or without memory, and its memory after the step.
-
-    Args:
-        policy: Trained policy, or any function from observations to actions.
-        obs: Observations by name. (n_worlds, n_drones, k) each
-        memory: Memory before the step; at the start of an episode the result of ``initial_memory``.
-    """
-    return policy.act(obs, memory) if isinstance(policy, Policy | Policies) else (policy(obs), memory)
-
-
-def initial_memory(policy: Callable[[Obs], Array], env: Env) -> Any:
-    """Return the memory of a policy at the start of an episode; ``()`` for none. (n_worlds, n_drones, ...) each"""
-    if not isinstance(policy, Policy | Policies):
-        return ()
-    return policy.initial_memory(env.sim.n_worlds, env.sim.n_drones)
 
 
 @partial(jax.jit, static_argnames=("env", "n_blocks"))
@@ -81,7 +47,9 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
         ``terms``: terms of the reward by name, means over the worlds and drones of a block, zero after the end of an
         episode (n_steps, n_blocks) each;
         ``succeeded``: True where the episode satisfied ``task.succeeded``; only for tasks that define it (n_worlds,
-        n_drones).
+        n_drones);
+        ``outcomes``: entries of the task's info that are True or False, by name, True where they were so at any time
+        (n_worlds, n_drones) each.
     """
     env = RewardTerms(env)
     state = env.reset(jnp.broadcast_to(key, (n_blocks,)))
@@ -97,6 +65,8 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
             for name in state.info
             if name in ("error", "nonfinite") or name.startswith(TERM_PREFIX)
         }
+        outcomes = {name: x for name, x in state.info.items() if name != "nonfinite" and x.dtype == bool}
+        values["outcomes"] = {name: x for name, x in outcomes.items() if x.shape == state.reward.shape}
         return values | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
     _, _, history = rollout(env, state, fly_step, key, env.max_steps, record_transition, initial_memory(policy, env))
@@ -119,6 +89,7 @@ def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[s
         },
     }
     succeeded = history["succeeded"]
+    flight["outcomes"] = {name: jnp.any(x & is_flying, axis=0) for name, x in history["outcomes"].items()}
     return flight if succeeded is None else flight | {"succeeded": jnp.any(succeeded & is_flying, axis=0)}
 
 
@@ -149,6 +120,26 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
     return evaluate_blocks(env, as_tree(policy), key)[0]
 
 
+def evaluate_each(env: Env, policy: MultiPolicy, key: Array | None = None) -> list[dict[str, float]]:
+    """Evaluate the policies of several drones that fly together, each over its own drones.
+
+    Args:
+        env: Environment without automatic resets; each world flies from one initial state.
+        key: Random key of the initial states; None for the held-out ones.
+
+    Returns:
+        For each policy ``success`` and ``reward`` as of ``evaluate``, and the share of its drones for which an outcome
+        of the task came true, such as ``won``, ``collided`` or ``disabled`` in ``head_to_head``.
+    """
+    check_policy(policy, env)
+    key = held_out_key() if key is None else key
+    check_key(key)
+    flight = jax.device_get(fly_episodes(env, policy, key))
+    who = np.asarray(policy.of_drones(env.sim.n_worlds, env.sim.n_drones))
+    values = {"success": _succeeded(env, flight), "reward": flight["reward"], **flight["outcomes"]}
+    return [{name: float(x[who == i].mean()) for name, x in values.items()} for i in range(len(policy.members))]
+
+
 def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: int = 1) -> list[dict[str, float]]:
     """Return the metrics of ``evaluate`` for each block of worlds; all blocks begin from the same initial states.
 
@@ -164,17 +155,21 @@ def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: i
     return [_metrics(env, flight, i, slice(i * n_worlds, (i + 1) * n_worlds)) for i in range(n_blocks)]
 
 
+def _n_final_steps(env: Env, flight: dict[str, Any]) -> int:
+    return 1 if "succeeded" in flight else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
+
+
+def _succeeded(env: Env, flight: dict[str, Any]) -> np.ndarray:
+    if "succeeded" in flight:
+        return flight["succeeded"]
+    error = flight["error"][-_n_final_steps(env, flight) :]
+    return np.all(error < env.task.tolerance, axis=0) & ~flight["over"][-1][:, None]
+
+
 def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
-    has_own_criterion = "succeeded" in flight
-    n_final_steps = 1 if has_own_criterion else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    over_by_step = flight["over"][:, worlds]
+    over_by_step, succeeded = flight["over"][:, worlds], _succeeded(env, flight)[worlds]
     n_steps = 1 + (~over_by_step[:-1]).sum(axis=0)
-    error, is_over = flight["error"][-n_final_steps:, worlds], over_by_step[-1]
-    succeeded = (
-        flight["succeeded"][worlds]
-        if has_own_criterion
-        else np.all(error < env.task.tolerance, axis=0) & ~is_over[:, None]
-    )
+    error, is_over = flight["error"][-_n_final_steps(env, flight) :, worlds], over_by_step[-1]
     crashed = is_over[:, None] & ~succeeded
     error = error[:, ~np.any(crashed, axis=-1)]
     error = error[~np.isnan(error)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ WEIGHT_NAMES = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""
 LIMIT_NAMES = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
-COUNT_NAMES = ("memory", "demonstrations")
+COUNT_NAMES = ("memory", "demonstrations", "opponents")
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 MAX_COUNT, MAX_SIZE = 2**26, 2**14
 """Largest whole number, and largest size of a layer or a memory."""
@@ -45,6 +46,8 @@ def check_hyperparameters(config: Any) -> None:
         value, default = getattr(config, field.name), field.default
         if field.name == "rewards":
             value = _check_factors(value)
+        elif field.name == "rivals":
+            value = _check_folders(field.name, value)
         elif isinstance(default, tuple):
             value = _check_sizes(field.name, value)
         elif field.name in CHOICES_BY_NAME:
@@ -68,6 +71,12 @@ def _check_text(name: str, value: object) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"expected {name} as a text, got {value!r}. Use for example 'out/hover'.")
     return value
+
+
+def _check_folders(name: str, value: object) -> tuple[str, ...]:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(x, str) for x in value):
+        raise ConfigError(f'expected {name} as a list of folders of runs, got {value!r}. Use for example ["out/race"].')
+    return tuple([str(Path(x).resolve()) for x in value])  # so that the run can be resumed from any folder
 
 
 def _check_factors(value: Any) -> tuple[tuple[str, float], ...]:

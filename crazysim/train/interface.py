@@ -127,14 +127,25 @@ def describe_env(env: Env, sizes: Mapping[str, int] | None = None) -> dict[str, 
 def check_policy(policy: Any, env: Env) -> None:
     """Check that a policy is a function, and that the interface of a trained one is that of an environment.
 
-    A policy of a task also flies a task whose class is derived from it.
+    A policy of a task also flies a task whose class is derived from it. Members of a ``MultiPolicy`` need no more than
+    their own observations, of the task of their training.
     """
     check_callable(policy, env)
-    interface = getattr(policy, "interface", None)
-    if isinstance(interface, Interface):
+    is_multiple = hasattr(policy, "members")
+    if is_multiple:
+        policy.of_drones(env.sim.n_worlds, env.sim.n_drones)
+    for member in policy.members if is_multiple else (policy,):
+        interface = getattr(member, "interface", None)
+        if not isinstance(interface, Interface):
+            continue
         other = Interface.read(describe_env(env))
-        if interface.task in [vars(base).get("name") for base in type(env.task).__mro__]:
-            other = dataclasses.replace(other, task=interface.task)
+        if is_multiple:
+            known = tuple([x for x in other.observations if x[0] in interface.sizes])
+            other = dataclasses.replace(other, observations=known)
+        for base in type(env.task).__mro__:
+            if interface.task is not None and vars(base).get("name") == interface.task:
+                code = task_digest(base) if is_multiple else other.task_code
+                other = dataclasses.replace(other, task=interface.task, task_code=code)
         interface.require(other, "an environment")
 
 

@@ -25,9 +25,21 @@ from crazysim.errors import ConfigError, expect, require
 from crazysim.train.convolution import images_of
 from crazysim.train.critic import PRIVILEGED_CRITICS, critic_input, critic_obs, policy_obs, rescale_value, return_std
 from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.interface import check_policy
 from crazysim.train.mlp_kernel import choose_mlp
-from crazysim.train.networks import ApplyLayers, Network, Policy, Weights, choose_network, forward, init_weights, unroll
+from crazysim.train.networks import (
+    ApplyLayers,
+    Network,
+    Policies,
+    Policy,
+    Weights,
+    choose_network,
+    forward,
+    init_weights,
+    unroll,
+)
 from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
+from crazysim.train.policies import MultiPolicy, known_obs
 from crazysim.train.seeds import Step, for_each_seed, rollout_seeds, split_blocks, split_keys, stack_configs
 
 LEAST_STD = 0.1
@@ -81,6 +93,15 @@ class Config:
     demonstrations: int = 0
     """Iterations at the start in which the policy learns the actions of the task's ``demonstrate`` where it flies
     itself, and the value function its returns."""
+    opponents: int = 0
+    """Drones of each world, its last ones, that earlier versions of the policy or ``rivals`` fly; the policy learns
+    from the others. Each version and each rival flies in an equal share of the worlds. 0 if it flies all drones."""
+    versions: int = 8
+    """Number of earlier versions that are kept for ``opponents``, the latest ones. At the start all are the first."""
+    version_every: int = 10
+    """Iterations from one version to the next."""
+    rivals: tuple[str, ...] = ()
+    """Folders of runs whose policies, without memory, are opponents from the start and do not change."""
     rewards: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
     """Factors of terms of the reward in training, such as ``{"progress": 3.0}``; other terms stay as they are."""
 
@@ -119,6 +140,12 @@ class Agent(PyTree):
     """Function that computes the layers after the network of the policy."""
     apply_critic_layers: ApplyLayers = static()
     """Function that computes the layers after the network of the value function."""
+    n_learners: int | None = static(default=None)
+    """Number of drones of a world, its first ones, that the policy flies; None for all."""
+    versions: Any = ()
+    """``Policy`` of all earlier versions, stacked, which fly the other drones; ``()`` without opponents."""
+    rivals: tuple[Policy, ...] = ()
+    """Other policies that fly them."""
 
     def observe(self, obs: Obs, config: Config) -> tuple[Array, Array]:
         """Join the observations of policy and critic: as they are, and normalised. (n_worlds, n_drones, k) each"""
@@ -126,8 +153,9 @@ class Agent(PyTree):
         return raw_obs, self.stats.normalize(raw_obs)
 
     def estimate_value(self, obs: Array, memory: Any, config: Config) -> tuple[Array, Any]:
-        """Estimate the return from normalised observations, (..., k) -> (...), and advance the critic's memory."""
+        """Estimate the returns of the drones that learn from normalised observations, and advance the memory. (...)"""
         x = critic_input(obs, config.critic)
+        x = x[..., : self.n_learners, :]
         output, memory = forward(self.critic_network, self.value, x, memory, self.apply_critic_layers)
         return output[..., 0] * return_std(self.returns) + self.returns.mean, memory
 
@@ -187,6 +215,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
     if config.demonstrations:
         check_demonstration(env)
+    rivals = load_opponents(env, config, env.sim.n_worlds // len(configs)) if config.opponents else ()
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
     state, hidden = env.reset(k_env), config.hidden if network is None else ()
     terms, names = terms_of(state.info), dict(config.rewards)
@@ -211,7 +240,12 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(parameters)
         stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
         networks = network, critic_network, apply_layers, apply_critic_layers
-        return Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, *networks)
+        agent = Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, *networks)
+        if not config.opponents:
+            return agent
+        n = config.versions
+        versions = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), agent.as_policy())
+        return agent.replace(n_learners=env.sim.n_drones - config.opponents, versions=versions, rivals=rivals)
 
     raw_obs = split_blocks(critic_obs(state.obs, config.critic), len(configs))
     agents = for_each_seed(init_agent, k_policy, k_value, k_agent, raw_obs)
@@ -219,8 +253,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
 
 def _initial_memory(agents: Agent, state: EnvState) -> tuple[Any, Any]:
-    batch = state.reward.shape
-    return agents.network.make_memory(*batch), agents.critic_network.make_memory(*batch)
+    batch = state.reward[:, : agents.n_learners].shape
+    return agents.network.make_memory(*state.reward.shape), agents.critic_network.make_memory(*batch)
 
 
 @partial(jax.jit, static_argnames=("env", "configs"))
@@ -258,6 +292,8 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     agents, metrics = for_each_seed(
         learn, agents, config, records, *blocks, k_learn, imitates, axes=axes, mesh=env.sim.mesh
     )
+    if config.opponents:
+        agents = for_each_seed(partial(keep_version, config, learner.iteration + 1), agents)
     return Learner(agents, state, memory, learner.iteration + 1), metrics
 
 
@@ -269,14 +305,23 @@ def act(
     key: Array,
     show: Callable[[Obs], Array] | None = None,
 ) -> tuple[Array, Any, Any]:
-    """Draw an action, and return it with the memories of policy and critic after the step."""
+    """Draw an action, and return it with the memories of policy and critic after the step; opponents do not explore."""
+    n = agent.n_learners
     raw_obs, x = agent.observe(obs, config)
-    output, policy_memory = forward(agent.network, agent.policy, x[..., : agent.n_obs], memory[0], agent.apply_layers)
     value, value_memory = agent.estimate_value(x, memory[1], config)
+    own_obs, own_memory = x[..., :n, : agent.n_obs], jax.tree.map(lambda m: m[:, :n], memory[0])
+    output, policy_memory = forward(agent.network, agent.policy, own_obs, own_memory, agent.apply_layers)
     mean = agent.network.squash(output)
     action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
     shown = None if show is None else jnp.clip(show(policy_obs(obs, config.critic)), -1.0, 1.0).astype(mean.dtype)
-    extras = raw_obs, x, action, log_prob(mean, agent.log_std, action), value, value_memory, shown
+    # A critic of all drones also learns from the observations of the opponents.
+    seen = x if config.critic.startswith("all_drones") else x[..., :n, :]
+    shown = None if shown is None else shown[..., :n, :]
+    extras = raw_obs[..., :n, :], seen, action, log_prob(mean, agent.log_std, action), value, value_memory, shown
+    if n is not None:
+        others = jax.tree.map(lambda x: x[:, n:], (policy_obs(obs, config.critic), memory[0]))
+        results = (action, policy_memory), fly_opponents(agent, *others)
+        action, policy_memory = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *results)
     return action, (policy_memory, value_memory), extras
 
 
@@ -288,11 +333,12 @@ def record(agent: Agent, config: Config, step: Step, extras: Any) -> tuple[Sampl
     is_cut_off = (step.truncated & ~step.terminated)[:, None]
     factors: Any = config.rewards
     scaled = {name: x * factors[name] if name in factors else x for name, x in step.terms.items()}
-    reward = sum_terms(scaled) if factors else step.reward
+    reward = (sum_terms(scaled) if factors else step.reward)[..., : agent.n_learners]
     reward = reward + config.discount * jnp.where(is_cut_off, final_value, 0.0)
     done = jnp.broadcast_to(step.done[:, None], reward.shape)
     # Means would make the devices communicate in each step.
-    outcome = {"reward": step.reward, "terminated": step.terminated, "error": step.error}
+    own_reward, error = (x[..., : agent.n_learners] for x in (step.reward, step.error))
+    outcome = {"reward": own_reward, "terminated": step.terminated, "error": error}
     return Sample(obs, action, action_log_prob, value, reward, done, shown), raw_obs, outcome
 
 
@@ -318,7 +364,8 @@ def learn(
     targets = (targets - returns.mean) / return_std(returns)
     parameters = (agent.policy, agent.log_std, rescale_value(agent.value, agent.returns, returns))
     # Epochs of updates on minibatches.
-    data = samples, advantages, targets, jax.tree.map(lambda x: x[None], memory)
+    own_memory = jax.tree.map(lambda x: x[:, : agent.n_learners], memory)
+    data = samples, advantages, targets, jax.tree.map(lambda x: x[None], own_memory)
     loss = partial(compute_loss, agent, config, imitates)
     parameters, optimizer, losses = run_epochs(loss, parameters, agent.optimizer, data, config, key)
     # Statistics of the observations, and metrics.
@@ -359,7 +406,8 @@ def compute_loss(
     policy, log_std, value = parameters
     sample, advantage, target, memory = minibatch
     policy_memory, value_memory = jax.tree.map(lambda x: x[0], memory)
-    obs, value_obs, done = sample.obs[..., : agent.n_obs], critic_input(sample.obs, config.critic), sample.done
+    obs, done = sample.obs[..., : agent.n_learners, : agent.n_obs], sample.done
+    value_obs = critic_input(sample.obs, config.critic)[..., : agent.n_learners, :]
     mean = agent.network.squash(unroll(agent.network, policy, obs, policy_memory, done, agent.apply_layers))
     values = unroll(agent.critic_network, value, value_obs, value_memory, done, agent.apply_critic_layers)[..., 0]
     ratio = jnp.exp(log_prob(mean, log_std, sample.action) - sample.log_prob)
@@ -373,6 +421,54 @@ def compute_loss(
     value_loss = 0.5 * jnp.square(values - target).mean()
     total_loss = -objective + config.value_weight * value_loss - config.entropy * log_std.sum()
     return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
+
+
+def keep_version(config: Config, iteration: Array, agent: Agent) -> Agent:
+    """Replace the oldest version by the policy if one is due after an iteration."""
+    version, rest = jnp.divmod(iteration, config.version_every)
+    is_next = (rest == 0) & (jnp.arange(config.versions) == version % config.versions)
+    versions = jax.tree.map(
+        lambda old, new: jnp.where(is_next.reshape(-1, *[1] * new.ndim), new, old), agent.versions, agent.as_policy()
+    )
+    return agent.replace(versions=versions)
+
+
+def fly_opponents(agent: Agent, obs: Obs, memory: Any) -> tuple[Array, Any]:
+    """Return the actions of the opponents: the worlds are divided among the versions, and then the rivals."""
+    n_versions = len(agent.versions.stats.mean)
+    share = len(jax.tree.leaves(obs)[0]) // (n_versions + len(agent.rivals))
+    n = share * n_versions
+    action, own_memory = Policies(agent.versions).act(*jax.tree.map(lambda x: x[:n], (obs, memory)))
+    actions, memory = [action], jax.tree.map(lambda new, old: jnp.concatenate([new, old[n:]]), own_memory, memory)
+    for i, rival in enumerate(agent.rivals):
+        worlds = slice(n + i * share, n + (i + 1) * share)
+        actions.append(rival({name: x[worlds] for name, x in known_obs(rival, obs).items()}))
+    return jnp.concatenate(actions), memory
+
+
+def load_opponents(env: Env, config: Config, n_worlds: int) -> tuple[Policy, ...]:
+    """Return the rivals, after checking that a drone is left that learns, and that all opponents get equal shares."""
+    from crazysim.train.training import load_policy
+
+    n_drones, n_shares = env.sim.n_drones, config.versions + len(config.rivals)
+    require(
+        config.opponents < n_drones,
+        f"expected fewer opponents than the {n_drones} drones of a world, got {config.opponents}. Use --set n_drones="
+        f"{config.opponents + 1}, or opponents=0.",
+    )
+    require(
+        n_worlds % n_shares == 0,
+        f"expected a number of worlds that {config.versions} versions and {len(config.rivals)} rivals divide, got "
+        f"{n_worlds}. Use --worlds {n_shares * max(n_worlds // n_shares, 1)}.",
+    )
+    rivals = tuple([load_policy(folder)[0] for folder in config.rivals])
+    for rival in rivals:
+        check_policy(MultiPolicy.of([rival]), env)
+    require(
+        not any(rival.has_memory for rival in rivals),
+        f"expected rivals without memory, got {', '.join(config.rivals)}. Use policies trained with memory=0.",
+    )
+    return rivals
 
 
 def check_demonstration(env: Env) -> None:

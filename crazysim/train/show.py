@@ -23,9 +23,10 @@ from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_text
 from crazysim.storage import MAX_TEXT_BYTES, as_path, open_file, wrap_read_errors, write_figure
-from crazysim.train.evaluation import act, as_tree, fly_episodes, held_out_key, initial_memory
+from crazysim.train.evaluation import fly_episodes, held_out_key
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
+from crazysim.train.policies import act, as_tree, initial_memory
 from crazysim.train.training import CURVE_FILE
 
 DEPTH_COLORS = ((10, 8, 30), (90, 20, 110), (200, 60, 70), (250, 160, 40), (255, 250, 190))

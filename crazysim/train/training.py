@@ -442,7 +442,9 @@ class _Training:
         )
         self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
         best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
-        point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
+        # Success against itself does not say how strong a policy is, so that the latest one of a league is kept.
+        is_league = bool(self.config.config.get("opponents"))
+        point["kept"] = is_league or point["check"] >= least_kept_success(best_check, n_starts)
         best_policy = policy if point["kept"] else self.kept_policy
         if is_first_host():
             checkpoint.save(self.folder / POLICY_FILE, best_policy, self.meta | description)

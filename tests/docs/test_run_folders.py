@@ -31,7 +31,9 @@ def command_folders(code):
         if program != "crazysim" or arguments[0] not in commands.choices:
             continue
         options = parser.parse_args(arguments)
-        if options.command != "train":
+        if getattr(options, "policies", None):
+            yield from ((None, False, folder) for folder in options.policies)
+        elif options.command != "train":
             yield None, False, options.policy if options.command == "live" else options.folder
         elif (
             options.task != "list" and not options.host_id and not options.check

@@ -195,7 +195,8 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
 def collision_placements(sim: Sim) -> list[StagePlacement]:
     """Return the stage after each physics step in which drones that touch each other fail; none for a single drone.
 
-    It is for an ``OutcomeTask``. Drones whose flights are over collide with nothing.
+    It is for an ``OutcomeTask``; a state ``collided`` of the task is set, too. Drones whose flights are over collide
+    with nothing.
     """
     if sim.n_drones == 1:
         return []
@@ -209,7 +210,8 @@ def collision_placements(sim: Sim) -> list[StagePlacement]:
         far_pos = 1000.0 * (1 + np.arange(len(is_over)))[:, None] * np.array([0.0, 0.0, 1.0])
         query_pos = jnp.where(is_over[:, None], far_pos.astype(s.pos.dtype), s.pos)
         collides = contacts(data.replace(states=s.replace(pos=query_pos))).any & ~is_over
-        record = record.replace(failure=record.failure | collides)
+        names = {"failure", "collided"} & vars(record).keys()
+        record = record.replace(**{name: getattr(record, name) | collides for name in names})
         return data.replace(plugins=data.plugins | {TASK_RECORD_NAME: record})
 
     return [StagePlacement(collide, before="increment_steps", name=f"{TASK_RECORD_NAME}_collisions")]

@@ -33,6 +33,7 @@ from crazysim.envs.tracks import (
     gate_body,
     gates_of_track,
     random_course,
+    ranks,
     start_offsets,
 )
 from crazysim.errors import require
@@ -80,6 +81,8 @@ class Race(ProgressTask, OutcomeTask):
     film_view = {"elevation": -50}
     check_freq: ClassVar[int | None] = None
     """Rate at which gates, contacts and limits are checked, Hz; None for every physics step."""
+    shuffles: ClassVar[bool] = False
+    """Whether drones draw their places at the start, and in practice their gates."""
 
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3, as in the table above."""
@@ -100,7 +103,7 @@ class Race(ProgressTask, OutcomeTask):
     practice: bool = False
     """True to start anywhere on the course, for learning: with equal probability at the start or just behind any gate
     except the last. The gates up to there count as passed. Several drones all begin at the start, or behind different
-    gates."""
+    gates, and one of them at the start if there are as many drones as gates."""
 
     passed: Array = state((), dtype=np.int32)
     """Number of gates passed in all laps."""
@@ -138,9 +141,9 @@ class Race(ProgressTask, OutcomeTask):
 
     def install(self, sim: Sim) -> None:
         require(
-            not self.practice or sim.n_drones < max(self.course.n_gates, 2),
-            f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.course.n_gates} "
-            f"gates: drones start behind different gates. Use practice=False.",
+            not self.practice or sim.n_drones <= self.course.n_gates,
+            f"expected at most as many drones as gates for practice, got {sim.n_drones} drones and "
+            f"{self.course.n_gates} gates: drones start behind different gates. Use practice=False.",
         )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.course, sim.n_drones, float(jitter), self.level == 3)
@@ -201,6 +204,8 @@ class Race(ProgressTask, OutcomeTask):
             sizes["course"] = count_random_numbers(course)
         if self.practice:
             sizes |= {"passed": 1, "behind": (n_drones, 2)}
+        if self.shuffles:
+            sizes["places"] = n_drones
         x = draw(key, **sizes)
         # Displaced objects and start, and other moments of inertia.
         start = np.asarray(course.start, float).astype(dtype)
@@ -208,12 +213,15 @@ class Race(ProgressTask, OutcomeTask):
             data, start = self._displace_objects(data, x)
         if self.level >= 1:
             data = data.replace(params=_randomize_inertia(data.params, 2 * x["inertia"] - 1))
-        pos, rpy = self.place_start(start + start_offsets(n_drones).astype(dtype), x["start"])
+        places: Any = ranks(x["places"], n_drones) if self.shuffles else np.arange(n_drones, dtype=np.int32)
+        offsets = pick_entry(start_offsets(n_drones).astype(dtype), jnp.asarray(places))
+        pos, rpy = self.place_start(start + offsets, x["start"])
         vel = jnp.zeros((), dtype)
         # Practice starts behind any gate.
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
-            passed_gates = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)
+            first = int(n_drones < course.n_gates)  # else one of the drones begins at the start
+            passed_gates = first + (passed - first + places) % max(course.n_gates - first, 1)
             passed = jnp.where(passed > 0, passed_gates, 0)
             pos_behind, vel = _pos_behind_gate(data, passed, x["behind"])
             pos = jnp.where(passed[..., None] > 0, pos_behind, pos)

@@ -24,8 +24,8 @@ from crazysim.envs.tasks.goals import FLOOR, GoalTask
 from crazysim.errors import ConfigError, require
 from crazysim.lab.live.loop import Live
 from crazysim.storage import MAX_TEXT_BYTES, read_text
-from crazysim.train.evaluation import act, initial_memory
 from crazysim.train.interface import check_policy
+from crazysim.train.policies import act, initial_memory
 
 ARRIVAL_DISTANCE = 0.15
 """Distance from a listed goal at which a drone continues to the next one, m."""

@@ -22,7 +22,7 @@ from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_text
 from crazysim.storage import write_figure
-from crazysim.train.evaluation import act, initial_memory
+from crazysim.train.policies import act, initial_memory
 
 SAMPLE_TIME = 0.01
 """Time between samples of a flight, s."""
