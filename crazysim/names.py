@@ -100,6 +100,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.sensors.range_finder": "RangeFinder",
         "crazysim.plugins.sensors.sensor": "Samples Sensor",
         "crazysim.plugins.sensors.triad": "Triad",
+        "crazysim.scene.appearance": "RandomColors",
     },
     "crazysim.plugins.vehicles": {
         "crazysim.lab.vehicles.car_params": "CarParams",

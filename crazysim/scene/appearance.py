@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.typing import DTypeLike
 
+from crazysim.core.data import SimData
+from crazysim.core.random import uniform, world_keys
+from crazysim.core.settings import check_settings, setting
 from crazysim.scene.first_hit import Target
 from crazysim.scene.hit_color import MAX_LEVELS, Light, Paint, View
 from crazysim.scene.visual_geoms import DEFAULT_COLOR
@@ -25,11 +29,58 @@ TEXTURED_KINDS = ("plane", "box")
 """Kinds of geoms on which textures are drawn; other geoms have the mean colour of their texture."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RandomColors:
+    """Colours and light that differ in every world and episode, for policies that fly by colour."""
+
+    surfaces: float = setting(default=0.3, low=0.0, high=1.0)
+    """Largest change of red, green and blue of the floor and of each object and drone, a share of their values."""
+    lights: float = setting(default=0.3, low=0.0, high=1.0)
+    """Largest change of the brightness of each light, a share of it."""
+    tilt: float = setting(default=20.0, low=0.0, high=80.0)
+    """Largest angle by which the directions of lights change, degrees."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+    def apply(self, paint: Paint, data: SimData, body_index: Sequence[int], n_lights: int) -> Paint:
+        """Return tables with rows for each world; see ``color_at_hit``.
+
+        Args:
+            paint: Tables of the scene.
+            data: Data of all worlds, for their random keys.
+            body_index: ``Target.body_index`` of each geom.
+            n_lights: Number of lights.
+        """
+        # The keys of the first step, so that an episode keeps its colours.
+        first = data.replace(core=data.core.replace(steps=jnp.zeros_like(data.core.steps)))
+        n_bodies, dtype = max(body_index, default=0) + 1, paint.looks.dtype
+        draw = jax.vmap(lambda key: uniform(key, (n_bodies * 3 + n_lights * 4,), dtype))
+        numbers = 2 * draw(world_keys(first, "colors")) - 1
+        by_body = numbers[:, : n_bodies * 3].reshape(-1, n_bodies, 3)[:, np.asarray(body_index, int)]
+        by_light = numbers[:, n_bodies * 3 :].reshape(-1, n_lights, 4)
+        looks = jnp.broadcast_to(paint.looks[: len(body_index)], (*by_body.shape[:2], paint.looks.shape[1]))
+        looks = looks.at[..., :3].multiply(1 + self.surfaces * by_body)
+        # A direction tilts by a part of the unit ball that is perpendicular to it.
+        pos, direction, colors, rest = jnp.split(paint.lights[:n_lights], (3, 6, 15), axis=-1)
+        shift = by_light[..., :3] / jnp.maximum(jnp.linalg.norm(by_light[..., :3], axis=-1, keepdims=True), 1)
+        shift = shift - jnp.sum(shift * direction, axis=-1, keepdims=True) * direction
+        direction = direction + np.tan(np.radians(self.tilt)) * shift
+        direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-6)
+        colors = colors * (1 + self.lights * by_light[..., 3:])
+        pos, rest = (jnp.broadcast_to(x, (*by_light.shape[:2], x.shape[-1])) for x in (pos, rest))
+        lights = jnp.concatenate([pos, direction, colors, rest], axis=-1)
+        tables = (
+            x.reshape(-1, x.shape[-1]) if x.size else y for x, y in ((looks, paint.looks), (lights, paint.lights))
+        )
+        return paint._replace(**dict(zip(("looks", "lights"), tables, strict=True)))
+
+
 class Appearance:
     """Materials, lights, textures and sky of a compiled scene."""
 
-    def __init__(self, model: mujoco.MjModel, shadows: bool):
-        self._model = model
+    def __init__(self, model: mujoco.MjModel, shadows: bool, random_colors: RandomColors | None = None):
+        self._model, self._random_colors = model, random_colors
         data = mujoco.MjData(model)
         for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
             update(model, data)
@@ -37,35 +88,35 @@ class Appearance:
         head, spot = model.vis.headlight, mujoco.mjtLightType.mjLIGHT_SPOT
         kinds = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), int(spot)
         lights = [k for k in range(model.nlight) if model.light_active[k] and int(model.light_type[k]) in kinds]
-        self.lights = [
+        lights_of_scene = [
             Light(False, int(model.light_type[k]) == int(spot), shadows and bool(model.light_castshadow[k]))
             for k in lights
         ]
-        """Lights of the scene, the headlight first."""
         rows = [
             [*data.light_xpos[k], *data.light_xdir[k], *model.light_ambient[k], *model.light_diffuse[k],
              *model.light_specular[k], *model.light_attenuation[k], model.light_exponent[k],
              np.cos(np.deg2rad(model.light_cutoff[k]))] for k in lights
         ]  # fmt: skip
         if head.active:
-            self.lights.insert(0, Light(True, False))
+            lights_of_scene.insert(0, Light(True, False))
             rows.insert(0, [*np.zeros(6), *head.ambient, *head.diffuse, *head.specular, 1, 0, 0, 0, -1])
         self._light_rows = np.array(rows).reshape(-1, 20)
         # Sky, and haze before it where a plane is infinite.
         skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
-        self.has_sky = len(skies) > 0
-        """Whether rays that meet nothing have the colour of the sky."""
-        self._sky = _read_texture(model, skies[0]) if self.has_sky else np.zeros((1, 1, 3))
+        has_sky = len(skies) > 0
+        self._sky = _read_texture(model, skies[0]) if has_sky else np.zeros((1, 1, 3))
         is_infinite = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & ~model.geom_size[:, :2].any(axis=1)
         plane = int(np.argmax(is_infinite))
-        self.has_haze = bool(self.has_sky and is_infinite.any() and data.geom_xmat[plane, 8] > 1 - 1e-6)
-        """Whether a level plane disappears in haze at the horizon."""
-        self._plane_height = float(data.geom_xpos[plane, 2]) if self.has_haze else 0.0
+        has_haze = bool(has_sky and is_infinite.any() and data.geom_xmat[plane, 8] > 1 - 1e-6)
+        self._plane_height = float(data.geom_xpos[plane, 2]) if has_haze else 0.0
+        self.flags = tuple(lights_of_scene), has_sky, has_haze, random_colors is not None
+        """First arguments of ``color_at_hit``."""
 
-    def paint(self, targets: Sequence[Target], pixel_angle: float, dtype: DTypeLike) -> Paint:
-        """Return the tables of the scene.
+    def paint(self, data: SimData, targets: Sequence[Target], pixel_angle: float) -> Paint:
+        """Return the tables of the scene, or of the scene in each world.
 
         Args:
+            data: Data of all worlds.
             targets: ``Targets.all_geoms``.
             pixel_angle: Angle between neighbouring pixels in the middle of the image, rad.
         """
@@ -108,15 +159,20 @@ class Appearance:
         )
         # Empty tables get a row of zeros, since an array without rows has no memory.
         arrays = [np.asarray(x if len(x) else np.zeros((1, np.shape(x)[1]))) for x in tables]
-        return Paint(*(jnp.asarray(x, np.int32 if x.dtype.kind == "i" else dtype) for x in arrays))
+        dtype = data.states.pos.dtype
+        paint = Paint(*(jnp.asarray(x, np.int32 if x.dtype.kind == "i" else dtype) for x in arrays))
+        bodies = [target.body_index for target in targets]
+        return (
+            paint if self._random_colors is None else self._random_colors.apply(paint, data, bodies, len(self.flags[0]))
+        )
 
     def _view(self, pixel_angle: float) -> View:
         vis, far = self._model.vis, self._model.vis.map.zfar * self._model.stat.extent
         share = vis.map.haze
         slope = np.arctan2(1, share)
         densest = np.sqrt(0.5) * share * np.sin(slope) / np.sin(0.75 * np.pi - slope)
-        ambient = 0.0 if self.lights else AMBIENT_WITHOUT_LIGHTS
-        radius = far * SKY_RADIUS if self.has_sky else far
+        ambient = 0.0 if self.flags[0] else AMBIENT_WITHOUT_LIGHTS
+        radius = far * SKY_RADIUS if self.flags[1] else far
         numbers = (
             pixel_angle,
             radius,

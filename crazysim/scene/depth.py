@@ -292,15 +292,20 @@ def build_depth_fn(
         n_worlds, worlds_per_batch = data.states.pos.shape[0], max(1, max_rays // n_rays)
         if n_worlds <= worlds_per_batch:
             return cast_in_worlds(data, kernels)
-        objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
+        objects, core = None if data.objects is None else data.objects.replace(mocap_ids=None), data.core
+        # Colours may differ by world and episode.
+        keyed_fields = () if appearance is None else ("world_id", "episode", "steps", "drone_id", "rng_key")
+        keys = {name: getattr(core, name) for name in keyed_fields if name != "rng_key" or core.rng_key.ndim}
 
         def cast_in_world(poses: MocapPoses) -> Hits:
-            pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
+            pos, quat, objects, keys = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
-            world_data = data.replace(states=states, objects=objects)
+            world_data = data.replace(states=states, objects=objects, core=core.replace(**keys))
             return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data, kernels))
 
-        return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=worlds_per_batch)
+        return jax.lax.map(
+            cast_in_world, (data.states.pos, data.states.quat, objects, keys), batch_size=worlds_per_batch
+        )
 
     return depth
 

@@ -61,8 +61,8 @@ class LightRow(NamedTuple):
     """Cosine of the largest angle between its axis and a ray of light."""
 
     @classmethod
-    def read(cls, table: Array, index: int) -> LightRow:
-        row = table_rows(table, jnp.int32(index))
+    def read(cls, table: Array, index: Array) -> LightRow:
+        row = table_rows(table, index)
         return cls(*(row[k : k + 3] for k in range(0, 18, 3)), *row[18:])
 
 
@@ -110,6 +110,7 @@ def color_at_hit(
     lights: Sequence[Light],
     has_sky: bool,
     has_haze: bool,
+    is_per_world: bool,
     surfaces: Sequence[Surface],
     n_pixels: int,
     n_cameras: int,
@@ -122,6 +123,7 @@ def color_at_hit(
         lights: Lights in the order of ``Paint.lights``.
         has_sky: Whether rays that meet nothing have the colour of the sky; they are black otherwise.
         has_haze: Whether a plane disappears in haze at the horizon.
+        is_per_world: Whether ``Paint.looks`` and ``Paint.lights`` have rows for each world, one world after the other.
         surfaces: ``Targets.surfaces``.
         n_pixels: Number of rays of a camera.
         n_cameras: Number of cameras of a world.
@@ -137,13 +139,15 @@ def color_at_hit(
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     view = View(*table_rows(paint.view, jnp.int32(0)))
     zero = jnp.zeros_like(distance)
+    scene = world if is_per_world else jnp.int32(0)
     row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
 
     def shade(_: Components) -> Components:
         *normal, u, v, u_rate, v_rate = surface_at_hit(
             _normal_and_texture_position, 7, surfaces, n_pixels, n_cameras, index, *tables[n_paint:]
         )
-        *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, row)
+        look = row + scene * (counts[1] + counts[2])
+        *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, look)
         point = [o + distance * d for o, d in zip(ray.origin, ray.direction, strict=True)]
         to_eye = [-d for d in ray.direction]
         steepness = _dot(normal, to_eye)
@@ -160,7 +164,7 @@ def color_at_hit(
         # OpenGL limits the sum of all lights without shadows, and each light with shadows, which MuJoCo adds to it.
         color, shaded_color = [c * (emission + view.ambient) for c in own_color], [zero] * 3
         for k, light in enumerate(lights):
-            row_of_light = LightRow.read(paint.lights, k)
+            row_of_light = LightRow.read(paint.lights, scene * len(lights) + k)
             parts = _light(light, row_of_light, point, normal, to_eye, back, specular, exponent, without_shadow)
             part = [a * own + b for own, (a, b) in zip(own_color, parts, strict=True)]
             if light.casts_shadow:

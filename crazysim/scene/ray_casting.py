@@ -331,9 +331,8 @@ def cast_rays_in_worlds(
     names = body_names(model, data.core.n_drones if drones else 0)
     color = None
     if appearance is not None:
-        paint = appearance.paint(targets.all_geoms, pixel_angle, camera_poses.dtype)
-        settings = tuple(appearance.lights), appearance.has_sky, appearance.has_haze, targets.surfaces
-        color_fn = functools.partial(color_at_hit, *settings, n_pixels, n_cameras)
+        paint = appearance.paint(data, targets.all_geoms, pixel_angle)
+        color_fn = functools.partial(color_at_hit, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
         (packed,), _ = kernels._map_indices(color_fn, n, [*paint, *tables, *hit_table])
         color = packed.reshape(n_worlds, -1)  # unpacked when its pixels are in the order of the image
     if not targets.all_geoms:

@@ -22,7 +22,7 @@ from crazysim.core.settings import check_image_size
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError, expect, require, short_repr
 from crazysim.scene import build, collision, contact_report, depth, mjx
-from crazysim.scene.appearance import Appearance
+from crazysim.scene.appearance import Appearance, RandomColors
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.object_poses import ListPlugins
@@ -333,6 +333,7 @@ class Scene:
         along: depth.Along = "axis",
         color: bool = False,
         shadows: bool = True,
+        random_colors: RandomColors | None = None,
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
@@ -353,6 +354,7 @@ class Scene:
                 distance from the camera.
             color: Whether to return ``Hits.color``, the colours that MuJoCo's renderer draws.
             shadows: Whether lights of the scene cast shadows, by a second ray of each pixel.
+            random_colors: Changes of the colours in every world and episode; None for the colours of the scene.
         """
         if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
@@ -362,6 +364,7 @@ class Scene:
             objects = (*self.added_objects.movable, *self.visual_model.mocap_bodies)
             cameras = depth.find_cameras(self.mj_model, camera, objects)
         self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
+        color, shadows = check_flag("color", color), check_flag("shadows", shadows)
         if isinstance(camera, depth.DroneCamera):
             # The frame of MuJoCo's cameras: x right, y up, z back.
             rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)
@@ -370,7 +373,7 @@ class Scene:
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
             camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
-            Appearance(self.mj_model, check_flag("shadows", shadows)) if check_flag("color", color) else None,
+            Appearance(self.mj_model, shadows, random_colors) if color else None,
         )  # fmt: skip
 
     def splat_fn(

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from crazysim import Camera, Sim
+from crazysim.plugins.sensors import RandomColors
+from crazysim.scene import depth
 from crazysim.scene.ray_casting import RayKernels
 
 WIDTH, HEIGHT = 96, 72
@@ -140,3 +142,38 @@ def test_a_camera_sees_the_colors_of_moving_objects_and_other_drones():
     assert (images["rgb"][is_sky] > 150).all()
     # In the upper half of the image, the sky becomes darker with the height.
     assert (np.diff(red[1, 1, :15, 0]) >= 0).all()
+
+
+def test_random_colors_differ_by_world_and_episode_and_stay_during_an_episode(monkeypatch):
+    sim = Sim(3, control="attitude")
+    sim.scene.add("sphere", pos=[1.5, 0, 1.2], radius=0.3, rgba=(0.5, 0.5, 0.5, 1))
+    camera = Camera(24, 16, outputs=("rgb", "segmentation"), random_colors=RandomColors(0.4, 0.2))
+    take_images = jax.jit(camera.image_fn(sim))
+    initial_data = sim.data
+
+    def mean_colors(data, take_images=take_images):
+        """Return the mean colour of ball and floor in each world. (3, 2, 3)"""
+        images = jax.device_get(take_images(data))
+        masks = [images["segmentation"] == k for k in (1, 0)]
+        return np.stack([images["rgb"].mean(axis=(1, 2, 3), where=mask[..., None]) for mask in masks], axis=1)
+
+    colors = mean_colors(initial_data)
+    assert np.ptp(colors, axis=0).max(axis=-1).min() > 10
+    assert np.abs(np.diff(colors / colors.mean(axis=-1, keepdims=True), axis=1)).max() > 0.1, "bodies differ"
+    sim.step(1)
+    np.testing.assert_allclose(mean_colors(sim.data.replace(states=initial_data.states)), colors)
+    sim.reset(np.array([True, False, False]))
+    changed = np.abs(mean_colors(sim.data.replace(states=initial_data.states)) - colors).max(axis=(1, 2))
+    assert changed[0] > 5
+    np.testing.assert_allclose(changed[1:], 0)
+    # Worlds that do not fit into memory together have the same colours.
+    monkeypatch.setattr(depth, "MAX_RAYS_OF_KERNEL", 24 * 16)
+    np.testing.assert_allclose(mean_colors(initial_data, jax.jit(camera.image_fn(sim))), colors, atol=1)
+    # Without changes, the colours are those of the scene.
+    unchanged, plain = (
+        mean_colors(
+            initial_data, jax.jit(Camera(24, 16, outputs=("rgb", "segmentation"), random_colors=x).image_fn(sim))
+        )
+        for x in (RandomColors(0, 0, 0), None)
+    )
+    np.testing.assert_allclose(unchanged, plain, atol=0.1)

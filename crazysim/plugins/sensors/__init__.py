@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Samples, Sensor
     from crazysim.plugins.sensors.triad import Triad
+    from crazysim.scene.appearance import RandomColors
 
 __all__ = [
     "GPS",
@@ -43,6 +44,7 @@ __all__ = [
     "MultiRanger",
     "OpticalFlow",
     "Radar",
+    "RandomColors",
     "RangeFinder",
     "RotorSpeeds",
     "Rounded",

@@ -1,9 +1,10 @@
-"""Depth cameras: images of depth, normals and bodies, of all drones, with rate and latency.
+"""Cameras: images of depth, colours, normals and bodies, of all drones, with rate and latency.
 
 The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           noise=None, distortion=None, shadows=True, drones=True, freq=None, latency=0.0, name="camera")
+           noise=None, distortion=None, shadows=True, random_colors=None, drones=True, freq=None, latency=0.0,
+           name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
@@ -25,15 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.arguments import check_flag
 from crazysim.core.settings import setting
 from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
 from crazysim.plugins.sensors.image_sensor import ImageSensor
+from crazysim.scene.appearance import RandomColors
 from crazysim.scene.depth import pixel_directions
 
 
 class Camera(ImageSensor):
-    """Depth camera on every drone, with the pinhole model or a distorting lens, and with noise.
+    """Camera on every drone for depth and colours, with the pinhole model or a distorting lens, and with noise.
 
     A camera within an object sees its inner side: the surface where a ray leaves the object, as with MuJoCo's rays.
     """
@@ -53,6 +54,8 @@ class Camera(ImageSensor):
     """Distortion of the lens; ``fovy`` is the field of view without it. None for none."""
     shadows: bool = True
     """Whether lights cast shadows in colours, by a second ray of each pixel."""
+    random_colors: RandomColors | None = None
+    """Changes of colours and lights in every world and episode, such as ``RandomColors()``; None for none."""
     name: str = "camera"
 
     @property
@@ -74,8 +77,8 @@ class Camera(ImageSensor):
         return self.noise is not None
 
     @property
-    def has_shadows(self) -> bool:
-        return check_flag("shadows", self.shadows)
+    def color_settings(self) -> dict[str, Any]:
+        return {"color": True, "shadows": self.shadows, "random_colors": self.random_colors}
 
     @property
     def far_ratio(self) -> np.ndarray:

@@ -121,9 +121,9 @@ class ImageSensor(Plugin):
         return False
 
     @property
-    def has_shadows(self) -> bool:
-        """Whether lights of the scene cast shadows in colours."""
-        return False
+    def color_settings(self) -> dict[str, Any]:
+        """Settings of ``Scene.depth_fn`` for colours."""
+        return {}
 
     @property
     def baseline(self) -> float:
@@ -200,7 +200,7 @@ class ImageSensor(Plugin):
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
-        color_settings = {"color": bool({*COLORS} & {*self.outputs}), "shadows": self.has_shadows}
+        color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
         cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
         rot = camera.rot
 
