@@ -14,6 +14,7 @@ from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.random import drone_key, uniform
+from crazysim.drones.loading import load_airframe
 from crazysim.engine.stage import stage
 from crazysim.envs.actions import Actions
 from crazysim.envs.tasks import race
@@ -37,8 +38,10 @@ ACTION_NOISE = 0.001
 """Standard deviation of the noise of every number of a command."""
 START_TILT = race.START_JITTER[3:]
 """Largest random roll, pitch and yaw at the start, rad."""
+DRONE_NAME = "cf21B_500"
+"""Airframe."""
 DRONE = (0.07, 0.07, 0.02)
-"""Half lengths of the box of a cf21B_500, m."""
+"""Half lengths of the drone's box, m."""
 GATE_BOXES = np.array(
     [[(0, 0, 0.28), (0.01, 0.36, 0.08)], [(0, 0, -0.28), (0.01, 0.36, 0.08)], [(0, 0, -0.86), (0.05, 0.05, 0.5)]]
     + [[(0, side * 0.28, 0), (0.01, 0.08, 0.36)] for side in (-1, 1)]
@@ -91,9 +94,6 @@ class CompetitionRace(race.Race):
         off_pad = jnp.any(jnp.abs(pos[..., :2] - pad) > PAD, axis=-1)
         low, high = np.array(LOW, pos.dtype), np.array(HIGH, pos.dtype)
         return jnp.any(pos > high, axis=-1) | (jnp.any(pos < low, axis=-1) & off_pad)
-
-    def actions(self, sim: Sim) -> Actions:
-        return Commands(sim)
 
     def touch_fn(self, sim: Sim, objects: Sequence[Handle], floor: bool) -> Callable[[SimData], Array]:
         names = {handle.name for handle in objects}
@@ -156,13 +156,12 @@ class Commands(Actions):
     | ``attitude`` | roll, pitch and yaw within 90 degrees, rad, and collective thrust, N |
     """
 
-    def __init__(self, sim: Sim):
-        thrusts = [4 * float(sim.airframes[0].value(f"rotors.thrust_{end}", ())) for end in ("min", "max")]
-        high = np.array([np.pi / 2] * 3 + [thrusts[1]])
-        self.low, self.high = np.array([*-high[:3], thrusts[0]]), high
-        if sim.control == Control.state:
+    def __init__(self, control: Control):
+        thrusts = [4 * float(load_airframe(DRONE_NAME).value(f"rotors.thrust_{end}", ())) for end in ("min", "max")]
+        self.low, self.high = np.array([[*[side * np.pi / 2] * 3, x] for side, x in zip((-1, 1), thrusts, strict=True)])
+        if control == Control.state:
             self.low, self.high = np.full(13, -np.inf), np.full(13, np.inf)
-        super().__init__(np.zeros(len(self.low)), np.ones(len(self.low)), sim.control)
+        super().__init__(np.zeros(len(self.low)), np.ones(len(self.low)), control)
 
     def command(self, action: Array) -> Array:
         action = jnp.clip(action, self.low.astype(action.dtype), self.high.astype(action.dtype))
@@ -188,7 +187,7 @@ class Config(dict[str, Any]):
 
 def race_config(level: int, control: str) -> Config:
     """Return the configuration that controllers receive, with the entries of lsy_drone_racing's TOML files."""
-    course, drone = Track(), "cf21B_500"
+    course, drone = Track(), DRONE_NAME
     start = {"pos": [*course.start[:2], START_HEIGHT], "rpy": [0.0] * 3, "vel": [0.0] * 3, "ang_vel": [0.0] * 3}
     gates = zip(course.gates_pos, course.gates_rpy, strict=True)
     track = Config(

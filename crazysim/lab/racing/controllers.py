@@ -8,6 +8,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import os
 import random
 import sys
 from abc import ABC, abstractmethod
@@ -22,14 +23,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.race_clock import time_flight
 from crazysim.envs.registry import make
 from crazysim.envs.tasks.race_rules import gates_of, obstacles_of
 from crazysim.envs.tracks import Track
 from crazysim.errors import expect, require
-from crazysim.lab.racing.competition import ACTION_NOISE, FREQ, SIM_FREQ, CompetitionRace, race_config
+from crazysim.lab.racing.competition import (
+    ACTION_NOISE,
+    DRONE_NAME,
+    FREQ,
+    SIM_FREQ,
+    Commands,
+    CompetitionRace,
+    race_config,
+)
 from crazysim.lab.racing.flight import RaceFlight
+
+os.environ.setdefault("SCIPY_ARRAY_API", "1")  # drone_models, which controllers import, needs it before SciPy
 
 PACKAGE = "lsy_drone_racing"
 """Package that controller files import."""
@@ -92,15 +104,16 @@ class Run:
         """The run with its clock, for films and plots."""
         times = np.arange(len(self.pos)) / FREQ
         clock = time_flight(self.track, times, self.pos)
-        return RaceFlight(self.track, "cf21B_500", times, self.pos, self.quat, clock)
+        return RaceFlight(self.track, DRONE_NAME, times, self.pos, self.quat, clock)
 
 
 @functools.cache
 def competition_env(level: int, control: str) -> Env:
     """Return the environment of a level for commands of a level, ``state`` or ``attitude``."""
     task = CompetitionRace(level=level)  # type: ignore[call-arg]
-    return make(task, freq=FREQ, sim_freq=SIM_FREQ, control=control, state_freq=None if control != "state" else FREQ,
-                controller="crazyflow", dynamics="first_principles")  # fmt: skip
+    state_freq = FREQ if control == "state" else None
+    return make(task, freq=FREQ, sim_freq=SIM_FREQ, state_freq=state_freq, actions=Commands(Control(control)),
+                control=control, drone=DRONE_NAME, controller="crazyflow")  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -158,14 +171,18 @@ def _stand_ins(path: Path, package: Path | None) -> dict[str, ModuleType]:
             module.draw_line = _do_nothing  # type: ignore[attr-defined]
     result = {PACKAGE + name: module for name, module in modules.items()}
     if importlib.util.find_spec("crazyflow") is None:
-        result |= {f"crazyflow{name}": importlib.import_module(f"crazysim{name}") for name in CRAZYFLOW_MODULES}
+        for name in CRAZYFLOW_MODULES:
+            # A copy without the path of its submodules, which would be executed again under the other name.
+            own, module = importlib.import_module(f"crazysim{name}"), ModuleType(f"crazyflow{name}")
+            vars(module).update({key: x for key, x in vars(own).items() if key[:2] != "__" or key == "__getattr__"})
+            module.__path__, result[module.__name__] = [], module
     return result
 
 
 def control_of(controller: type[Controller], level: int) -> str:
     """Return the level of the commands of a controller, ``state`` or ``attitude``, by the length of its first one."""
     env = competition_env(level, "attitude")
-    obs = _observations(jax.jit(env.reset)(jax.random.key(0)))
+    obs = _observations(_programs(env)[0](jax.random.key(0)))
     action = np.asarray(controller(obs, {}, race_config(level, "attitude")).compute_control(obs, {}))
     expect(
         action.shape in ((4,), (13,)), "a command of 4 or 13 numbers from compute_control", action.shape,
@@ -186,8 +203,8 @@ def fly_controller(controller: type[Controller], control: str, level: int = 2, s
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002  # controllers may draw from it
     rng = np.random.default_rng(seed)
-    step = _step_of(env)
-    state = jax.jit(env.reset)(jax.random.key(seed))
+    reset, step = _programs(env)
+    state = reset(jax.random.key(seed))
     obs = _observations(state)
     pilot = controller(obs, {}, race_config(level, control))
     poses, n_passed, time = [(obs["pos"], obs["quat"])], 0, 0.0
@@ -197,13 +214,12 @@ def fly_controller(controller: type[Controller], control: str, level: int = 2, s
         had_finished = int(obs["target_gate"]) == -1
         noise = ACTION_NOISE * rng.standard_normal(len(action)).astype(np.float32)
         state = step(state, (action + noise)[None, None])
-        obs = _observations(state)
+        obs, info = _observations(state), {name: x.flat[0] for name, x in jax.device_get(state.info).items()}
         poses.append((obs["pos"], obs["quat"]))
-        n_passed = int(state.info["gates_passed"][0, 0])
-        finished, disabled = int(obs["target_gate"]) == -1, bool(state.info["disabled"][0, 0])
+        n_passed, finished = int(info["gates_passed"]), bool(info["finished"])
         time = time if had_finished else k / FREQ
         # The race ends one command after the last gate, as in the original.
-        ended = had_finished or disabled or bool(state.info["nonfinite"][0])
+        ended = had_finished or bool(info["disabled"] or info["nonfinite"])
         if pilot.step_callback(action, obs, -float(finished), ended, k == env.max_steps, {}) or ended:
             break
     pilot.episode_callback()
@@ -213,12 +229,13 @@ def fly_controller(controller: type[Controller], control: str, level: int = 2, s
 
 
 @functools.cache
-def _step_of(env: Env) -> Any:
-    return jax.jit(env.step)
+def _programs(env: Env) -> tuple[Any, Any]:
+    return jax.jit(env.reset), jax.jit(env.step)
 
 
 def _observations(state: Any) -> dict[str, NDArray]:
-    obs = {name: np.array(state.obs[name][0, 0]).reshape(shape) for name, shape in OBSERVATIONS.items()}
+    values = jax.device_get(state.obs)
+    obs = {name: np.array(values[name][0, 0]).reshape(shape) for name, shape in OBSERVATIONS.items()}
     visited = {name: obs[name] > 0.5 for name in ("gates_visited", "obstacles_visited")}
     return obs | visited | {"target_gate": obs["target_gate"].astype(np.int32)}
 

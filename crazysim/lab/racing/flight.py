@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from crazysim.envs.env import Env
 from crazysim.envs.race_clock import RaceClock, time_flight
 from crazysim.envs.state import EnvState
-from crazysim.envs.tasks.race_rules import race_of
+from crazysim.envs.tasks.race import FOOT_TO_TOP
+from crazysim.envs.tasks.race_rules import POLE_HEIGHT, race_of
 from crazysim.envs.tracks import Track, gate_body, gates_of_track
 from crazysim.errors import optional_import
 from crazysim.lab.racing.time_optimal import Plan
@@ -139,7 +140,7 @@ def media_flight(flight: RaceFlight, dt: float = SAMPLE_TIME) -> tuple[Sim, Flig
 
 
 def track_simulation(track: Track, drone: Any) -> Sim:
-    """Make a simulation of one drone with the gates of a track, each once."""
+    """Make a simulation of one drone with the gates of a track, each once, and its obstacles."""
     sim = Sim(drone=drone, control="rotor_vel")
     bodies = {}
     for gate in gates_of_track(track):
@@ -148,6 +149,9 @@ def track_simulation(track: Track, drone: Any) -> Sim:
         yaw = np.arctan2(gate.rot[1, 0], gate.rot[0, 0])
         quat = [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
         sim.scene.add(gate_body(gate), f"gate{k}", pos=gate.pos, quat=quat, mocap=False)
+    if track.n_obstacles:
+        feet = np.asarray(track.obstacles_pos, float) - FOOT_TO_TOP
+        sim.scene.add("pole", count=track.n_obstacles, pos=feet, height=POLE_HEIGHT, mocap=False)
     return sim
 
 

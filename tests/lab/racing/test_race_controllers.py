@@ -1,5 +1,6 @@
 """Controllers of lsy_drone_racing: loading, the rules of their race, and the ranking."""
 
+import importlib.util
 import json
 import sys
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError
+from crazysim import ConfigError, Sim
 from crazysim.__main__ import main
 from crazysim.lab.racing import competition, controllers, ranking
 
@@ -94,6 +95,14 @@ def test_a_file_needs_one_controller(folder):
     (folder / "empty").mkdir()
     with pytest.raises(ConfigError, match="controller files"):
         ranking.find_pilots([folder / "empty"])
+
+
+@pytest.mark.skipif(importlib.util.find_spec("crazyflow") is not None, reason="Crazyflow itself is used")
+def test_modules_that_crazysim_lacks_are_not_found_in_crazyflow(folder):
+    with controllers.loaded(folder / "pilot.py"):
+        assert importlib.import_module("crazyflow").Sim is Sim
+        with pytest.raises(ModuleNotFoundError):
+            importlib.import_module("crazyflow.envs")  # and crazysim.envs is not executed again
 
 
 def test_controllers_are_ordered_by_time_if_they_finish_half_of_their_runs():
