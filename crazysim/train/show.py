@@ -245,8 +245,8 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
     A world whose episode is over stands still from then on, and its text says how it ended: ``success``, ``crashed``
-    or, at the time limit, ``late``. The film ends a second after the last of them. Drones that would be smaller than 25
-    pixels have a ring of that width.
+    or, at the time limit, ``late``, or how many drones succeeded. The film ends a second after the last of them. Drones
+    that would be smaller than 25 pixels have a ring of that width.
 
     If the policy observes images, the first depth image of the first drone, or else its first segmentation of the
     target, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles then also
@@ -287,6 +287,8 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         if not state.done[world]:
             return ""
         succeeded, is_terminated = find_success(state), bool(state.terminated[world])
+        if succeeded is not None and 0 < (n := int(succeeded[world].sum())) < sim.n_drones:
+            return f": {n} of {sim.n_drones} succeeded"
         has_succeeded = n_steady_steps[world] >= n_hold_steps and not is_terminated
         if has_succeeded if succeeded is None else bool(succeeded[world].all()):
             return ": success"

@@ -73,7 +73,7 @@ class TrainResult:
     duration, s; ``compile_seconds``, the part for compilation, s; ``env_steps``, environment steps of all drones."""
     policy: Policy
     """Kept policy: the latest evaluated policy with a success on the check set within two standard errors of the
-    best."""
+    best; with opponents the latest one."""
     env: Env
     """Environment in which all trainings of the program are evaluated, without automatic resets."""
 

@@ -35,7 +35,7 @@ def against_others(data: SimData, action: Array, last_action: Array) -> dict[str
     own_terms, n_others = dense(data, action, last_action), len(record.success) - 1
     is_active = ~record.flight_over_before
     progress = jnp.where(is_active, record.remaining_way_before - remaining_way(data), 0)
-    place = (len(record.success) - jnp.sum(record.success)) / n_others
+    place = (len(record.success) - jnp.sum(record.success, dtype=np.int32)) / n_others
     others = {
         "ahead": 1.0 * (progress - (jnp.sum(progress) - progress) / n_others),
         "place": 4.0 * record.success * place,
