@@ -25,8 +25,8 @@ AMBIENT_WITHOUT_LIGHTS = 0.3
 """MuJoCo's ambient light in scenes without lights."""
 SKY_RADIUS = 0.7
 """Distance at which MuJoCo draws the sky, divided by ``zfar``."""
-TEXTURED_KINDS = ("plane", "box")
-"""Kinds of geoms on which textures are drawn; other geoms have the mean colour of their texture."""
+TEXTURED_KINDS = ("plane", "box", "hfield", "mesh")
+"""Kinds of geoms on which textures are drawn; round ones, and meshes with coordinates, have the mean colour."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,8 +134,11 @@ class Appearance:
                 texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
                 repeat = np.where(model.mat_texrepeat[material] > 0, model.mat_texrepeat[material], 1.0)
                 repeat = repeat * np.where(model.mat_texuniform[material] & (half > 0), half, 1.0)
-            kind = target.geom.shape.kind
-            shift = 0.5 * (kind == "plane" and not half.all())
+            kind, mesh = target.geom.shape.kind, int(model.geom_dataid[geom])
+            shift = 0.5 * (kind in ("hfield", "mesh") or (kind == "plane" and not half.all()))
+            if kind in ("hfield", "mesh"):
+                repeat = repeat / half
+                kind = "coordinates" if kind == "mesh" and model.mesh_texcoordadr[mesh] >= 0 else kind
             look[:] = *rgba[:3], *shine[:2], SHININESS_SCALE * shine[2], *repeat, shift
             is_flat = texture >= 0 and int(model.tex_type[texture]) == int(mujoco.mjtTexture.mjTEXTURE_2D)
             if texture >= 0 and not (is_flat and kind in TEXTURED_KINDS):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from crazysim.core.branches import compute_where, table_rows
+from crazysim.geometry import Shape
 from crazysim.geometry.points import Components
 from crazysim.rotation import safe_sqrt
 from crazysim.scene.first_hit import (
@@ -143,9 +144,10 @@ def color_at_hit(
     row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
 
     def shade(_: Components) -> Components:
-        *normal, u, v, u_rate, v_rate = surface_at_hit(
-            _normal_and_texture_position, 7, surfaces, n_pixels, n_cameras, index, *tables[n_paint:]
+        surface_numbers = surface_at_hit(
+            _normal_and_texture, 11, surfaces, n_pixels, n_cameras, index, *tables[n_paint:]
         )
+        normal, (u, *u_rates), (v, *v_rates) = surface_numbers[:3], surface_numbers[3:7], surface_numbers[7:]
         look = row + scene * (counts[1] + counts[2])
         *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, look)
         point = [o + distance * d for o, d in zip(ray.origin, ray.direction, strict=True)]
@@ -175,12 +177,16 @@ def color_at_hit(
         first_level, n_levels = table_rows(paint.textures, row)
 
         def draw_texture(color: Components) -> Components:
-            cosine = _dot(ray.direction, back)
-            footprint = distance * view.pixel_angle * cosine * cosine / jnp.maximum(steepness, MIN_COSINE)
-            # The image whose texels are nearest to the size of a pixel.
+            # The image whose texels are nearest to the distance between neighbouring pixels on the surface.
             _, width, height = table_rows(paint.levels, first_level)
-            rate = footprint * jnp.maximum(u_rate * u_scale * width, v_rate * v_scale * height)
-            level = sum(jnp.where(rate > 2 ** (k + 0.5), jnp.int32(1), 0) for k in range(MAX_LEVELS - 1))
+            spacing = -distance * view.pixel_angle * _dot(ray.direction, back)
+            squared_rate = zero
+            for axis in ((pose[3], pose[6], pose[9]), (pose[4], pose[7], pose[10])):
+                slope = _dot(normal, axis) / jnp.maximum(steepness, MIN_COSINE)
+                step = [spacing * (a + slope * d) for a, d in zip(axis, ray.direction, strict=True)]
+                du, dv = _dot(u_rates, step) * u_scale * width, _dot(v_rates, step) * v_scale * height
+                squared_rate = jnp.maximum(squared_rate, du * du + dv * dv)
+            level = sum(jnp.where(squared_rate > 2 ** (2 * k + 1), jnp.int32(1), 0) for k in range(MAX_LEVELS - 1))
             level = first_level + jnp.minimum(level, n_levels - 1)
             texel = _interpolate(paint, level, u * u_scale - shift, v * v_scale - shift)
             return tuple(c * k for c, k in zip(color, texel, strict=True))  # type: ignore[return-value]
@@ -206,30 +212,29 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _normal_and_texture_position(
+def _normal_and_texture(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> tuple[Array, ...]:
-    # The texture covers a side of a box, or a plane, once; of an infinite plane it covers 2 m.
+    # World normal; position along both axes of the texture, each with its gradient. The texture covers a side of a box,
+    # or a plane, once; of infinite planes, terrain and meshes it covers 2 m.
     normal = normal_in_frame(surface, row, origin, direction, distance)
-    position = [jnp.zeros_like(distance)] * 4
-    if surface in ("plane", "box"):
-        x, y, z = (o + distance * d for o, d in zip(origin, direction, strict=True))
-        half = row[13:16]
-        pairs = [(x, half[0]), (y, half[1])]
+    texture = [jnp.zeros_like(distance)] * 8
+    if surface in ("plane", "box") or isinstance(surface, Shape):
+        point, half = [o + distance * d for o, d in zip(origin, direction, strict=True)], row[13:16]
+        axes: list[list[Any]] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         if surface == "box":
             is_x_side, is_z_side = jnp.abs(normal[0]) > 0.5, jnp.abs(normal[2]) > 0.5
-            second = (jnp.where(is_z_side, y, z), jnp.where(is_z_side, half[1], half[2]))
-            pairs = [(jnp.where(is_x_side, y, x), jnp.where(is_x_side, half[1], half[0])), second]
-        (u, u_rate, u_start), (v, v_rate, v_start) = (
-            (
-                0.5 * p / jnp.where(size > 0, size, 1.0),
-                0.5 / jnp.where(size > 0, size, 1.0),
-                jnp.where(size > 0, 0.5, 0.0),
-            )
-            for p, size in pairs
-        )
-        position = [u_start + u, v_start - v, u_rate, v_rate]
-    return *world_vector(row, normal), *position
+            axes = [
+                [jnp.where(is_x_side, 0.0, 1.0), jnp.where(is_x_side, 1.0, 0.0), 0.0],
+                [0.0, jnp.where(is_z_side, 1.0, 0.0), jnp.where(is_z_side, 0.0, 1.0)],
+            ]
+        texture = []
+        for axis, sign in zip(axes, (0.5, -0.5), strict=True):
+            size = _dot(axis, half)
+            rate = sign / jnp.where(size > 0, size, 1.0)
+            start = jnp.where(size > 0, 0.5, 0.0)
+            texture += [start + rate * _dot(axis, point), *world_vector(row, tuple(rate * a for a in axis))]  # type: ignore[arg-type]
+    return *world_vector(row, normal), *texture
 
 
 def _light(
