@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 17363,
     "media": 1087,
     "plugins": 4897,
-    "scene": 2908,
+    "scene": 2919,
     "sim": 914,
     "train": 2628,
     "trajectories": 497,
