@@ -30,7 +30,7 @@ from tables import Line
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
-PAGES = ("README.md", "docs/results.md")
+PAGES = ("README.md", "docs/results.md", "docs/lab/racing.md")
 """Pages with figures."""
 MACHINE_KEYS = ("device", "processor", "vectors", "cores", "jax", "python", "date", "crazysim")
 """Keys of lines that a record holds once for all lines."""
@@ -300,6 +300,7 @@ FIGURES: dict[str, Figure] = {
         "flight_stack.py --worlds 4194304 --cases follow starts slots",
     ),
     "mppi": Figure("mppi.py", "mppi.py"),
+    "racing": Figure("racing.py"),
     "live": Figure("live.py --only max recorded jitter"),
     "mocap": Figure("mocap.py"),
     "first-results": Figure("first_results.py --repeat 1"),

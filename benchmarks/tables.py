@@ -258,6 +258,32 @@ def ratios(lines: list[Line]) -> str:
     return markdown_table(["Machine", "Reference", "Time of each case over it"], rows)
 
 
+def racing(lines: list[Line]) -> str:
+    """Return published and planned times of flights over race tracks, by the time between changes of thrust."""
+
+    def row_of(x: Line) -> tuple[str, ...]:
+        floor = "none" if x["floor"] is None else f"{x['floor']:g} m"
+        lag = ", rotor lag" if x["rotor_lag"] else ""
+        return f"`{x['track']}`", f"`{x['drone']}`{lag}", f"{x['yaw_rate']:g} rad/s, {floor}", x["published"]
+
+    cells: dict[tuple[str, ...], dict[float, str]] = {}
+    for x in lines:
+        if x["case"] == "plan":
+            text = f"{x['duration_s']:.2f} s; {x['deviation_cm']:.2g} cm; {x['cpu_s']:.2g} s"
+            cells.setdefault(row_of(x), {})[x["dt"]] = text
+    head = ["Track", "Drone", "Yaw rate, floor", "Published", "0.04 s: time; deviation; planning", "0.02 s"]
+    return markdown_table(head, [[*row, *(by_dt.get(dt, "") for dt in (0.04, 0.02))] for row, by_dt in cells.items()])
+
+
+def sagging(lines: list[Line]) -> str:
+    return columns(
+        At_full_thrust_for=lambda x: f"{x['seconds']} s",
+        Voltage=lambda x: f"{x['voltage']:g} V",
+        Thrust=lambda x: f"{x['thrust']:g} N",
+        Plan=lambda x: f"{x['duration_s']:.2f} s",
+    )([x for x in lines if x["case"] == "battery"])
+
+
 def further(lines: list[Line]) -> str:
     """Return machine, what is measured, and the figure, for measurements with few lines."""
     images = {"policy": "`forest` with its convolution, 4,096 worlds", "lidar": "a lidar of 16 x 360 rays at 10 Hz"}
@@ -601,6 +627,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "training": (("training",), training),
     "trainers": (("trainers",), trainers),
     "controllers": (("controllers",), control),
+    "racing": (("racing",), racing),
+    "racing-battery": (("racing",), sagging),
     "validation": (tuple(f"validation-{name}" for name in (*SECTIONS, "sim2sim")), summary),
     "other-models": (("validation-rotorpy", "validation-commonroad"), unranged),
     "path-errors": (("path-errors",), path_errors),
