@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,6 +24,7 @@ from crazysim.envs.tasks.race_rules import gates_of, obstacles_of
 from crazysim.envs.tracks import Track
 from crazysim.scene.objects import IDENTITY_QUAT, Handle
 from crazysim.sim.sim import Sim
+from crazysim.storage import read_toml
 
 # The numbers are those of lsy_drone_racing at commit eb891d0: config/level2.toml, envs/race_core.py, assets/gate.xml.
 FREQ, SIM_FREQ = 50, 500
@@ -183,6 +186,11 @@ class Config(dict[str, Any]):
 
     def __setattr__(self, name: str, value: Any) -> None:
         self[name] = value
+
+
+def load_config(path: str | Path) -> Config:
+    """Read a configuration from a TOML file of lsy_drone_racing."""
+    return json.loads(json.dumps(read_toml(path, "docs/lab/race_controllers.md")), object_hook=Config)
 
 
 def race_config(level: int, control: str) -> Config:

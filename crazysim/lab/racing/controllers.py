@@ -37,6 +37,7 @@ from crazysim.lab.racing.competition import (
     SIM_FREQ,
     Commands,
     CompetitionRace,
+    load_config,
     race_config,
 )
 from crazysim.lab.racing.flight import RaceFlight
@@ -98,13 +99,15 @@ class Run:
     """Attitudes, xyzw. (n, 4)"""
     track: Track
     """The track with gates and obstacles where they were."""
+    reason: str
+    """Why the run ended, if not by the last gate."""
 
     @property
     def flight(self) -> RaceFlight:
         """The run with its clock, for films and plots."""
         times = np.arange(len(self.pos)) / FREQ
         clock = time_flight(self.track, times, self.pos)
-        return RaceFlight(self.track, DRONE_NAME, times, self.pos, self.quat, clock)
+        return RaceFlight(self.track, DRONE_NAME, times, self.pos, self.quat, clock, self.reason)
 
 
 @functools.cache
@@ -168,7 +171,7 @@ def _stand_ins(path: Path, package: Path | None) -> dict[str, ModuleType]:
         if "control" in name:
             vars(module).update(Controller=Controller, BaseController=Controller)
         if "utils" in name:
-            module.draw_line = _do_nothing  # type: ignore[attr-defined]
+            vars(module).update(draw_line=_do_nothing, load_config=load_config)
     result = {PACKAGE + name: module for name, module in modules.items()}
     if importlib.util.find_spec("crazyflow") is None:
         for name in CRAZYFLOW_MODULES:
@@ -207,7 +210,7 @@ def fly_controller(controller: type[Controller], control: str, level: int = 2, s
     state = reset(jax.random.key(seed))
     obs = _observations(state)
     pilot = controller(obs, {}, race_config(level, control))
-    poses, n_passed, time = [(obs["pos"], obs["quat"])], 0, 0.0
+    poses, n_passed, time, reason = [(obs["pos"], obs["quat"])], 0, 0.0, "the time was over"
     for k in range(1, env.max_steps + 1):
         action = np.array(pilot.compute_control(obs, {}), np.float32)
         expect(action.shape == (env.actions.size,), f"a command of {env.actions.size} numbers", action.shape)
@@ -221,11 +224,12 @@ def fly_controller(controller: type[Controller], control: str, level: int = 2, s
         # The race ends one command after the last gate, as in the original.
         ended = had_finished or bool(info["disabled"] or info["nonfinite"])
         if pilot.step_callback(action, obs, -float(finished), ended, k == env.max_steps, {}) or ended:
+            reason = "the drone touched something or left the arena" if ended else "the controller ended the run"
             break
     pilot.episode_callback()
     pilot.episode_reset()
     pos, quat = (np.array(x, float) for x in zip(*poses, strict=True))
-    return Run(time, n_passed, int(obs["target_gate"]) == -1, pos, quat, _track(env, state))
+    return Run(time, n_passed, int(obs["target_gate"]) == -1, pos, quat, _track(env, state), reason)
 
 
 @functools.cache

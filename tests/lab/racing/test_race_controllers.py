@@ -19,7 +19,7 @@ PILOT = """
 import numpy as np
 from lsy_drone_racing.control import Controller
 from lsy_drone_racing.control.way import SPEED
-from lsy_drone_racing.utils import draw_line
+from lsy_drone_racing.utils import draw_line, load_config
 from crazyflow.sim.visualize import draw_points
 
 POINTS = [[-1.5, 0.75, 0.4], [0.0, 0.5, 0.7], [0.5, 0.25, 0.7], [1.2, -0.2, 0.9], [1.35, 0.4, 1.2], [1.05, 0.75, 1.2],
@@ -103,6 +103,15 @@ def test_modules_that_crazysim_lacks_are_not_found_in_crazyflow(folder):
         assert importlib.import_module("crazyflow").Sim is Sim
         with pytest.raises(ModuleNotFoundError):
             importlib.import_module("crazyflow.envs")  # and crazysim.envs is not executed again
+
+
+def test_a_configuration_has_attributes_and_keys(tmp_path):
+    (tmp_path / "level.toml").write_text("[env]\nfreq = 50\n[[env.track.gates]]\npos = [1, 2, 3]\n")
+    config = competition.load_config(tmp_path / "level.toml")
+    assert config.env.track.gates[0]["pos"] == [1, 2, 3]
+    assert config.env.get("disturbances") is None
+    with pytest.raises(AttributeError, match="expected an entry of freq, track, got 'seed'"):
+        config.env.seed  # noqa: B018
 
 
 def test_controllers_are_ordered_by_time_if_they_finish_half_of_their_runs():
