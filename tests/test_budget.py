@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3748,
     "geometry": 940,
-    "lab": 17363,
+    "lab": 17370,
     "media": 1087,
     "plugins": 4897,
     "scene": 2919,
