@@ -57,8 +57,8 @@ class RandomColors:
         n_bodies, dtype = max(body_index, default=0) + 1, paint.looks.dtype
         draw = jax.vmap(lambda key: uniform(key, (n_bodies * 3 + n_lights * 4,), dtype))
         numbers = 2 * draw(world_keys(first, "colors")) - 1
-        by_body = numbers[:, : n_bodies * 3].reshape(-1, n_bodies, 3)[:, np.asarray(body_index, int)]
-        by_light = numbers[:, n_bodies * 3 :].reshape(-1, n_lights, 4)
+        by_body = numbers[:, : n_bodies * 3].reshape(len(numbers), n_bodies, 3)[:, np.asarray(body_index, int)]
+        by_light = numbers[:, n_bodies * 3 :].reshape(len(numbers), n_lights, 4)
         looks = jnp.broadcast_to(paint.looks[: len(body_index)], (*by_body.shape[:2], paint.looks.shape[1]))
         looks = looks.at[..., :3].multiply(1 + self.surfaces * by_body)
         # A direction tilts by a part of the unit ball that is perpendicular to it.
@@ -161,7 +161,7 @@ class Appearance:
             [self._view(pixel_angle)],
         )
         # Empty tables get a row of zeros, since an array without rows has no memory.
-        arrays = [np.asarray(x if len(x) else np.zeros((1, np.shape(x)[1]))) for x in tables]
+        arrays = [x if len(x) else np.zeros((1, x.shape[1]), x.dtype) for x in map(np.asarray, tables)]
         dtype = data.states.pos.dtype
         paint = Paint(*(jnp.asarray(x, np.int32 if x.dtype.kind == "i" else dtype) for x in arrays))
         bodies = [target.body_index for target in targets]

@@ -309,14 +309,15 @@ def _sky_color(paint: Paint, view: View, direction: Components) -> Components:
     x, y, z = direction[0], direction[2], -direction[1]
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
     is_x, is_y = (ax >= ay) & (ax >= az), (ay > ax) & (ay >= az)
-    side = jnp.where(is_x, jnp.where(x < 0, 1, 0), jnp.where(is_y, jnp.where(y < 0, 3, 2), jnp.where(z < 0, 5, 4)))
+    is_negative = jnp.where(is_x, x, jnp.where(is_y, y, z)) < 0
+    side = jnp.where(is_x, jnp.int32(0), jnp.where(is_y, jnp.int32(2), jnp.int32(4))) + is_negative.astype(jnp.int32)
     across = jnp.where(is_x, jnp.where(x < 0, z, -z), jnp.where(~is_y & (z < 0), -x, x))
     down = jnp.where(is_y, jnp.where(y < 0, -z, z), -y)
     scale = 0.5 / jnp.maximum(jnp.maximum(ax, ay), az)
     size = view.sky_size
     column, row = (jnp.clip((0.5 + scale * p) * size, 0.0, size - 1).astype(jnp.int32) for p in (across, down))
     width = size.astype(jnp.int32)
-    red, green, blue = _texel(paint, (side.astype(jnp.int32) * width + row) * width + column)
+    red, green, blue = _texel(paint, (side * width + row) * width + column)
     return red, green, blue
 
 

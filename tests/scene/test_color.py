@@ -125,6 +125,20 @@ def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, look):
     assert (difference <= 1).mean() > 0.999
 
 
+@pytest.mark.parametrize("random_colors", [None, RandomColors(0, 0, 0)])
+@pytest.mark.parametrize("geom, color", [("", 0), ("<geom type='sphere' size='.3' pos='1 0 1'/>", 38)])
+def test_scenes_without_lights_textures_and_sky(tmp_path, geom, color, random_colors):
+    """MuJoCo adds ambient light of 0.3 to scenes without lights: 0.3 x 0.5 x 255 = 38."""
+    path = tmp_path / "scene.xml"
+    path.write_text(f"""<mujoco><visual><headlight active="0"/></visual><worldbody>{geom}
+        <camera name="eye" pos="0 0 1" xyaxes="0 -1 0 0 0 1"/></worldbody></mujoco>""")
+    sim = Sim(2, xml_path=path)
+    colors = jax.jit(sim.scene.depth_fn("eye", 8, 6, drones=False, color=True, random_colors=random_colors))(
+        sim.data
+    ).color
+    assert set(np.unique(colors)) == {0, color}
+
+
 def test_a_camera_sees_the_colors_of_moving_objects_and_other_drones():
     sim = Sim(2, 2, control="attitude")
     ball = sim.scene.add("sphere", pos=[1.5, 0, 1], radius=0.3, rgba=(0, 0, 1, 1))

@@ -190,7 +190,8 @@ class ImageSensor(Plugin):
                 f"expected a latency of {self.name!r} of at most {MAX_ROWS - 1} images, got {self.latency} s. Use a "
                 f"shorter latency or a lower freq=."
             )
-        bytes_per_pixel = 4 * sum(math.prod(OUTPUTS[name]) for name in self.outputs) * (1 + n_rows) + BYTES_PER_RAY
+        number_bytes = {name: (1 if name in COLORS else 4) * math.prod(OUTPUTS[name]) for name in self.outputs}
+        bytes_per_pixel = sum(number_bytes.values()) * (1 + n_rows) + BYTES_PER_RAY
         check_image_memory(sim.n_worlds * sim.n_drones, width, height, bytes_per_pixel, sim.scene.device)
 
     def image_fn(self, sim: Simulation) -> ImageFn:
