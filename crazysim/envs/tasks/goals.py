@@ -177,10 +177,11 @@ def pick_entry(x: Array | np.ndarray, index: Array) -> Array:
 
 
 def nearest_entries(distance: Array, x: Array, n: int) -> Array:
-    """Return the entries with the smallest distances, nearest first. (..., n, k)
+    """Return the entries with the smallest distances, nearest first, and each once. (..., n, k)
 
     Args:
-        distance: Distances, or other numbers in the same order, such as their squares. (..., m)
+        distance: Distances, or other numbers in the same order, such as their squares. Where all that are left are
+            infinite, the entry is zero if those of infinite distances are. (..., m)
         x: Entries. (..., m, k)
         n: Number of entries to return, at most m.
     """
@@ -188,7 +189,8 @@ def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     for _ in range(n):
         nearest_index = lax.argmin(distance, distance.ndim - 1, np.int32)
         entries.append(pick_entry(x, nearest_index))
-        distance = jnp.where(nearest_index[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
+        is_taken = nearest_index[..., None] == np.arange(x.shape[-2], dtype=np.int32)
+        distance, x = jnp.where(is_taken, jnp.inf, distance), jnp.where(is_taken[..., None], 0, x)
     return jnp.stack(entries, axis=-2)
 
 

@@ -57,6 +57,8 @@ def test_drones_that_touch_are_out_fall_and_are_in_nobodys_way(start):
     np.testing.assert_array_equal(state.info["collided"][0], [True, True, False, False])
     np.testing.assert_array_equal(state.info["disabled"][0], [True, True, False, False])
     assert not np.any(np.asarray(state.obs["rivals"])[0, 2].reshape(3, 6)[1:]), "two of three rivals are out"
+    mirrored = step(place_drones(state.replace(data=start[1].data), pos[[2, 3, 0, 1]]), state.action)
+    np.testing.assert_allclose(mirrored.obs["rivals"][:, [2, 3, 0, 1]], state.obs["rivals"], atol=1e-5)
     for _ in range(10):
         state = step(state, state.action)
     fallen = 1.0 - np.asarray(state.data.states.pos)[0, :, 2]
