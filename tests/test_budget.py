@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 516,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3748,
+    "envs": 3749,
     "geometry": 940,
     "lab": 17370,
     "media": 1087,
