@@ -273,6 +273,7 @@ FIGURES: dict[str, Figure] = {
     "memory": Figure(f"{VERSUS} --only memory"),
     "depth": Figure("depth.py --poles 30 1000", "depth.py --worlds 16384"),
     "depth-small": Figure(gpu="depth.py --worlds 4096 --size 16 12 --poles 30"),
+    "colors": Figure("depth.py --colors --poles 30 --repeats 25", "depth.py --colors --poles 30 --worlds 16384"),
     "sight": Figure(gpu="sight.py"),
     "range-finder": Figure(
         "depth.py --range-finder --worlds 1024 --poles 0 4 30 100 1000",

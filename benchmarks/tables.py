@@ -227,6 +227,17 @@ def depths(lines: list[Line]) -> str:
     )
 
 
+def colors(lines: list[Line]) -> str:
+    """Return images per second, of depth and in colour; of a CPU per second of one core."""
+    return pivot(
+        lines,
+        lambda x: f"{x['images']}, {poles_text(x)}",
+        lambda x: f"{'one core of ' * ('images_per_processor_s' in x)}{x['machine']}, {worlds_text(x)} worlds",
+        lambda x: si_text(x.get("images_per_processor_s", x["images_per_s"])),
+        "64 x 64 pixels, images/s",
+    )
+
+
 def costs(lines: list[Line]) -> str:
     """Return the times of cases divided by the times of their references, rates of the cases, and first calls."""
     return pivot(
@@ -617,6 +628,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "gradient": (("gradient",), gradients),
     "envs": (("envs", "envs-training", "envs-depth", "randomize"), env_rates),
     "depth": (("depth", "range-finder"), depths),
+    "colors": (("colors",), colors),
     "costs": (("plugins", "loads", "follow"), ratios),
     "plugins": (("plugins",), costs),
     "loads": (("loads",), costs),
