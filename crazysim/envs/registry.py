@@ -52,7 +52,8 @@ class Entry:
     @property
     def defaults(self) -> dict[str, Any]:
         """Options of the simulation, by name, unless others are given."""
-        return {"control": self.control or self.task.control, "n_drones": self.n_drones or self.task.n_drones}
+        drone = {} if self.task.drone is None else {"drone": self.task.drone}
+        return drone | {"control": self.control or self.task.control, "n_drones": self.n_drones or self.task.n_drones}
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -72,6 +73,7 @@ TASKS: dict[str, Entry] = {
     "race": Entry("crazysim.envs.tasks.race:Race", "crazysim/Race-v0"),
     "multi_race": Entry("crazysim.envs.tasks.race:Race", "crazysim/MultiRace-v0", n_drones=2),
     "head_to_head": Entry("crazysim.lab.tasks.head_to_head:HeadToHead", "crazysim/HeadToHead-v0"),
+    "time_trial": Entry("crazysim.lab.tasks.time_trial:TimeTrial", "crazysim/TimeTrial-v0"),
     "race_by_camera": Entry("crazysim.envs.tasks.race_by_camera:RaceByCamera", "crazysim/RaceByCamera-v0"),
     "avoid": Entry("crazysim.envs.tasks.avoid:Avoid", "crazysim/Avoid-v0"),
     "forest": Entry("crazysim.envs.tasks.forest:Forest", "crazysim/Forest-v0"),

@@ -53,6 +53,8 @@ class Task:
     """Default command level."""
     n_drones: ClassVar[int] = 1
     """Default number of drones."""
+    drone: ClassVar[str | None] = None
+    """Name or file of the default airframe; None for that of ``Sim``."""
     freq: ClassVar[int] = 50
     """Default number of environment steps per second, Hz."""
     recipe: ClassVar[Mapping[str, Any]] = {}
