@@ -215,6 +215,13 @@ class Task:
         """Return the camera on every drone whose images the policy observes, which ``make`` adds; None for none."""
         return None
 
+    @property
+    def criterion(self) -> str:
+        """What success means, in messages."""
+        if type(self).succeeded is not Task.succeeded:
+            return "as the task judges it"
+        return f"error below {self.tolerance:g} {self.unit} for the last {self.hold:g} s"
+
     def succeeded(self, data: SimData) -> Array | None:
         """Whether a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
         return None

@@ -29,7 +29,6 @@ from crazysim.engine.sharding import distribute, fetch_arrays
 from crazysim.envs.env import Env
 from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats
-from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset, PrivilegedObservation, RewardTerms
 from crazysim.errors import ConfigError, DivergedError, require, require_callable
@@ -373,9 +372,6 @@ class _Run:
 
     def results(self) -> dict[str, TrainResult]:
         task, results = self.env.task, {}
-        criterion = f"error below {task.tolerance:g} {task.unit} for the last {task.hold:g} s"
-        if type(task).succeeded is not Task.succeeded:
-            criterion = "as the task judges it"
         for training in self.trainings:
             best, latest, name = kept_point(training.curve), training.curve[-1], training.name and f"{training.name}: "
             if best is not latest:
@@ -385,7 +381,7 @@ class _Run:
                 )
             point = best | {name: latest[name] for name in ("env_steps", "seconds", "compile_seconds")}
             self.log(
-                f"{name}success {point['success']:.1%} of {self.n_starts:,} held-out starts ({criterion}), "
+                f"{name}success {point['success']:.1%} of {self.n_starts:,} held-out starts ({task.criterion}), "
                 f"{describe_outcome(point, task.unit)}; {point['env_steps']:,} steps in {point['seconds']:.1f} s, "
                 f"including {self.compile_seconds:.1f} s of compilation"
             )

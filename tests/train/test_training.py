@@ -609,7 +609,8 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys, monkeyp
     assert (tmp_path / "hover" / "episode.png").stat().st_size > 5000
     assert main(["evaluate", folder, "--worlds", "8"]) == 0
     assert re.search(
-        r"hover, 8 starts: success .*, mean return \S+ \(action_rate .*, proximity \d", capsys.readouterr().out
+        r"hover, 8 starts \(error below .*\): success .*, mean return \S+ \(action_rate .*, proximity \d",
+        capsys.readouterr().out,
     )
     assert main(["evaluate", folder, "--worlds", "8", "--plot", str(tmp_path / "terms.png")]) == 0
     assert (tmp_path / "terms.png").stat().st_size > 5000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -122,7 +121,7 @@ class TimeTrial(Race):
             return self.write(data, phase=jnp.full_like(self.read(data).phase, START_PHASE))
         x = draw(key, data.core.n_drones, phase=1, at_start=1, **dict.fromkeys(PRACTICE_DEVIATION, 3))
         deviation = {name: scale_symmetric(x[name], size) for name, size in PRACTICE_DEVIATION.items()}
-        phase = START_PHASE + x["phase"] * (reference.duration - 1.0)
+        phase = START_PHASE + x["phase"] * (reference.duration - 2 * START_PHASE)
         pos, vel, quat, ang_vel = reference.at(phase)
         from_start = x["at_start"] < 0.1
         phase = jnp.where(from_start, START_PHASE, phase)
@@ -186,7 +185,8 @@ class TimeTrial(Race):
         excess = jnp.abs(data.states.ang_vel) - np.array(MAX_BODY_RATES, data.states.pos.dtype)
         return {
             "phase": 100.0 * (record.phase - record.phase_before)[..., 0],
-            "time": jnp.full_like(distance, -0.5),
+            "time": jnp.full_like(distance, -0.2),
+            "deviation": -rotation.safe_norm(data.states.pos - record.reference.at(record.phase)[0])[..., 0],
             "stop": -jnp.where(is_at_end, distance + 0.2 * speed, 0.0),
             "rate": -0.05 * jnp.sum(jnp.maximum(excess, 0.0), axis=-1),
             "action_rate": -0.005 * terms.action_rate(action, last_action),
@@ -194,6 +194,10 @@ class TimeTrial(Race):
             "lost": -10.0 * record.failure,
             "finish": 10.0 * record.success,
         }
+
+    @property
+    def criterion(self) -> str:
+        return f"all gates, at most {100 * self.slack:g}% longer than the plan"
 
     def succeeded(self, data: SimData) -> Array:
         return self.read(data).success & (self.error(data) <= self.slack * self.read(data).reference.duration)
@@ -216,9 +220,11 @@ class Reference:
     """Duration of the plan, s."""
 
     @staticmethod
-    @functools.cache
     def of(track: Track, airframe: Airframe, margin: float, laps: int) -> Reference:
-        """Plan a flight that keeps a distance from the edges of the gates."""
+        """Plan a flight that keeps a distance from the edges of the gates, once in a process."""
+        key = (repr(track), airframe, margin, laps)
+        if key in _REFERENCES:
+            return _REFERENCES[key]
         gates = gates_of_track(track)
         openings = [
             float(x.opening) - margin if x.is_ball else np.asarray(x.opening) * (1 - 2 * margin / x.size) for x in gates
@@ -231,7 +237,8 @@ class Reference:
         for k, x in enumerate(flight.pos.T):
             rows[:, k] = np.interp(times, flight.time, x)
         passes = np.asarray(flight.clock.times, float)
-        return Reference(rows.astype(np.float32), tuple(passes.tolist()), plan.duration)
+        _REFERENCES[key] = Reference(rows.astype(np.float32), tuple(passes.tolist()), plan.duration)
+        return _REFERENCES[key]
 
     def at(self, time: Array) -> tuple[Array, Array, Array, Array]:
         """Return position, velocity, attitude and angular velocity at a time. (..., 1) to (..., 3 or 4) each"""
@@ -242,3 +249,7 @@ class Reference:
         row = (1 - share) * table[index] + share * table[index + 1]
         pos, vel, quat, ang_vel = jnp.split(row, [3, 6, 10], axis=-1)
         return pos, vel, quat / rotation.safe_norm(quat), ang_vel
+
+
+_REFERENCES: dict[tuple[str, Airframe, float, int], Reference] = {}
+"""Plans of this process."""

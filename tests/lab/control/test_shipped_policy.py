@@ -88,7 +88,7 @@ def test_commands_take_it_by_name(tmp_path, capsys, monkeypatch):
     arguments = ["--worlds", "10", "--airframe", "crazyflie"]
     assert main(["evaluate", "any", *arguments]) == 0
     first = capsys.readouterr().out
-    assert first.startswith("any, 10 starts: success 100.0%")
+    assert first.startswith("any, 10 starts (error below 0.2 m for the last 1 s): success 100.0%")
     assert main(["evaluate", "policy.tar", *arguments]) == 0
     assert capsys.readouterr().out == first, "the checkpoint holds the same policy"
     assert main(["evaluate", "out/none", "--drone", "crazyflie"]) == 2

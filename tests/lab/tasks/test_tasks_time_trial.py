@@ -1,0 +1,120 @@
+"""Time trials: the phase of a flight along the plan, its end, missed gates, and what is observed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import rotation
+from crazysim.envs import Track, make
+from crazysim.lab.tasks.time_trial import AHEAD, MISSED, START_PHASE, STEP, Reference
+
+TRACK = Track(
+    gates_pos=[(4.0, 1.0, 2.0), (8.0, -1.0, 1.5)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], start=(0, 0, 1),
+    finish=(11.0, 0.0, 1.5), obstacles_pos=(), low=(-5, -5, 0), high=(16, 5, 5),
+)  # fmt: skip
+WORLDS = {"on the plan": 0, "missed": 1, "away": 2, "stays": 3}
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("time_trial", len(WORLDS), track=TRACK, engine="interpret")
+
+
+@pytest.fixture(scope="module")
+def flown(env):
+    """States along the plan, judged without dynamics: beside the second gate, away from the plan, and at the start."""
+    task, start = env.task, env.reset(jax.random.key(0))
+    reference = task.read(start.data).reference
+    times = np.arange(START_PHASE, reference.duration + 0.4, 1 / start.data.core.freq)
+    pos, vel = (np.asarray(x) for x in reference.at(jnp.asarray(times[:, None], jnp.float32))[:2])
+    pos, vel = (np.repeat(x[:, None, None], len(WORLDS), axis=1) for x in (pos, vel))
+    beside = np.clip(np.minimum(times - reference.passes[0], 0.3), 0, None)[:, None]
+    pos[:, WORLDS["missed"], :, 2] += 2.5 * beside
+    pos[:, WORLDS["away"], :, 1] += (1.5 * np.clip(times - 0.3, 0, None))[:, None]
+    pos[:, WORLDS["stays"]], vel[:, WORLDS["stays"]] = pos[0, WORLDS["stays"]], 0.0
+    no = jnp.zeros((len(WORLDS), 1), bool)
+
+    @jax.jit
+    def fly(data, pos, vel):
+        s = data.states.replace(pos=pos, vel=vel)
+        n_before = task.read(data).passed
+        data = data.replace(states=s, core=data.core.replace(steps=data.core.steps + 1))
+        gates = jnp.asarray(TRACK.gates_pos)
+        near = jnp.linalg.norm(gates[jnp.minimum(n_before, 1)] - pos, axis=-1) < 0.3
+        passed = n_before + (near & (n_before < 2))
+        data = task.write(data, passed=passed.astype(n_before.dtype), last_pos=pos)
+        return task.judge(data, passed >= 2, no)
+
+    data, records = start.data, []
+    for x, v in zip(pos.astype(np.float32), vel.astype(np.float32), strict=True):
+        data = fly(data, x, v)
+        records.append(jax.tree.map(np.asarray, task.read(data)))
+    return task, reference, times, records, data
+
+
+def world(records, name, field):
+    return np.array([np.ravel(getattr(r, field)[WORLDS[name]])[0] for r in records])
+
+
+def test_the_phase_of_a_flight_on_the_plan_is_its_time(flown):
+    """Lines between rows of the table and the speeds near the ends, where the phase lags, leave hundredths."""
+    _, reference, times, records, _ = flown
+    phase = world(records, "on the plan", "phase")
+    inner = (times > 0.3) & (times < reference.duration - 0.3)
+    assert np.abs(phase - times)[inner].max() < 2 * STEP
+    assert not world(records, "on the plan", "failure").any()
+
+
+def test_a_flight_succeeds_at_rest_at_the_end_and_its_error_is_the_time_behind_the_plan(flown):
+    task, reference, times, records, data = flown
+    success = world(records, "on the plan", "success")
+    arrived = times[np.argmax(success)]
+    assert success[-1]
+    assert reference.duration - 0.2 < arrived <= reference.duration + STEP
+    flight = len(times) / data.core.freq  # all steps count
+    np.testing.assert_allclose(task.error(data)[WORLDS["on the plan"]], flight - reference.duration, atol=1e-4)
+    assert bool(task.succeeded(data)[WORLDS["on the plan"], 0]) == (flight < 1.02 * reference.duration)
+
+
+def test_flights_that_miss_a_gate_or_leave_the_plan_fail(flown):
+    _, reference, times, records, _ = flown
+    missed = times[np.argmax(world(records, "missed", "failure"))]
+    np.testing.assert_allclose(missed, reference.passes[1] + MISSED, atol=0.1)
+    away = times[np.argmax(world(records, "away", "failure"))]
+    assert 0.3 + 1.0 / 1.5 <= away < 0.3 + 1.0 / 1.5 + 0.3, "1 m from the plan at 1.5 m/s sideways, and beside a bend"
+    assert world(records, "stays", "phase")[-1] < 0.3
+    assert not world(records, "stays", "failure").any()
+
+
+def test_points_of_the_plan_ahead_are_observed_in_the_body_frame(env, flown):
+    task, reference, _, _, _ = flown
+    state = env.step(env.reset(jax.random.key(3)), jnp.zeros((len(WORLDS), 1, 4)))
+    obs, data, record = state.obs, state.data, task.read(state.data)
+    assert obs["plan_pos"].shape == (len(WORLDS), 1, 3 * len(AHEAD))
+    times = jnp.minimum(record.phase[..., None] + jnp.asarray(AHEAD)[:, None], reference.duration)
+    points = obs["plan_pos"].reshape(len(WORLDS), 1, -1, 3)
+    in_world = rotation.rotate(data.states.quat[..., None, :], points) + data.states.pos[..., None, :]
+    np.testing.assert_allclose(in_world, reference.at(times)[0], atol=1e-4)
+
+
+def test_practice_begins_on_the_plan_with_its_gates_passed():
+    env = make("time_trial", 64, track=TRACK, practice=True, engine="interpret")
+    data = env.reset(jax.random.key(1)).data
+    record = jax.tree.map(np.asarray, env.task.read(data))
+    phase, reference = record.phase[:, 0, 0], env.task.read(data).reference
+    np.testing.assert_array_equal(record.passed[:, 0], (phase[:, None] > reference.passes).sum(axis=1))
+    assert np.ptp(phase) > 0.5 * reference.duration
+    deviation = np.asarray(data.states.pos)[:, 0] - np.asarray(reference.at(jnp.asarray(phase[:, None]))[0])
+    assert np.abs(deviation).max() <= 0.2 + 1e-3 or (phase == np.float32(START_PHASE)).any()
+
+
+def test_a_plan_with_a_margin_passes_inside_the_openings():
+    reference = Reference.of(TRACK, make("time_trial", 1, track=TRACK, engine="interpret").sim.airframes[0], 0.1, 1)
+    pos = reference.rows[:, :3]
+    for gate in TRACK.gates_pos:
+        # Rows are 20 ms apart: between two of them the plan moves up to 0.3 m past the point nearest to the gate.
+        k = np.argmin(np.linalg.norm(pos - gate, axis=-1))
+        a, b = pos[max(k - 1, 0)], pos[k + 1]
+        share = np.clip((np.asarray(gate) - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        assert np.linalg.norm(a + share * (b - a) - gate) < 0.2 + 0.01
