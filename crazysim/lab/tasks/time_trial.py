@@ -222,7 +222,7 @@ class Reference:
     @staticmethod
     def of(track: Track, airframe: Airframe, margin: float, laps: int) -> Reference:
         """Plan a flight that keeps a distance from the edges of the gates, once in a process."""
-        key = (repr(track), airframe, margin, laps)
+        key = repr((track, airframe.values, margin, laps))
         if key in _REFERENCES:
             return _REFERENCES[key]
         gates = gates_of_track(track)
@@ -251,5 +251,5 @@ class Reference:
         return pos, vel, quat / rotation.safe_norm(quat), ang_vel
 
 
-_REFERENCES: dict[tuple[str, Airframe, float, int], Reference] = {}
-"""Plans of this process."""
+_REFERENCES: dict[str, Reference] = {}
+"""Plans of this process. Programs are the same for the same plan, which is compared by its identity."""
