@@ -1,4 +1,4 @@
-"""Time trials: the phase of a flight along the plan, its end, missed gates, and what is observed."""
+"""Time trials: the phase of a flight along the plan, the finish, missed gates, and what is observed."""
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ TRACK = Track(
     gates_pos=[(4.0, 1.0, 2.0), (8.0, -1.0, 1.5)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], start=(0, 0, 1),
     finish=(11.0, 0.0, 1.5), obstacles_pos=(), low=(-5, -5, 0), high=(16, 5, 5),
 )  # fmt: skip
+N_GATES = 3
+"""Two gates and the finish."""
 WORLDS = {"on the plan": 0, "missed": 1, "away": 2, "stays": 3}
 
 
@@ -31,7 +33,7 @@ def flown(env):
     pos, vel = (np.repeat(x[:, None, None], len(WORLDS), axis=1) for x in (pos, vel))
     beside = np.clip(np.minimum(times - reference.passes[0], 0.3), 0, None)[:, None]
     pos[:, WORLDS["missed"], :, 2] += 2.5 * beside
-    pos[:, WORLDS["away"], :, 1] += (1.5 * np.clip(times - 0.3, 0, None))[:, None]
+    pos[:, WORLDS["away"], :, 1] += (4.0 * np.clip(times - 0.3, 0, None))[:, None]
     pos[:, WORLDS["stays"]], vel[:, WORLDS["stays"]] = pos[0, WORLDS["stays"]], 0.0
     no = jnp.zeros((len(WORLDS), 1), bool)
 
@@ -40,11 +42,11 @@ def flown(env):
         s = data.states.replace(pos=pos, vel=vel)
         n_before = task.read(data).passed
         data = data.replace(states=s, core=data.core.replace(steps=data.core.steps + 1))
-        gates = jnp.asarray(TRACK.gates_pos)
-        near = jnp.linalg.norm(gates[jnp.minimum(n_before, 1)] - pos, axis=-1) < 0.3
-        passed = n_before + (near & (n_before < 2))
+        gates = jnp.asarray(task.course.gates_pos)
+        near = jnp.linalg.norm(gates[jnp.minimum(n_before, N_GATES - 1)] - pos, axis=-1) < 0.3
+        passed = n_before + (near & (n_before < N_GATES))
         data = task.write(data, passed=passed.astype(n_before.dtype), last_pos=pos)
-        return task.judge(data, passed >= 2, no)
+        return task.judge(data, passed >= N_GATES, no)
 
     data, records = start.data, []
     for x, v in zip(pos.astype(np.float32), vel.astype(np.float32), strict=True):
@@ -66,15 +68,16 @@ def test_the_phase_of_a_flight_on_the_plan_is_its_time(flown):
     assert not world(records, "on the plan", "failure").any()
 
 
-def test_a_flight_succeeds_at_rest_at_the_end_and_its_error_is_the_time_behind_the_plan(flown):
+def test_a_flight_succeeds_at_the_finish_and_its_error_is_the_time_behind_the_plan(flown):
     task, reference, times, records, data = flown
     success = world(records, "on the plan", "success")
     arrived = times[np.argmax(success)]
     assert success[-1]
-    assert reference.duration - 0.2 < arrived <= reference.duration + STEP
+    # The ball of the finish is larger than that of the plan, by 0.1 m of some metres per second.
+    assert reference.passes[-1] - 0.1 < arrived <= reference.passes[-1] + STEP
     flight = len(times) / data.core.freq  # all steps count
-    np.testing.assert_allclose(task.error(data)[WORLDS["on the plan"]], flight - reference.duration, atol=1e-4)
-    assert bool(task.succeeded(data)[WORLDS["on the plan"], 0]) == (flight < 1.02 * reference.duration)
+    np.testing.assert_allclose(task.error(data)[WORLDS["on the plan"]], flight - reference.passes[-1], atol=1e-4)
+    assert bool(task.succeeded(data)[WORLDS["on the plan"], 0]) == (flight < 1.03 * reference.passes[-1])
 
 
 def test_flights_that_miss_a_gate_or_leave_the_plan_fail(flown):
@@ -82,7 +85,7 @@ def test_flights_that_miss_a_gate_or_leave_the_plan_fail(flown):
     missed = times[np.argmax(world(records, "missed", "failure"))]
     np.testing.assert_allclose(missed, reference.passes[1] + MISSED, atol=0.1)
     away = times[np.argmax(world(records, "away", "failure"))]
-    assert 0.3 + 1.0 / 1.5 <= away < 0.3 + 1.0 / 1.5 + 0.3, "1 m from the plan at 1.5 m/s sideways, and beside a bend"
+    assert 0.3 + 1.0 / 4.0 <= away < reference.passes[0] + MISSED, "1 m from the plan at 4 m/s sideways"
     assert world(records, "stays", "phase")[-1] < 0.3
     assert not world(records, "stays", "failure").any()
 
@@ -106,7 +109,8 @@ def test_practice_begins_on_the_plan_with_its_gates_passed():
     np.testing.assert_array_equal(record.passed[:, 0], (phase[:, None] > reference.passes).sum(axis=1))
     assert np.ptp(phase) > 0.5 * reference.duration
     deviation = np.asarray(data.states.pos)[:, 0] - np.asarray(reference.at(jnp.asarray(phase[:, None]))[0])
-    assert np.abs(deviation).max() <= 0.2 + 1e-3 or (phase == np.float32(START_PHASE)).any()
+    drawn = phase > np.float32(START_PHASE)
+    assert 0.05 < np.abs(deviation[drawn]).max() <= 0.2 + 1e-4
 
 
 def test_a_plan_with_a_margin_passes_inside_the_openings():
