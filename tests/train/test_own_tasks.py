@@ -255,6 +255,17 @@ def test_a_film_stands_still_where_an_episode_has_ended_and_says_so(monkeypatch)
         assert texts[-1] == f"5.0 s: {outcome}"
         assert sum(text.endswith(outcome) for text in texts) == 26
 
+    class OneOfTwo(envs.TASKS["hover"].task):
+        """Hover of two drones, the first of which succeeds."""
+
+        n_drones = 2
+
+        def succeeded(self, data):
+            return jnp.array([True, False])
+
+    film(envs.make(OneOfTwo(seconds=0.2)), lambda obs: jnp.zeros((1, 2, 4)), "two.mp4", worlds=1)
+    assert texts[-1] == "0.2 s: 1 of 2 succeeded"
+
 
 class StoppedError(Exception):
     """Raised instead of filming."""

@@ -63,7 +63,7 @@ class HeadToHead(Race):
     shuffles: ClassVar[bool] = True
     recipe: ClassVar[Mapping[str, Any]] = {
         "iterations": 400,
-        "discount": 0.98,
+        "discount": 0.99,
         "opponents": 3,
         "evaluate_every": 50,
         "practice": {"practice": True, "ends_with": 1},
