@@ -19,6 +19,7 @@ import argparse
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -60,7 +61,7 @@ def main() -> None:
         )  # fmt: skip
 
 
-def report_colors(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
+def report_colors(sim: Any, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
     cameras = {
         "depth": Camera(*args.size),
         "colours without shadows": Camera(*args.size, outputs=("rgb",), shadows=False),
