@@ -102,10 +102,10 @@ def _read_gate(name: Any, tables: Mapping[Any, Any], owner: str) -> dict[str, An
     keys = {"position": COORDINATE} | dict.fromkeys(shape.margins, LENGTH) | margins
     optional = {"rpy": ANY_NUMBER, "length": LENGTH_OR_ZERO} if kind.endswith("Prisma") else {}
     got = set(table) - {"type", *optional, *UNUSED_KEYS}
+    wrong = ", ".join(map(str, got - set(keys))) or "fewer"
     require(
         got == set(keys),
-        f"expected the keys {', '.join(['type', *keys])} of {name!r} in {owner}, got {', '.join(map(str, table))}. "
-        f"Correct the keys.",
+        f"expected the keys {', '.join(['type', *keys])} of {name!r} in {owner}, got {wrong}. Correct the keys.",
     )
     values = {
         key: read_numbers(

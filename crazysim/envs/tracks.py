@@ -195,13 +195,16 @@ def check_track(track: Track, n_drones: int, jitter: float, is_random: bool) -> 
         return track
     # Starts that are clear of gates, obstacles and limits.
     starts = np.asarray(track.start) + start_offsets(n_drones)
+    has_frame = np.array([not gate.is_ball for gate in gates_of_track(track)])
     for kind, points, clearance in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
         distance = np.linalg.norm((starts[:, None] - np.reshape(points, (1, -1, 3)))[..., :2], axis=-1)
+        if kind == "gate":
+            distance = np.where(has_frame, distance, np.inf)  # waypoints are points in the air
         if np.any(distance < clearance + jitter):
             k = int(np.argwhere(distance < clearance + jitter)[0, 1])
             raise ConfigError(
-                f"expected {kind} {k} of the track at least {clearance + jitter:.2f} m from every start in the plane, "
-                f"got {distance[:, k].min():.2f} m. Move it, or set Track(start=...)."
+                f"expected {kind} {k + 1} of the track, seen from above, at least {clearance + jitter:.2f} m from "
+                f"every start, got {distance[:, k].min():.2f} m. Move it, or the start."
             )
     require(
         np.all(starts >= low + [0.2, 0.2, 0.2]) and np.all(starts <= high - 0.2),

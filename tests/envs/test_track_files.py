@@ -68,7 +68,7 @@ def test_half_planes_bound_a_triangle_in_either_order_of_its_corners():
         ("initState", "start", "'initState' in mine.yaml as a table"),
         ("pos: [9, 0, 1]", "pos: [9, 0]", r"pos of endState of shape \(3,\), got \(2,\)"),
         ("RectanglePrisma", "Ring", "'B' in mine.yaml of type SingleBall, RectanglePrisma"),
-        ("radius", "size", "keys type, position, radius, margin of 'A' in mine.yaml, got type, position, size"),
+        ("radius", "size", "keys type, position, radius, margin of 'A' in mine.yaml, got size"),
         ("width", "widht", "position, width, height, marginW, marginH of 'B' in mine.yaml, got .*widht"),
         ("rpy", "rpz", "of 'B' in mine.yaml, got .*rpz"),
         ("margin: 0.2", "margin: 0.2, rpy: [0, 0, 0]", "of 'A' in mine.yaml, got .*rpy"),

@@ -79,6 +79,8 @@ class Race(ProgressTask, OutcomeTask):
     name = "race"
     outcomes = ("finished", "disabled")
     film_view = {"elevation": -50}
+    other_failures: ClassVar[str] = ""
+    """What else ends flights of a class, in messages."""
     check_freq: ClassVar[int | None] = None
     """Rate at which gates, contacts and limits are checked, Hz; None for every physics step."""
     shuffles: ClassVar[bool] = False

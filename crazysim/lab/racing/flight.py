@@ -95,7 +95,7 @@ def flight_of_policy(env: Env, policy: Any, seed: int = 1) -> RaceFlight:
         reason = "the drone left the arena"
     elif records[-1].failure[0, 0]:
         things = "a gate, an obstacle" if task.penalty is None else "an obstacle"
-        reason = f"the drone touched {things} or the floor"
+        reason = f"the drone touched {things} or the floor{task.other_failures}"
     else:
         reason = "the time of the episode was over"
     return RaceFlight(task.course, env.sim.airframes[0], times, pos, quat, clock, reason, penalty, battery)

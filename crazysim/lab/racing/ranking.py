@@ -52,12 +52,12 @@ class Score:
         return [time for time in self.times if time is not None]
 
     @property
-    def order(self) -> tuple[bool, float, float]:
-        """Key by which scores are sorted: by the mean time if at least half of the runs were finished, and after those
-        by the share of finished runs.
+    def order(self) -> tuple[bool, bool, float, float]:
+        """Key by which scores are sorted: by the mean time if at least half of the runs were finished, after those by
+        the share of finished runs, and last those with an error.
         """
         ranked = self.finished >= 0.5
-        return not ranked, float(np.mean(self.finish_times)) if ranked else 0.0, -self.finished
+        return bool(self.error), not ranked, float(np.mean(self.finish_times)) if ranked else 0.0, -self.finished
 
 
 def find_pilots(paths: Sequence[Path]) -> list[Path]:

@@ -64,6 +64,7 @@ class TimeTrial(Race):
     drone = "uzh_cpc"
     freq = 100
     unit = "s"
+    other_failures = ", missed a gate or was too far from the plan"
     recipe = {
         "n_worlds": 16384,
         "iterations": 5000,

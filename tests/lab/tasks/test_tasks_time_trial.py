@@ -1,5 +1,7 @@
 """Time trials: the phase of a flight along the plan, the finish, missed gates, and what is observed."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,3 +124,8 @@ def test_a_plan_with_a_margin_passes_inside_the_openings():
         a, b = pos[max(k - 1, 0)], pos[k + 1]
         share = np.clip((np.asarray(gate) - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         assert np.linalg.norm(a + share * (b - a) - gate) < 0.2 + 0.01
+
+
+def test_a_track_may_end_where_it_starts():
+    closed = dataclasses.replace(TRACK, finish=TRACK.start)
+    assert make("time_trial", 1, track=closed, engine="interpret").task.course.n_gates == N_GATES
