@@ -24,6 +24,7 @@ def test_all_sensors_are_tested():
         "ImageSensor",
         "Lidar",
         "Radar",
+        "RandomColors",
         "RangeFinder",
         "Samples",
         "Sensor",
