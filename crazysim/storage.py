@@ -302,7 +302,7 @@ def write_figure(figure: Any, path: str | Path, dpi: float) -> None:
     """
     check_writable(path, PICTURE_SUFFIXES)
     with open_replacement(path) as file:
-        figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=dpi)
+        figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=dpi, bbox_inches="tight")
 
 
 class _NothingToWriteError(Exception):
