@@ -74,6 +74,12 @@ class Actions:
         return f"{self.control.value} ({fields}): {self.centre - self.scale} to {self.centre + self.scale}"
 
 
+def rotor_speeds(params: SimParams) -> Actions:
+    """Return actions of four rotors from standing still at -1 to the largest speed at 1."""
+    half = np.broadcast_to(np.asarray(params.rotor_vel_max).reshape(-1)[:1] / 2, 4)  # type: ignore[union-attr]
+    return Actions(half, half, Control.rotor_vel)
+
+
 def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
     """Choose the default actions of a command level; see ``Actions``.
 

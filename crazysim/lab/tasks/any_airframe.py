@@ -12,7 +12,7 @@ from crazysim.core.plugin import drawn_data, state
 from crazysim.core.random import normal, world_key
 from crazysim.core.settings import setting
 from crazysim.envs import terms
-from crazysim.envs.actions import Actions, hover_rotor_states
+from crazysim.envs.actions import Actions, hover_rotor_states, rotor_speeds
 from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying, random_attitude
 from crazysim.envs.tasks.goals import GoalTask
@@ -101,8 +101,7 @@ class AnyAirframe(GoalTask):
         self.add_states(sim)
 
     def actions(self, sim: Sim) -> Actions:
-        half = np.broadcast_to(np.asarray(sim.default_data.params.rotor_vel_max).reshape(-1)[:1] / 2, 4)
-        return Actions(half, half, sim.control)
+        return rotor_speeds(sim.default_data.params)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, attitude=3, goal=3, goal_vel=3, yaw=1,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +14,12 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import state
+from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
 from crazysim.drones import Airframe
 from crazysim.engine.pytree import static
 from crazysim.envs import terms
-from crazysim.envs.actions import Actions
+from crazysim.envs.actions import Actions, rotor_speeds
 from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks import race_rules as rules
@@ -104,20 +106,12 @@ class TimeTrial(Race):
         if self.laps == 1 and self.course.finish is not None:
             object.__setattr__(self, "track", _with_finish(self.course))
 
-    def install(self, sim: Sim) -> None:
-        super().install(sim)
+    def add_states(self, sim: Sim, placements: Sequence[StagePlacement] = (), **initial: Any) -> None:
         reference = Reference.of(self.course, sim.airframes[0], self.margin, self.laps)
-
-        def with_reference(data: SimData) -> SimData:
-            return self.write(data, reference=reference)
-
-        sim.data, sim.default_data = with_reference(sim.data), with_reference(sim.default_data)
+        super().add_states(sim, placements, reference=reference, **initial)
 
     def actions(self, sim: Sim) -> Actions:
-        if sim.control != "rotor_vel":
-            return super().actions(sim)
-        half = np.broadcast_to(np.asarray(sim.default_data.params.rotor_vel_max).reshape(-1)[:1] / 2, 4)
-        return Actions(half, half, sim.control)
+        return rotor_speeds(sim.default_data.params) if sim.control == "rotor_vel" else super().actions(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         data = Race.spawn(dataclasses.replace(self, practice=False), data, key)
