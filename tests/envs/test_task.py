@@ -418,3 +418,10 @@ def test_plugins_that_are_added_to_the_simulation_of_an_environment_are_refused(
     env.sim.add(Wind((1.0, 0.0, 0.0)))
     with pytest.raises(ConfigError, match=r"was made \(.*\), got .*wind.*Use make\(\.\.\., effects="):
         env.reset(jax.random.key(0))
+
+
+@pytest.mark.parametrize("task", ["forest", "race_by_camera", "land_on_marker"])
+def test_tasks_fly_airframes_without_sizes(task):
+    # Its file has no table [shape]: cameras and contacts take the defaults that its picture has.
+    env = make(task, 1, drone="uzh_5inch")
+    assert jax.eval_shape(env.reset, jax.random.key(0)).obs

@@ -12,6 +12,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
+from crazysim.drones.body import body_shape
 from crazysim.engine.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
@@ -112,7 +113,7 @@ class Forest(OutcomeTask):
     def install(self, sim: Sim) -> None:
         trees, half_width = self.trees(sim.n_drones), self.half_width(sim.n_drones)
         sim.add(trees)
-        radius = max(float(airframe.value("shape.collision_sphere")[3]) for airframe in sim.airframes)
+        radius = max(float(body_shape(airframe)["collision_sphere"][3]) for airframe in sim.airframes)
         period = max(sim.freq // CHECK_FREQ, 1)
 
         @stage("drone", when=lambda data: (data.core.steps + 1) % period == 0)

@@ -16,6 +16,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
+from crazysim.drones.body import body_shape
 from crazysim.engine.stage import vmap_worlds
 from crazysim.errors import ConfigError
 from crazysim.lab.bodies.manifold import N_BOX_POINTS
@@ -197,7 +198,7 @@ def drones_as_bodies(data: SimData) -> Bodies:
 
 def drone_box_extents(sim: Simulation) -> np.ndarray:
     """Return centre and half extents of each drone's collision box, body frame, m. (n_drones, 6)"""
-    return np.array([airframe.value("shape.collision_box") for airframe in sim.airframes], np.float64)
+    return np.array([body_shape(airframe)["collision_box"] for airframe in sim.airframes])
 
 
 def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:

@@ -284,7 +284,7 @@ def _plan_point_mass(course: _Course, airframe: Airframe) -> tuple[Floats, Float
     h = ca.SX.sym("h")
     following = [p + h * v + h**2 / 2 * a + h**3 / 6 * j, v + h * a + h**2 / 2 * j, a + h * j]
     step = ca.Function("step", [ca.vertcat(p, v, a), j, h], [ca.vertcat(*following)]).map(len(leg))
-    program.add(x[:, 1:] - step(x[:, :-1], jerk, (legs[leg.tolist()] / n).T), 0.0, 0.0)
+    program.add(x[:, 1:] - step(x[:, :-1], jerk, (legs[leg.tolist(), 0] / n).T), 0.0, 0.0)
     program.add(ca.sum1((x[6:9, :] + np.array([[0], [0], [GRAVITY_MAGNITUDE]])) ** 2), MIN_FORCE**2, strongest**2)
     program.add(ca.sum1(jerk**2), 0.0, (strongest * GUESS_TURN_RATE) ** 2)
     course.constrain(program, x, ends, balls=False)
@@ -331,7 +331,7 @@ def _plan_drone(
     u = program.variable(inputs, input_low, input_high)
     legs = program.variable(1.05 * durations[:, None], 0.02, FAR)
     step = _step_function(ca, airframe, scale if lag else None).map(len(leg))
-    program.add(x[:, 1:] - step(x[:, :-1], u, (legs[leg.tolist()] / counts[leg].astype(float)).T), 0.0, 0.0)
+    program.add(x[:, 1:] - step(x[:, :-1], u, (legs[leg.tolist(), 0] / counts[leg].astype(float)).T), 0.0, 0.0)
     program.add(ca.sumsqr(x[6:10, 0]), 1.0, 1.0)
     course.constrain(program, x, ends, balls=True)
     states, inputs, durations = program.solve(ca.sum1(legs), f"{airframe.name!r}")

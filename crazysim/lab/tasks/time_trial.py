@@ -17,6 +17,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import StagePlacement, state
 from crazysim.core.settings import setting
 from crazysim.drones import Airframe
+from crazysim.drones.body import body_shape
 from crazysim.engine.pytree import static
 from crazysim.envs import terms
 from crazysim.envs.actions import Actions, rotor_speeds
@@ -87,7 +88,7 @@ class TimeTrial(Race):
     seconds: float = 30.0
     """Length of an episode, s."""
     margin: float = setting(default=0.1, low=0.0)
-    """Distance that the plan keeps from the edges of the gates, m."""
+    """Distance that the plan keeps from the edges of the gates, and the drone from the floor, m."""
     width: float = setting(default=1.0, positive=True)
     """Largest distance from the plan, m."""
     slack: float = setting(default=0.03, low=0.0)
@@ -107,7 +108,11 @@ class TimeTrial(Race):
             object.__setattr__(self, "track", _with_finish(self.course))
 
     def add_states(self, sim: Sim, placements: Sequence[StagePlacement] = (), **initial: Any) -> None:
-        reference = Reference.of(self.course, sim.airframes[0], self.margin, self.laps)
+        airframe = sim.airframes[0]
+        # Drones touch the floor before their middle does; gates may be lower.
+        floor = self.margin + float(body_shape(airframe)["collision_sphere"][3])
+        floor = min([floor, *(z for *_, z in (self.course.start, *self.course.gates_pos))])
+        reference = Reference.of(self.course, airframe, self.margin, floor, self.laps)
         super().add_states(sim, placements, reference=reference, **initial)
 
     def actions(self, sim: Sim) -> Actions:
@@ -168,7 +173,7 @@ class TimeTrial(Race):
         }
         inverse = jnp.swapaxes(rotation.matrix(s.quat), -1, -2)[..., None, :, :]
         obs = {name: rotation.matvec(inverse, x).reshape(*x.shape[:-2], -1) for name, x in vectors.items()}
-        return obs | {"rot": inverse.reshape(*s.pos.shape[:-1], 9), "ang_vel": s.ang_vel}
+        return obs | {"rot": rotation.matrix(s.quat).reshape(*s.pos.shape[:-1], 9), "ang_vel": s.ang_vel}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record = self.read(data)
@@ -220,16 +225,17 @@ class Reference:
     """Duration of the plan, s."""
 
     @staticmethod
-    def of(track: Track, airframe: Airframe, margin: float, laps: int) -> Reference:
-        """Plan a flight that keeps a distance from the edges of the gates, once in a process."""
-        key = repr((track, airframe.values, margin, laps))
+    def of(track: Track, airframe: Airframe, margin: float, floor: float, laps: int) -> Reference:
+        """Plan a flight that keeps a distance from the edges of the gates and a height, once in a process."""
+        key = repr((track, airframe.values, margin, floor, laps))
         if key in _REFERENCES:
             return _REFERENCES[key]
         gates = gates_of_track(track)
         openings = [
             float(x.opening) - margin if x.is_ball else np.asarray(x.opening) * (1 - 2 * margin / x.size) for x in gates
         ]
-        plan = plan_race(dataclasses.replace(track, openings=openings), airframe, laps=laps, body_rate=MAX_BODY_RATES)
+        inner = dataclasses.replace(track, openings=openings)
+        plan = plan_race(inner, airframe, laps=laps, body_rate=MAX_BODY_RATES, floor=floor)
         flight = flight_of_plan(plan, track, laps)
         times = np.arange(0.0, plan.duration + STEP, STEP)
         names = ("pos", "vel", "quat", "ang_vel")

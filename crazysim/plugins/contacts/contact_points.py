@@ -19,6 +19,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
+from crazysim.drones.body import body_shape
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.plugins.effects.ground import HeightField
@@ -286,7 +287,7 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
 def collision_boxes(sim: Simulation) -> DroneBoxes:
     drone_groups = [DroneGeoms((), drones) for drones in sim.scene.drone_groups]
     first_drones = [0 if group.drones is None else group.drones[0] for group in drone_groups]
-    boxes = [np.asarray(sim.airframes[k].value("shape.collision_box"), np.float64) for k in first_drones]
+    boxes = [body_shape(sim.airframes[k])["collision_box"] for k in first_drones]
     return list(zip(drone_groups, boxes, strict=True))
 
 

@@ -23,6 +23,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.random import drone_keys
 from crazysim.core.settings import setting
+from crazysim.drones.body import body_shape
 from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, short_repr
@@ -322,7 +323,7 @@ class ImageSensor(Plugin):
         return age_at(data, self.read(data).taken_step)
 
     def _drone_camera(self, sim: Simulation) -> DroneCamera:
-        fpv_pos = [airframe.value("shape.fpv_camera") for airframe in sim.airframes]
+        fpv_pos = [body_shape(airframe)["fpv_camera"] for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
         return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline)
 

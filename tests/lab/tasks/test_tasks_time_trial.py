@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import rotation
+from crazysim.drones.body import body_shape
 from crazysim.envs import Track, make
 from crazysim.lab.tasks.time_trial import AHEAD, MISSED, START_PHASE, STEP, Reference
 
@@ -116,7 +117,9 @@ def test_practice_begins_on_the_plan_with_its_gates_passed():
 
 
 def test_a_plan_with_a_margin_passes_inside_the_openings():
-    reference = Reference.of(TRACK, make("time_trial", 1, track=TRACK, engine="interpret").sim.airframes[0], 0.1, 1)
+    reference = Reference.of(
+        TRACK, make("time_trial", 1, track=TRACK, engine="interpret").sim.airframes[0], 0.1, 0.4, 1
+    )
     pos = reference.rows[:, :3]
     for gate in TRACK.gates_pos:
         # Rows are 20 ms apart: between two of them the plan moves up to 0.3 m past the point nearest to the gate.
@@ -124,6 +127,18 @@ def test_a_plan_with_a_margin_passes_inside_the_openings():
         a, b = pos[max(k - 1, 0)], pos[k + 1]
         share = np.clip((np.asarray(gate) - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         assert np.linalg.norm(a + share * (b - a) - gate) < 0.2 + 0.01
+
+
+def test_a_plan_keeps_the_drone_above_the_floor():
+    # Along a straight line to a waypoint that is as low as the start, drones sink when they lean.
+    low = Track(gates_pos=[(6.0, 0.0, 0.5)], gates_rpy=[(0, 0, 0)], start=(0.0, 0.0, 0.5), openings=[0.3], frames=[0.3])
+    env = make("time_trial", 1, track=low, engine="interpret")
+    radius = body_shape(env.sim.airframes[0])["collision_sphere"][3]
+    heights = env.task.read(env.reset(jax.random.key(0)).data).reference.rows[:, 2]
+    assert heights.min() > radius + env.task.margin - 1e-3
+    lower = dataclasses.replace(low, gates_pos=[(6.0, 0.0, 0.2)])
+    env = make("time_trial", 1, track=lower, engine="interpret")
+    assert env.task.read(env.reset(jax.random.key(0)).data).reference.rows[:, 2].min() > 0.2 - 1e-3
 
 
 def test_a_track_may_end_where_it_starts():

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import load_airframe
+from crazysim.drones.body import body_shape
 from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.lab.live.attitude import from_rpy, multiply, rotate, to_rpy
 from crazysim.lab.live.loop import Live
@@ -69,7 +70,7 @@ class Twin:
     @staticmethod
     def drone(airframe: str = "crazyflie", **settings: Any) -> Twin:
         """Return a box of the size of an airframe's collision box."""
-        centre, half = np.split(np.asarray(load_airframe(airframe).value("shape.collision_box"), float), 2)
+        centre, half = np.split(body_shape(load_airframe(airframe))["collision_box"], 2)
         options = {"size": tuple((2 * half).tolist()), "rgba": (0.1, 0.5, 0.9, 1.0)}
         offset = np.asarray(settings.pop("offset", (0.0, 0.0, 0.0)), float) + centre
         return Twin("box", options, tuple(offset.tolist()), **settings)
