@@ -69,6 +69,11 @@ def world_keys(data: SimData, name: str) -> Array:
     return _vmap_worlds(data, lambda world: world_key(world, name))
 
 
+def episode_keys(data: SimData, name: str) -> Array:
+    """Return typed random keys of all worlds that stay the same for a whole episode; see ``world_keys``. (n_worlds,)"""
+    return world_keys(data.replace(core=data.core.replace(steps=jnp.zeros_like(data.core.steps))), name)
+
+
 def drone_keys(data: SimData, name: str) -> Array:
     """Return the random keys of all drones of all worlds, equal to ``drone_key`` of each.
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from crazysim.core.data import SimData
-from crazysim.core.random import uniform, world_keys
+from crazysim.core.random import episode_keys, uniform
 from crazysim.core.settings import check_settings, setting
 from crazysim.scene.first_hit import Target
 from crazysim.scene.hit_color import MAX_LEVELS, Light, Paint, View
@@ -52,11 +52,9 @@ class RandomColors:
             body_index: ``Target.body_index`` of each geom.
             n_lights: Number of lights.
         """
-        # The keys of the first step, so that an episode keeps its colours.
-        first = data.replace(core=data.core.replace(steps=jnp.zeros_like(data.core.steps)))
         n_bodies, dtype = max(body_index, default=0) + 1, paint.looks.dtype
         draw = jax.vmap(lambda key: uniform(key, (n_bodies * 3 + n_lights * 4,), dtype))
-        numbers = 2 * draw(world_keys(first, "colors")) - 1
+        numbers = 2 * draw(episode_keys(data, "colors")) - 1
         by_body = numbers[:, : n_bodies * 3].reshape(len(numbers), n_bodies, 3)[:, np.asarray(body_index, int)]
         by_light = numbers[:, n_bodies * 3 :].reshape(len(numbers), n_lights, 4)
         looks = jnp.broadcast_to(paint.looks[: len(body_index)], (*by_body.shape[:2], paint.looks.shape[1]))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
@@ -46,7 +48,7 @@ class CameraImages(Wrapper):
         self._period = sim.freq // rate_in(camera, env.base.freq)
         """Physics steps from one image to the next."""
         camera.check(sim, self._period)
-        self._is_immediate = self._period == env.n_substeps and camera.latency == 0
+        self._is_immediate = self._period == env.n_substeps and not np.any(camera.latency)
         """Whether each environment step takes an image that is observed at its end."""
         self._take_images = camera.image_fn(sim)
 

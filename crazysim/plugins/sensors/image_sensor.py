@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
-from crazysim.core.random import drone_keys
+from crazysim.core.random import drone_keys, episode_keys
 from crazysim.core.settings import setting
 from crazysim.drones.body import body_shape
 from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import Stage
-from crazysim.errors import ConfigError, short_repr
+from crazysim.errors import ConfigError, require, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
 from crazysim.scene.ray_casting import body_names
@@ -87,8 +87,9 @@ class ImageSensor(Plugin):
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
     """Images per second, Hz, a divisor of ``sim.freq``, or in an environment of ``env.freq``; None for every step."""
-    latency: float = setting(default=0.0, low=0.0, high=MAX_DELAY)
-    """Time from image to delivery, s, rounded to steps."""
+    latency: ArrayLike = setting(default=0.0, low=0.0, high=MAX_DELAY, shapes=((), (2,)))
+    """Time from image to delivery, s, rounded to steps, or the shortest and longest, between which each world draws
+    one in every episode. () or (2,)"""
     name: str = "images"
 
     def __post_init__(self) -> None:
@@ -100,6 +101,10 @@ class ImageSensor(Plugin):
                 f"expected outputs of {self.name!r} as a list of {', '.join(map(repr, OUTPUTS))}, got "
                 f"{short_repr(outputs)}. Use outputs=('depth',), say."
             )
+        require(
+            bool(np.all(np.diff(np.atleast_1d(self.latency)) >= 0)),
+            f"expected a range of latency of {self.name!r}, the shortest first, got {self.latency!r}.",
+        )
 
     @property
     def rays(self) -> np.ndarray:
@@ -159,7 +164,7 @@ class ImageSensor(Plugin):
         """
         (height, width), camera = self.image_size, CarriedCamera.on_drone(self._drone_camera(sim), 0)
         sensor = {"sensor": self.name, **self.optics, "pos": list(camera.pos), "rot": [list(x) for x in camera.rot]}
-        sensor |= {"freq": self.freq, "latency": float(self.latency)}
+        sensor |= {"freq": self.freq, "latency": np.asarray(self.latency, np.float64).tolist()}
         formats = {}
         for name in self.outputs:
             unit = {"normal": "1", "segmentation": "index"} | dict.fromkeys(COLORS, "1")
@@ -264,7 +269,7 @@ class ImageSensor(Plugin):
 
         def capture_images(record: ImageData) -> ImageData:
             images = take_images(data)
-            if not latency:
+            if not record.transit:
                 return record.replace(images=jax.tree.map(select_due, images, record.images))
             queues = {k: jnp.concatenate([x[:, :, None], record.transit[k][:, :, :-1]], 2) for k, x in images.items()}
             return record.replace(transit=jax.tree.map(select_due, queues, record.transit))
@@ -276,7 +281,7 @@ class ImageSensor(Plugin):
         )
         # Images are numbered from the beginning of the episode; the first one is delivered at once.
         delivered_index = jnp.maximum((steps - latency) // period, 0)
-        if latency:
+        if record.transit:
             row = steps // period - delivered_index
 
             def read_row(queue: Array) -> Array:
@@ -327,9 +332,17 @@ class ImageSensor(Plugin):
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
         return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline)
 
-    def _latency_steps(self, data: SimData) -> int:
-        return math.floor(float(self.latency) * data.core.freq + 0.5)
+    def _latency_range(self, freq: int) -> tuple[int, int]:
+        low, high = np.broadcast_to(np.asarray(self.latency, np.float64), 2).tolist()
+        return math.floor(low * freq + 0.5), math.floor(high * freq + 0.5)
+
+    def _latency_steps(self, data: SimData) -> Array | int:
+        low, high = self._latency_range(data.core.freq)
+        if low == high:
+            return low
+        draw = jax.vmap(lambda key: jax.random.randint(key, (1,), low, high + 1))
+        return draw(episode_keys(data, f"latency of {self.name}"))
 
     def _n_rows(self, data: SimData, period: int) -> int:
-        latency = self._latency_steps(data)
+        _, latency = self._latency_range(data.core.freq)
         return -(-latency // period) + 1 if latency else 0
