@@ -91,7 +91,7 @@ class TimeTrial(Race):
     """Distance that the plan keeps from the edges of the gates, and the drone from the floor, m."""
     width: float = setting(default=1.0, positive=True)
     """Largest distance from the plan, m."""
-    slack: float = setting(default=0.03, low=0.0)
+    slack: float = setting(default=0.05, low=0.0)
     """Time that a flight may take longer than the plan, as a fraction of its duration."""
     phase: Array = state((1,))
     """Time of the plan at the place of the drone, s."""
