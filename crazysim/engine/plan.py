@@ -387,13 +387,9 @@ def _join_runs(
 
 
 def _input_leaves(program: Program) -> list[int]:
-    # These are the leaves that it reads, and one leaf of the drones, because its shape gives the number of worlds. If
-    # unfused stages split the step, all leaves that are written or checked are passed too.
-    in_rows = {i for leaf in program.leaves for i in leaf.row_leaves}
-    separate = [i for i, leaf in enumerate(program.leaves) if not leaf.row_leaves and i not in in_rows]
-    drone_leaves = [i for i in separate if program.leaves[i].scope == "drone"]
+    # If unfused stages split the step, all leaves that are written or checked are passed too.
     if program.fused:
-        needed = kernel.needed_leaves(program)
-        return [*needed, next((i for i in drone_leaves if i in needed), drone_leaves[0])]
+        return kernel.input_leaves(program)
     checked = [leaf for leaf, _ in program.check_segment.reads] if program.check_segment is not None else []
-    return [*program.read_leaves, *program.written_leaves, *checked, drone_leaves[0]]
+    drone_leaf = next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")
+    return [*program.read_leaves, *program.written_leaves, *checked, drone_leaf]

@@ -230,6 +230,30 @@ def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
     assert "st.global" in cuda.ptx(kernel.write_kernel(tangent_program, "cuda"), cuda.DEFAULT_ARCHITECTURE)
 
 
+def mix(data):
+    """Push all drones by their mean velocity, as an undeclared stage of all worlds."""
+    force = -0.1 * jnp.mean(data.states.vel, axis=(0, 1))
+    return data.replace(states=data.states.replace(force=jnp.broadcast_to(force, data.states.force.shape)))
+
+
+@pytest.mark.long("compiles both derivatives of two parts as kernels, and of plain stages to compare")
+@needs_compiler
+def test_an_unfused_stage_splits_the_gradient_into_kernels_too(x64):
+    ((fast, step, data), (plain, *_)), point = make_losses(stages=(mix,), n_steps=3)
+    points = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), point)
+    results = [
+        jax.jit(lambda losses=losses: (
+            jit_gradient(losses)(point), jax.jvp(losses, (point,), (point,)), jax.vmap(jit_gradient(losses))(points)
+        ))()
+        for losses in (fast, plain)
+    ]  # fmt: skip
+    assert_close(*results)
+    lines = explain(step, data).splitlines()
+    assert "splits the step: 'mix' is not fused: it is not declared for one drone or one world" in lines
+    assert not [line for line in lines if line.startswith(("gradient: on lanes", "jvp: on lanes"))]
+    assert [line for line in lines if line.startswith("gradient: one kernel")]
+
+
 def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
     """The gradient is a kernel or runs on lanes; a kernel of the CPU supports up to 8 drones that act on each other."""
     if cuda.nvrtc() is None:

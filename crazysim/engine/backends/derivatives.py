@@ -200,10 +200,6 @@ def _compute_cotangents(platform: str, *args: Any, spec: DerivativeSpec) -> list
 
 def _transpose(operands: Sequence[Any], seeds: Sequence[Any], spec: DerivativeSpec, **params: Any) -> list[Array]:
     del params
-    kernels = spec.kernels
-    if not kernels.program.fused:  # unfused stages may have side effects, such as printing; a primitive cannot
-        kernels.cotangent_kernel(spec.perturbed, kernels.location.platform)  # returns None, and records the reason
-        return _compute_cotangents_on_lanes(*operands, *seeds, spec=spec)
     return cotangent_p.bind(*operands, *seeds, spec=spec)
 
 

@@ -28,7 +28,6 @@ from crazysim.engine.ir.program import Program
 from crazysim.engine.passes.layout import packed_rows
 from crazysim.engine.pytree import replace_leaves
 from crazysim.engine.sharding import Location
-from crazysim.engine.stage import PHASES, Phase
 from crazysim.errors import ConfigError
 
 
@@ -110,16 +109,15 @@ def build(program: Program, location: Location, unpacked_program: Program | None
         UnsupportedError: If an operation or type has no source.
         KernelError: If the compiler refuses a kernel or takes too long.
     """
-    kernels = Kernels(program, location) if program.fused else None
-    run = _run_parts(program, location) if kernels is None else partial(_call_kernel, kernels)
+    if not program.fused:
+        return FusedRun(_run_parts(program, location), None)
+    kernels = Kernels(program, location)
+    run = _make_batchable(program, partial(_call_kernel, kernels))
     if unpacked_program is not None:
-        return FusedRun(
-            make_differentiable(_make_batchable(program, run), _run_without_rows(program, unpacked_program, location)),
-            kernels,
-        )
+        return FusedRun(make_differentiable(run, _run_without_rows(program, unpacked_program, location)), kernels)
     run_on_lanes = lanes.build(program, location)
     derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, run_on_lanes)
-    return FusedRun(make_differentiable(_make_batchable(program, run), run_on_lanes, derivatives), kernels)
+    return FusedRun(make_differentiable(run, run_on_lanes, derivatives), kernels)
 
 
 DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
@@ -134,8 +132,8 @@ def describe(program: Program, platform: str, devices: Sequence[jax.Device] | No
 
 def describe_derivatives(program: Program) -> list[str]:
     """Return a line for each way in which derivatives of a program were computed so far."""
-    derivatives = DERIVATIVE_KERNELS.get(program)
-    return [] if derivatives is None else list(derivatives.descriptions)
+    derivatives = (DERIVATIVE_KERNELS.get(part) for part in _parts(program))
+    return [line for x in derivatives if x is not None for line in x.descriptions]
 
 
 def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
@@ -145,7 +143,6 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
         out_batched = ([True] * len(program.written_leaves), True)
         if (
             count_batched
-            or not program.fused
             or any(b and not has_axis for b, has_axis in zip(leaves_batched, have_world_axis, strict=True))
         ):
             # Batches run one by one if they cannot be joined, for example because their shared parameters differ.
@@ -196,46 +193,46 @@ def _run_without_rows(program: Program, unpacked_program: Program, location: Loc
     return run
 
 
-def _parts(program: Program) -> list[Program]:
-    return [program] if program.fused else list(program.parts())
+def _parts(program: Program) -> Sequence[Program]:
+    return [program] if program.fused else program.parts
 
 
-def _run_parts(program: Program, location: Location) -> CountedRun:
-    parts = _parts(program)
-    # Compilers run in parallel.
+def _run_parts(program: Program, location: Location) -> Run:
+    parts = program.parts
+    # Compilers run in parallel. Each part has its own derivative, and JAX chains them.
     with native.compiling_threads() as pool:
-        kernels = list(pool.map(lambda part: Kernels(part, location) if part.fused else None, parts))
-    runs = [None if x is None else partial(_call_kernel, x) for x in kernels]
-    runs_by_phase: dict[Phase, list[Any]] = {
-        phase: [(part, run) for part, run in zip(parts, runs, strict=True) if part.segments[0].phase == phase]
-        for phase in PHASES
-    }
-    loop_leaves = sorted({i for part, _ in runs_by_phase["each"] for i in part.written_leaves})
+        runs = list(pool.map(lambda x: build(x, location) if x.fused else partial(lanes.run_steps, x), parts))
+    # A derivative keeps the inputs of its part.
+    inputs = [frozenset(kernel.input_leaves(x) if x.fused else range(len(x.leaves))) for x in parts]
+    loop = [k for k, part in enumerate(parts) if part.phase_segments("each")] or [len(parts)]
+    first, end = loop[0], loop[-1] + 1
+    loop_leaves = sorted({i for part in parts[first:end] for i in part.written_leaves})
 
-    def run_phase(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
-        for part, run in runs_by_phase[phase]:
-            results, _ = lanes.run_steps(part, leaves, 1) if run is None else run(leaves, count)
+    def run_range(start: int, end: int, leaves: list[Any], n_steps: int | Array) -> list[Any]:
+        for part, run, used in zip(parts[start:end], runs[start:end], inputs[start:end], strict=True):
+            results, _ = run([x if i in used else None for i, x in enumerate(leaves)], n_steps)
             leaves = replace_leaves(leaves, part.written_leaves, results)
         return leaves
 
-    def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-        one_step = jnp.asarray(1, jnp.int32)
-        leaves = run_phase("before", leaves, one_step)
-        # A single kernel loops over steps itself; several parts share a loop.
-        if [part.fused for part, _ in runs_by_phase["each"]] == [True]:
-            leaves = run_phase("each", leaves, count)
-        elif runs_by_phase["each"]:
+    def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        leaves = run_range(0, first, leaves, 1)
+        if len(loop) == 1:  # a kernel loops over steps itself
+            leaves = run_range(first, end, leaves, n_steps)
+        else:
 
-            def body(_: Any, values: list[Any]) -> list[Any]:
-                leaves_after = run_phase("each", replace_leaves(leaves_before, loop_leaves, values), one_step)
+            def advance(values: list[Any]) -> list[Any]:
+                leaves_after = run_range(first, end, replace_leaves(leaves_before, loop_leaves, values), 1)
                 return [leaves_after[i] for i in loop_leaves]
 
-            leaves_before = leaves
-            leaves = replace_leaves(
-                leaves_before, loop_leaves, jax.lax.fori_loop(0, count, body, [leaves_before[i] for i in loop_leaves])
+            leaves_before, values = leaves, [leaves[i] for i in loop_leaves]
+            values = (
+                lanes.repeat(advance, values, n_steps)
+                if isinstance(n_steps, int)
+                else jax.lax.fori_loop(0, n_steps, lambda _, x: advance(x), values)
             )
+            leaves = replace_leaves(leaves, loop_leaves, values)
         flagged = lanes.nonfinite_worlds(program, lanes.LeafValues(program, leaves))
-        leaves = run_phase("after", leaves, one_step)
+        leaves = run_range(end, len(parts), leaves, 1)
         return [leaves[i] for i in program.written_leaves], flagged
 
     return run

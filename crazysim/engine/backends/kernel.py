@@ -204,6 +204,14 @@ def needed_leaves(program: Program) -> tuple[int, ...]:
     return tuple(sorted({leaf for leaf, _ in _loaded_slots(program)}))
 
 
+def input_leaves(program: Program) -> list[int]:
+    """Return the leaves that the kernel reads, and one of the drones, whose shape gives the number of worlds."""
+    in_rows = {i for leaf in program.leaves for i in leaf.row_leaves}
+    leaves, needed = enumerate(program.leaves), needed_leaves(program)
+    drone_leaves = [i for i, x in leaves if x.scope == "drone" and not x.row_leaves and i not in in_rows]
+    return [*needed, next((i for i in drone_leaves if i in needed), drone_leaves[0])]
+
+
 def _written_slots(program: Program) -> list[Slot]:
     return [(leaf, k) for leaf in program.written_leaves for k in range(program.leaves[leaf].size)]
 

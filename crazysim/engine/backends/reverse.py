@@ -320,7 +320,8 @@ def write_kernel(reverse: ReverseProgram, target: str) -> Kernel:
         *(s.block for s in step_segments for _ in range(2)),
         *(reverse.backward_segments[s].block for s in step_segments),
     ]
-    return kernel_body.finish_kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carry))
+    n_stored = max(len(carry), 1)  # a part of a step may change nothing that it reads
+    return kernel_body.finish_kernel(pointers, needed_leaves(reverse), (), (), blocks, n_stored)
 
 
 def _write_backward(

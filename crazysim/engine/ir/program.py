@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -223,11 +223,18 @@ class Program:
                 )
         return slots
 
-    def parts(self) -> Iterator[Program]:
-        """Iterate over parts of the program in order: fused segments that one kernel can run, or one unfused stage.
+    @functools.cached_property
+    def parts(self) -> tuple[Program, ...]:
+        """Parts of the program in order: fused segments that one kernel can run, or one unfused stage.
 
-        All segments of a part have the same phase.
+        If all stages of a step are fused and nothing is checked after the last one, a part has segments of all phases.
+        Otherwise the segments of a part have the same phase.
         """
-        groups = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
-        for _, segments in groups:
-            yield dataclasses.replace(self, segments=tuple(segments), check_segment=None, scratch=frozenset())
+        loops = self.check_segment is None and not any(s.phase == "each" for s in self.unfused_stages)
+        groups = itertools.groupby(
+            self.segments, lambda s: (loops or s.phase, id(s) if isinstance(s, UnfusedStage) else 0)
+        )
+        return tuple([
+            dataclasses.replace(self, segments=tuple(segments), check_segment=None, scratch=frozenset())
+            for _, segments in groups
+        ])  # fmt: skip

@@ -21,8 +21,6 @@ def prepare_derivative(program: Program, perturbed: Collection[int]) -> tuple[Pr
     Raises:
         UnsupportedError: If the program has no derivative in a kernel.
     """
-    if not program.fused:
-        raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
     if program.rows:
         raise LimitError("rows of packed leaves have no gradient in a kernel")
     program = dataclasses.replace(program, check_segment=None)
