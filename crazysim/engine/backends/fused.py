@@ -141,9 +141,8 @@ def _make_batchable(program: Program, run: CountedRun) -> CountedRun:
         leaves_batched, count_batched = in_batched
         have_world_axis = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written_leaves), True)
-        if (
-            count_batched
-            or any(b and not has_axis for b, has_axis in zip(leaves_batched, have_world_axis, strict=True))
+        if count_batched or any(
+            b and not has_axis for b, has_axis in zip(leaves_batched, have_world_axis, strict=True)
         ):
             # Batches run one by one if they cannot be joined, for example because their shared parameters differ.
             broadcast_leaves = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
