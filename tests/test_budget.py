@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 17519,
     "media": 1087,
     "plugins": 4908,
-    "scene": 2920,
+    "scene": 2938,
     "sim": 914,
     "train": 2628,
     "trajectories": 497,

@@ -20,7 +20,7 @@ from crazysim.engine.errors import report_unsupported
 from crazysim.engine.index_map import map_indices
 from crazysim.engine.pytree import PyTree, static
 from crazysim.engine.sharding import map_devices
-from crazysim.errors import UnsupportedError
+from crazysim.errors import ConfigError, UnsupportedError
 from crazysim.geometry import Shape, ray_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.geometry.points import components
@@ -52,6 +52,9 @@ MAX_LOOP_RAYS = 64
 """Largest number of rays in a loop within a step; an index computed at run time selects among at most 64 entries."""
 
 
+MIN_COSINE = 0.05
+"""Smallest cosine between rays and normals in derivatives of distances, which it limits to 20 m/m where rays graze
+surfaces."""
 MAX_DEPTH_BELOW_FLOOR = 0.1
 """Depth below the floor from which sensors are moved up, m: drones land at -1 mm, and may carry sensors below that."""
 FLOOR_CLEARANCE = 1e-5
@@ -296,8 +299,8 @@ def cast_rays_in_worlds(
     """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
     A function of one ray finds the distance and the nearest geom without derivatives, in a kernel of the engine if
-    possible. A second function finds the normal at that point. XLA computes the derivatives, from the nearest geom
-    alone. Inside ``jit``, unused results are not computed.
+    possible. A second function finds the normal at that point. The derivative of a distance is that of the distance to
+    the tangent plane there, without the motion of edges. Inside ``jit``, unused results are not computed.
 
     Args:
         model: Model, without bodies whose poses are not part of the data.
@@ -337,22 +340,57 @@ def cast_rays_in_worlds(
         color = packed.reshape(n_worlds, -1)  # unpacked when its pixels are in the order of the image
     if not targets.all_geoms:
         return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names, color)
-    # Distance and normal again in JAX, for their derivatives.
+    # The normal, in a kernel if possible, and derivatives of both.
     fixed_rows = jnp.broadcast_to(
         tables.fixed_geoms[: len(targets.fixed_geoms)], (n_worlds, len(targets.fixed_geoms), 16)
     )
     rows = jnp.concatenate([fixed_rows, movable], axis=1)
     rows = jnp.take_along_axis(rows, jnp.maximum(geom_index, 0)[..., None], axis=1)
-    differentiable_distance, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
-    distance = _replace_derivative(distance, differentiable_distance)
-    normal = normal_at(distance)
-    # A kernel computes the normals, too; their derivatives stay JAX's.
-    if platform is not None:
+    _, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
+    if platform is None:
+        normal = normal_at(distance)
+    else:
         ray_fn = functools.partial(normal_at_hit, targets.surfaces, n_pixels, n_cameras)
-        kernel_normal = map_indices(ray_fn, n, [*tables, *hit_table], platform, compile_now=False)
-        normal = _replace_derivative(jnp.stack(kernel_normal, axis=-1).reshape(normal.shape), normal)
+        normal = jnp.stack(map_indices(ray_fn, n, [*tables, *hit_table], platform, compile_now=False), axis=-1)
+        normal = normal.reshape(*distance.shape, 3)
+    distance = _replace_derivative(distance, _gap(distance, normal, rows, origin, direction))
+    normal = _replace_derivative(normal, normal_at(distance))
     body_indices = jnp.asarray([*(target.body_index for target in targets.all_geoms), -1], jnp.int32)
     return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names, color)
+
+
+def _gap(distance: Array, normal: Array, rows: Array, origin: Array, direction: Array) -> Array:
+    # Has the derivative of the distances to the tangent planes of the surfaces, which move with their geoms.
+    length = _hold(jnp.where(jnp.isfinite(distance), distance, 0.0))
+    cosine = jnp.sum(normal * direction, axis=-1)
+    cosine = jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), MIN_COSINE)
+    weight, end = normal / cosine[..., None], origin + length[..., None] * direction
+    axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
+    local_weight = _hold(jnp.sum(axes * weight[..., None], axis=-2))
+    local_end = jnp.sum(axes * (_hold(end) - rows[..., :3])[..., None], axis=-2)
+    return -jnp.sum(_hold(weight) * end, axis=-1) - jnp.sum(local_weight * local_end, axis=-1)
+
+
+@jax.custom_jvp
+def _hold(x: Array) -> Array:
+    return x
+
+
+@_hold.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return _refuse_derivative(primals[0]), jnp.zeros_like(tangents[0])
+
+
+@jax.custom_jvp
+def _refuse_derivative(x: Array) -> Array:
+    return x
+
+
+@_refuse_derivative.defjvp
+def _(*_: Any) -> tuple[Array, Array]:
+    raise ConfigError(
+        "expected the first derivative of distances of rays, got a second one. Use central differences of the first."
+    )
 
 
 @dataclasses.dataclass

@@ -8,6 +8,7 @@ import pytest
 from cases import with_states
 
 from crazysim import Camera, ConfigError, RangeFinder, Sim, Terrain, rotation
+from crazysim.scene.ray_casting import MIN_COSINE
 
 SIZE = {"width": 9, "height": 6}
 
@@ -113,3 +114,71 @@ def test_sensors_of_landed_drones_see_the_ground(ground):
     distance = np.asarray(ranges.read(sim.data).distance)[:, 0]
     np.testing.assert_allclose(distance[0], [0, 4, 4, 4], atol=2e-3)
     assert distance[1, 3] < 2e-3
+
+
+KINDS = {
+    "ball": 'type="sphere" size=".25"', "brick": 'type="box" size=".2 .3 .25" euler="20 0 40"',
+    "pill": 'type="capsule" size=".15 .2"', "can": 'type="cylinder" size=".2 .25"',
+    "egg": 'type="ellipsoid" size=".15 .2 .3"', "tip": 'type="mesh" mesh="wedge"',
+}  # fmt: skip
+WEDGE = '<asset><mesh name="wedge" vertex="-.2 -.2 -.2 .4 0 0 0 .5 0 0 0 .6"/></asset>'
+
+
+@pytest.mark.long("compiles a step with images in float64, and its derivatives")
+def test_derivatives_of_images_are_central_differences(x64, rng):
+    """Depths after three steps, away from edges: moving drones in random scenes of movable objects of all kinds."""
+    n = 16
+    sim = Sim(n, 2, control="attitude", freq=100)
+    for name, geom in KINDS.items():
+        sim.scene.add(f"<mujoco>{WEDGE}<worldbody><geom {geom}/></worldbody></mujoco>", name, pos=[0, 0, -9])
+    camera = Camera(16, 12, fovy=50.0, outputs=("depth", "normal", "segmentation"), max_depth=4.0)
+    as_float64 = lambda x: jnp.asarray(x, np.float64) if x.dtype == np.float32 else x  # noqa: E731
+    data = jax.tree.map(as_float64, sim.data)
+    take_images, step = camera.image_fn(sim), sim.build_step_fn()
+    # Drones face each other, and the objects are between and around them.
+    pos = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 1.8], (n, 2, 3)) + [[-0.4, 0, 0], [0.4, 0, 0]]
+    object_pos = rng.uniform([-1, -1.2, 0.6], [1, 1.2, 2.4], (n, 1, len(KINDS), 3))
+    quat = 0.1 * rng.normal(size=(n, 2, 4)) + [[0, 0, 0, 1.0], [0, 0, 1.0, 0]]
+    args = pos, quat, rng.normal(size=(n, 2, 3)), object_pos, rng.normal(size=(n, 1, len(KINDS), 4))
+
+    def fly(pos, quat, vel, object_pos, object_quat):
+        quat, object_quat = (q / jnp.linalg.norm(q, axis=-1, keepdims=True) for q in (quat, object_quat))
+        states = data.states.replace(pos=pos, quat=quat, vel=vel)
+        moved = data.objects.replace(pos=object_pos, quat=object_quat)
+        data_after = step(data.replace(states=states, objects=moved), 3)
+        return take_images(data_after)["depth"], (take_images(data_after), data_after.states.quat)
+
+    shifts = tuple(rng.normal(size=x.shape) for x in args)
+    h, fly = 1e-6, jax.jit(fly)
+    (low, (images, quat_after)), (high, (images_high, _)) = (
+        jax.device_get(fly(*(x + sign * h * shift for x, shift in zip(args, shifts, strict=True)))) for sign in (-1, 1)
+    )
+    # No edge passes a pixel, and no ray grazes a surface.
+    rays = np.asarray(rotation.rotate(quat_after[:, :, None, None], camera.rays))
+    normals = np.asarray(rotation.rotate(quat_after[:, :, None, None], images["normal"]))
+    is_smooth = (images["segmentation"] == images_high["segmentation"]) & (low < 4) & (high < 4)
+    is_smooth &= np.abs(images["normal"] - images_high["normal"]).max(axis=-1) < 1e-3
+    is_smooth &= np.abs(np.sum(normals * rays, axis=-1)) > MIN_COSINE
+    names = {camera.segment_names(sim)[k].partition(":")[0] for k in np.unique(images["segmentation"][is_smooth])}
+    assert names == {"floor", "drone", *KINDS}
+    # Forward mode by pixel, and reverse mode of a weighted sum.
+    depth = lambda *args: fly(*args)[0]  # noqa: E731
+    tangent = jax.device_get(jax.jit(lambda *args: jax.jvp(depth, args, shifts)[1])(*args))
+    np.testing.assert_allclose(tangent[is_smooth], ((high - low) / (2 * h))[is_smooth], rtol=1e-3, atol=1e-5)
+    assert not tangent[(low == 4) & (high == 4)].any()
+    weight = rng.normal(size=low.shape)
+    gradients = jax.jit(jax.grad(lambda *args: jnp.sum(weight * depth(*args)), range(5)))(*args)
+    slope = sum(np.sum(g * shift) for g, shift in zip(gradients, shifts, strict=True))
+    np.testing.assert_allclose(slope, np.sum(weight * tangent), rtol=1e-9)
+
+
+def test_law_09_images_have_no_second_derivative():
+    sim = Sim(control="attitude")
+    take_images = Camera(2, 2).image_fn(sim)
+
+    def depth(height):
+        pos = sim.data.states.pos.at[..., 2].set(height)
+        return jnp.sum(take_images(sim.data.replace(states=sim.data.states.replace(pos=pos)))["depth"])
+
+    with pytest.raises(ConfigError, match=r"second one. Use central differences of the first"):
+        jax.grad(jax.grad(depth))(1.0)
