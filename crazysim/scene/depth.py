@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,9 @@ MAX_RAYS_OF_KERNEL = 1 << 28
 TILE_SIDE = 4
 """Height and width of tiles, pixels. Rays are ordered tile by tile, so that neighbouring lanes of a kernel meet similar
 geoms."""
+
+FAR_AWAY = 1e6
+"""Distance of the sky, m, for its motion between two images: so far that only rotations move it."""
 
 HIDDEN_TOLERANCE = 1e-3
 """Part of the distance by which a surface must be nearer to hide another: more than rounding, less than objects."""
@@ -170,7 +173,7 @@ def check_image_memory(
 
 
 DepthFn = Callable[..., Hits]
-"""``depth(data, mocap=None) -> Hits``."""
+"""``depth(data, mocap=None, before=None) -> Hits``."""
 
 
 def build_depth_fn(
@@ -185,7 +188,7 @@ def build_depth_fn(
     baseline: float = 0.0,
     appearance: Appearance | None = None,
 ) -> DepthFn:
-    """Return ``depth(data, mocap=None) -> Hits``; see ``Scene.depth_fn``.
+    """Return ``depth(data, mocap=None, before=None) -> Hits``; see ``Scene.depth_fn``.
 
     The images have shape (n_worlds, n_cameras, height, width), or without n_worlds in a function of one world.
 
@@ -220,37 +223,59 @@ def build_depth_fn(
 
     ignored_drones = directions[..., 3].reshape(-1).astype(int)
 
-    def cast_in_worlds(data: SimData, kernels: RayKernels) -> Hits:
+    def views(data: SimData) -> Array:
+        # Position and axes of each camera, as in ``Tables.camera_poses``. (..., n_cameras, 12)
         poses = []
         for camera in cameras:
             pos, rot = camera_pose(camera, data)
-            poses.append((pos if camera.carrier == "world" else raise_to_floor(model, pos), rot))
+            pos = pos if camera.carrier == "world" else raise_to_floor(model, pos)
+            poses.append(jnp.concatenate([pos, rot.reshape(*rot.shape[:-2], 9)], axis=-1))
+        return jnp.stack(poses, axis=-2)
+
+    def rays_of(poses: Array, shift: float = 0.0) -> tuple[Array, Array]:
+        # Origins and directions, world frame, of views that are shifted to the right, m. (..., n_rays, 3) each
+        right = poses[..., 3::3]
+        origin = poses[..., :3] + shift * right if shift else poses[..., :3]
+        return jnp.repeat(origin, height * width, axis=-2), _rotate_directions(poses, directions)
+
+    def cast_in_worlds(data: SimData, kernels: RayKernels, before: SimData | None = None) -> Hits:
+        poses = views(data)
         if data.states.pos.ndim == 2:
             require(appearance is None, "expected data of all worlds for colours, got data of one world")
-            origin = jnp.concatenate([jnp.broadcast_to(pos, (height * width, 3)) for pos, _ in poses])
-            direction = jnp.concatenate(
-                [_rotate_directions(rot, pixel_rows) for (_, rot), pixel_rows in zip(poses, directions, strict=True)]
+            hits = cast_rays(model_without_mocap, data, *rays_of(poses), ignored_drones, drones)
+        else:
+            hits = cast_rays_in_worlds(
+                model_without_mocap, data, poses, directions, drones, kernels, appearance, pixel_angle
             )
-            hits = cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones)
-            return untile_results(find_hidden(data, kernels, poses, hits))
-        camera_poses = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1) for pos, rot in poses], axis=1)
-        hits = cast_rays_in_worlds(
-            model_without_mocap, data, camera_poses, directions, drones, kernels, appearance, pixel_angle
-        )
-        return untile_results(find_hidden(data, kernels, poses, hits))
+        if baseline:
+            is_hidden = find_hidden(data, kernels, rays_of(poses, baseline)[0], hits.point)
+            hits = hits.replace(is_hidden=is_hidden & jnp.isfinite(hits.distance))
+        if before is not None:
+            hits = trace_back(data, before, kernels, rays_of(poses)[1], hits)
+        return untile_results(hits)
 
-    def find_hidden(data: SimData, kernels: RayKernels, poses: Sequence[tuple[Array, Array]], hits: Hits) -> Hits:
-        if not baseline:
-            return hits
-        origins = [(pos + baseline * rot[..., 0])[..., None, :] for pos, rot in poses]
-        shape = (*hits.point.shape[:-2], height * width, 3)
-        origin = jnp.concatenate([jnp.broadcast_to(x, shape) for x in origins], axis=-2)
-        origin, point = jax.lax.stop_gradient((origin, hits.point))
+    def find_hidden(data: SimData, kernels: RayKernels, origin: Array, point: Array) -> Array:
+        origin, point = jax.lax.stop_gradient((origin, point))
         distance = rotation.safe_norm(point - origin)
         direction = rotation.safe_normalize(point - origin, jnp.asarray([1.0, 0.0, 0.0], point.dtype))
         second = cast_rays(model_without_mocap, data, origin, direction, ignored_drones, drones, kernels=kernels)
-        is_nearer = second.distance < (1 - HIDDEN_TOLERANCE) * distance[..., 0]
-        return hits.replace(is_hidden=is_nearer & jnp.isfinite(hits.distance))
+        return second.distance < (1 - HIDDEN_TOLERANCE) * distance[..., 0]
+
+    def trace_back(data: SimData, before: SimData, kernels: RayKernels, direction: Array, hits: Hits) -> Hits:
+        # A point moves with its body; the sky stays in its direction.
+        index = jnp.maximum(hits.body_index, 0)[..., None]
+        (earlier_pos, earlier_quat), (pos, quat) = (
+            [jnp.take_along_axis(x, index, axis=-2) for x in body_poses(model_without_mocap, x)] for x in (before, data)
+        )
+        point = rotation.rotate(earlier_quat, rotation.rotate_inverse(quat, hits.point - pos), earlier_pos)
+        earlier_views = views(before)
+        origin = rays_of(earlier_views)[0]
+        point = jnp.where(jnp.isfinite(hits.distance)[..., None], point, origin + FAR_AWAY * direction)
+        axes = jnp.repeat(earlier_views[..., 3:], height * width, axis=-2)
+        return hits.replace(
+            earlier_point=jnp.concatenate([rotation.dot(axes[..., k::3], point - origin) for k in range(3)], axis=-1),
+            was_hidden=find_hidden(before, kernels, origin, point),
+        )
 
     def untile_results(hits: Hits) -> Hits:
         cosine = jnp.asarray(-directions[..., 2].reshape(-1), hits.distance.dtype) if along == "axis" else 1.0
@@ -269,43 +294,58 @@ def build_depth_fn(
             body_index=untile(hits.body_index, 0),
             color=None if hits.color is None else _unpack_color(untile(hits.color, 0)),
             is_hidden=None if hits.is_hidden is None else untile(hits.is_hidden, 0),
+            earlier_point=None if hits.earlier_point is None else untile(hits.earlier_point, 1),
+            was_hidden=None if hits.was_hidden is None else untile(hits.was_hidden, 0),
         )
 
     # Poses of mocap bodies become part of the data before the rays are cast.
     model_without_mocap = model.without_mocap_bodies()
 
-    def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
-        require_states(data, ("pos", "quat"), batched=False)
-        require(
-            data.states.pos.ndim != 1, "expected data of all worlds or of one world for images, got data of one drone"
-        )
+    def depth(data: SimData, mocap: MocapPoses = None, before: SimData | None = None) -> Hits:
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
-        require_poses(model, bodies, mocap)
-        data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
-        if data.states.pos.ndim == 2:
-            return cast_in_worlds(data, kernels)
-        return kernels.run_on_each_device(cast_in_parts, data)
 
-    def cast_in_parts(data: SimData, kernels: RayKernels) -> Hits:
+        def with_all_poses(data: SimData) -> SimData:
+            require_states(data, ("pos", "quat"), batched=False)
+            require(
+                data.states.pos.ndim != 1,
+                "expected data of all worlds or of one world for images, got data of one drone",
+            )
+            require_poses(model, bodies, mocap)
+            return with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
+
+        data = with_all_poses(data)
+        if before is None:
+            in_one_world = data.states.pos.ndim == 2
+            return cast_in_worlds(data, kernels) if in_one_world else kernels.run_on_each_device(cast_in_parts, data)
+        require(kernels.mesh is None, "expected worlds on one device for an earlier time, got a mesh. Leave out mesh=.")
+        before = with_all_poses(before)
+        return (cast_in_worlds if data.states.pos.ndim == 2 else cast_in_parts)(data, kernels, before)
+
+    def cast_in_parts(data: SimData, kernels: RayKernels, before: SimData | None = None) -> Hits:
         # Batches of worlds that fit into memory.
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, worlds_per_batch = data.states.pos.shape[0], max(1, max_rays // n_rays)
         if n_worlds <= worlds_per_batch:
-            return cast_in_worlds(data, kernels)
-        objects, core = None if data.objects is None else data.objects.replace(mocap_ids=None), data.core
+            return cast_in_worlds(data, kernels, before)
+        core = data.core
         # Colours may differ by world and episode.
         keyed_fields = () if appearance is None else ("world_id", "episode", "steps", "drone_id", "rng_key")
         keys = {name: getattr(core, name) for name in keyed_fields if name != "rng_key" or core.rng_key.ndim}
 
-        def cast_in_world(poses: MocapPoses) -> Hits:
-            pos, quat, objects, keys = jax.tree.map(lambda x: x[None], poses)
-            states = data.states.replace(pos=pos, quat=quat)
-            world_data = data.replace(states=states, objects=objects, core=core.replace(**keys))
-            return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data, kernels))
+        def poses_of(data: SimData) -> tuple[Any, ...]:
+            objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
+            return data.states.pos, data.states.quat, objects
 
-        return jax.lax.map(
-            cast_in_world, (data.states.pos, data.states.quat, objects, keys), batch_size=worlds_per_batch
-        )
+        def cast_in_world(parts: Any) -> Hits:
+            keys, *poses = jax.tree.map(lambda x: x[None], parts)
+            world_data = [
+                data.replace(states=data.states.replace(pos=pos, quat=quat), objects=objects, core=core.replace(**keys))
+                for pos, quat, objects in poses
+            ]
+            return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data[0], kernels, *world_data[1:]))
+
+        parts = keys, poses_of(data), *([] if before is None else [poses_of(before)])
+        return jax.lax.map(cast_in_world, parts, batch_size=worlds_per_batch)
 
     return depth
 
@@ -321,10 +361,27 @@ def _pixel_angle(rays: np.ndarray) -> float:
     return float(np.arccos(np.sort(cosines)[-2])) if len(cosines) > 1 else 0.0
 
 
-def _rotate_directions(rot: Array, rays: np.ndarray) -> Array:
+def _rotate_directions(poses: Array, rays: np.ndarray) -> Array:
     # By components: a GPU may round matrix products to 10 bits.
-    x, y, z = (rot[:, k] * jnp.asarray(rays[:, k, None], rot.dtype) for k in range(3))
-    return x + y + z
+    x, y, z = (poses[..., None, 3 + k :: 3] * jnp.asarray(rays[..., k, None], poses.dtype) for k in range(3))
+    return (x + y + z).reshape(*poses.shape[:-2], -1, 3)
+
+
+def body_poses(model: CollisionModel, data: SimData) -> tuple[Array, Array]:
+    """Return positions, m (..., n, 3), and attitudes, xyzw (..., n, 4), of floor, objects and drones.
+
+    Bodies are in the order of ``Hits.body_index``. Those that do not move are at the origin.
+    """
+    drones = data.states.pos, data.states.quat
+    world = jnp.zeros_like(drones[0][..., :1, :]), jnp.zeros_like(drones[1][..., :1, :]).at[..., 3].set(1)
+    carriers, n_objects = [world, drones], 0
+    if data.objects is not None:
+        objects = [x[:, 0] if drones[0].ndim == 3 else x for x in (data.objects.pos, data.objects.quat)]
+        carriers, n_objects = [world, objects, drones], objects[0].shape[-2]
+    rows = [0, *(0 if body.row is None else 1 + body.row for body in model.objects)]
+    rows += [1 + n_objects + k for k in range(drones[0].shape[-2])]
+    pos, quat = (jnp.concatenate(x, axis=-2)[..., np.array(rows), :] for x in zip(*carriers, strict=True))
+    return pos, quat
 
 
 def camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:

@@ -78,6 +78,11 @@ class Hits(PyTree):
     """Colour of the surface, or of the sky, red, green and blue, uint8; None if it was not requested. (..., 3)"""
     is_hidden: Array | None = None
     """Whether the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
+    earlier_point: Array | None = None
+    """Place of the point at an earlier time, in the camera's frame then (right, up, back), m; where the ray meets
+    nothing, its direction in this frame. None without an earlier time. (..., 3)"""
+    was_hidden: Array | None = None
+    """Whether a nearer surface hid the point from the camera at the earlier time; None without one. (...)"""
 
 
 def raise_to_floor(model: CollisionModel, pos: Array) -> Array:

@@ -335,13 +335,14 @@ class Scene:
         shadows: bool = True,
         random_colors: RandomColors | None = None,
     ) -> depth.DepthFn:
-        """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
+        """Return ``depth(data, mocap=None, before=None) -> Hits``, pure: depth images of all worlds, one ray per pixel.
 
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal``, ``point`` and
         ``body_index``, the index of the body that was hit. Inside jit, fields that are not used are not computed.
         Objects of plugins, such as loads, get their poses from the plugins' records in ``data``. In a function of one
         world, such as the observations of a task, images have no axis n_worlds, and the rays are cast without a
-        separate kernel.
+        separate kernel. With data of an earlier time as ``before``, ``Hits`` also has where the points of the surfaces
+        were then, in the frame of the camera, and which of them were hidden.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); the name or

@@ -48,14 +48,15 @@ class CameraImages(Wrapper):
         self._period = sim.freq // rate_in(camera, env.base.freq)
         """Physics steps from one image to the next."""
         camera.check(sim, self._period)
-        self._is_immediate = self._period == env.n_substeps and not np.any(camera.latency)
+        needs_record = camera.compares_images or np.any(camera.latency)
+        self._is_immediate = self._period == env.n_substeps and not needs_record
         """Whether each environment step takes an image that is observed at its end."""
-        self._take_images = camera.image_fn(sim)
+        self._capture = camera.capture_fn(sim)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of an image by the name of its observation: (height, width), and 3 for normals and colours."""
-        return {name: self.camera.image_size + OUTPUTS[output] for output, name in self.names.items()}
+        return {name: self.camera.image_size + OUTPUTS[output].shape for output, name in self.names.items()}
 
     def describe_images(self) -> dict[str, dict[str, Any]]:
         formats = self.camera.describe(self._sim)
@@ -64,12 +65,12 @@ class CameraImages(Wrapper):
     def look(self, state: EnvState) -> EnvState:
         data, camera = state.data, self.camera
         if self._is_immediate:
-            images = self._take_images(data)
+            images, _ = self._capture(data, None)
         else:
             if self.name in state.memory:
-                record = camera.update(self._take_images, data, self.recall(state), self._period)
+                record = camera.update(self._capture, data, self.recall(state), self._period)
             else:
-                record = camera.initial_record(self._take_images, data, self._period)
+                record = camera.initial_record(self._capture, data, self._period)
             state, images = self.remember(state, record), record.images
         dtype, shape = data.states.pos.dtype, data.states.pos.shape[:2]
         flat = {self.names[k]: as_observation(x, dtype).reshape(*shape, -1) for k, x in images.items()}

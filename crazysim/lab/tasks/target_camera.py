@@ -41,8 +41,8 @@ class TargetCamera(Camera):
             )
         target_indices = np.array([names.index(name) for name in targets], np.int32)[:, None, None]
 
-        def take_images(data: SimData) -> Images:
-            images = take_segmented_images(data)
+        def take_images(data: SimData, before: SimData | None = None) -> Images:
+            images = take_segmented_images(data, before)
             if "segmentation" not in images:
                 return images
             is_target = images["segmentation"] == target_indices

@@ -32,6 +32,11 @@ from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.scene.appearance import RandomColors
 from crazysim.scene.depth import pixel_directions
 
+MIN_COSINE = 1e-3
+"""Cosine of the largest angle to the axis under which a point has a place in the image."""
+FIELD_MARGIN = 1.1
+"""Largest squared tangent of this angle with a distorting lens, divided by that of the corners of the image."""
+
 
 class Camera(ImageSensor):
     """Camera on every drone for depth and colours, with the pinhole model or a distorting lens, and with noise.
@@ -87,6 +92,21 @@ class Camera(ImageSensor):
     @property
     def baseline(self) -> float:
         return self.noise.baseline if self.noise is not None and self.noise.has_holes else 0.0
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        height, width = self.image_size
+        depth = -points[..., 2]
+        is_ahead = depth > MIN_COSINE * jnp.linalg.norm(points, axis=-1)
+        x, y = (
+            jnp.where(is_ahead, p / jnp.where(is_ahead, depth, 1.0), 0.0) for p in (points[..., 0], -points[..., 1])
+        )
+        if self.distortion is not None:
+            # Farther out than every ray of the image, the polynomials of the lens may fold back into it.
+            is_ahead &= x * x + y * y < FIELD_MARGIN * float(np.max(1 / self.rays[..., 0] ** 2 - 1))
+            x, y = self.distortion.distort(x, y)  # type: ignore[arg-type]
+        column, row = self.focal * x + (width - 1) / 2, self.focal * y + (height - 1) / 2
+        is_in_image = (abs(column + 0.5 - width / 2) < width / 2) & (abs(row + 0.5 - height / 2) < height / 2)
+        return jnp.stack([column, row], axis=-1), is_ahead & is_in_image
 
     def measure(self, distance: Array, is_hidden: Array | None, key: Array) -> Array:
         if self.noise is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,22 +29,51 @@ from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, require, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
 from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
+from crazysim.scene.object_poses import moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import body_names
 
-OUTPUTS: dict[str, tuple[int, ...]] = {
-    "depth": (), "distance": (), "normal": (3,), "segmentation": (), "rgb": (3,), "gray": (),
-}  # fmt: skip
-"""Shape of a pixel of each output of an image."""
+
+class Output(NamedTuple):
+    """What an output of an image is."""
+
+    shape: tuple[int, ...] = ()
+    """Shape of a pixel."""
+    unit: str = "m"
+    """Its unit, as in ``ImageSensor.describe``."""
+    empty: int | None = None
+    """Value where a ray meets nothing; None for the largest distance."""
+    dtype: DTypeLike | None = None
+    """Type of its numbers; None for the type of the states."""
+
+
+OUTPUTS = {
+    "depth": Output(),
+    "distance": Output(),
+    "normal": Output((3,), "1", 0),
+    "segmentation": Output((), "index", -1, np.int32),
+    "rgb": Output((3,), "1", 0, np.uint8),
+    "gray": Output((), "1", 0, np.uint8),
+    "flow": Output((2,), "pixel", 0),
+    "flow_valid": Output((), "1", 0, bool),
+}
+"""Outputs of an image by name."""
 COLORS = "rgb", "gray"
 """Outputs that are colours, uint8."""
+FLOWS = "flow", "flow_valid"
+"""Outputs that compare an image with the image before it."""
 LUMA = 0.299, 0.587, 0.114
 """Weights of red, green and blue in grey (ITU-R BT.601)."""
 UNFUSED_REASON = "images are taken by kernels with a lane for each ray"
 
 Images = dict[str, Array]
-"""Images by output, (n_worlds, n_drones, height, width), and (n_worlds, n_drones, height, width, 3) for normals and
-colours."""
-ImageFn = Callable[[SimData], Images]
+"""Images by output, (n_worlds, n_drones, height, width), with a further axis of length 3 for normals and colours, and 2
+for flow."""
+ImageFn = Callable[..., Images]
+"""``images(data, before=None) -> Images``; ``before`` is the data at the time of the image before, for flow."""
+Poses = dict[str, dict[str, Array]]
+"""The fields ``drone_poses`` and ``object_poses`` of ``ImageData``."""
+CaptureFn = Callable[[SimData, Poses | None], tuple[Images, Poses]]
+"""Function of data and of the poses at the image before that returns images, and the poses that the next ones need."""
 
 
 def as_observation(image: Array, dtype: DTypeLike) -> Array:
@@ -55,14 +84,20 @@ def as_observation(image: Array, dtype: DTypeLike) -> Array:
 class ImageData(PyTree):
     """The last delivered images of a camera or lidar, and the images in transit."""
 
+    watched = False  # the check of every number of every pixel takes minutes to compile; states are watched
+
     images: dict[str, Array] = leaf("drone", None)
     """Last image of each output; nothing within ``far`` before the first image. (n_worlds, n_drones, height, width),
-    for normals and colours (n_worlds, n_drones, height, width, 3)"""
+    for normals and colours (n_worlds, n_drones, height, width, 3), for flow (n_worlds, n_drones, height, width, 2)"""
     taken_step: Array = leaf("world")
     """Step in which these images were taken, negative before the first ones. (n_worlds, 1)"""
     transit: dict[str, Array] = leaf("drone", None)
     """The last images of each output that were taken, newest first; empty without latency. (n_worlds, n_drones, n_rows,
-    height, width), for normals and colours (n_worlds, n_drones, n_rows, height, width, 3)"""
+    height, width), for normals and colours (n_worlds, n_drones, n_rows, height, width, 3), for flow (..., 2)"""
+    drone_poses: dict[str, Array] = leaf("drone", 1)
+    """``pos`` and ``quat`` of the drones at the last image that was taken; empty without flow."""
+    object_poses: dict[str, Array] = leaf("world", 2)
+    """``pos`` and ``quat`` of the objects at the last image that was taken; empty without flow or objects."""
 
 
 class ImageSensor(Plugin):
@@ -81,8 +116,11 @@ class ImageSensor(Plugin):
     outputs: Sequence[str] = ("depth",)
     """Images to take, some of ``"depth"`` (along the axis of the sensor, m), ``"distance"`` (along the ray, m),
     ``"normal"`` (of the surface, unit, sensor frame), ``"segmentation"`` (index in ``segment_names``, -1 for
-    nothing), ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8) and ``"gray"`` (its brightness, uint8). A lidar
-    has no depths along an axis and no colours."""
+    nothing), ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8), ``"gray"`` (its brightness, uint8), ``"flow"``
+    (motion of the surface since the image before, right and down, pixels: the place of its point in this image minus
+    its place in the image before, the negative of Kubric's ``backward_flow``) and ``"flow_valid"`` (whether the image
+    before shows this point, bool; False in the first image of an episode, whose flow is zero). A lidar has no depths
+    along an axis, colours and flow."""
     drones: bool = True
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
@@ -132,9 +170,22 @@ class ImageSensor(Plugin):
         return {}
 
     @property
+    def compares_images(self) -> bool:
+        """Whether images need the poses of the image before."""
+        return not {*FLOWS}.isdisjoint(self.outputs)
+
+    @property
     def baseline(self) -> float:
         """Distance to a second imager, on the right, m, whose view ``measure`` needs; 0 for none."""
         return 0.0
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Return where an image shows points, columns and rows, pixels (..., 2), and whether it shows them. (...)
+
+        Args:
+            points: Points in the frame of the camera: right, up and back, m. (..., 3)
+        """
+        raise NotImplementedError
 
     def measure(self, distance: Array, is_hidden: Array | None, key: Array) -> Array:
         """Return the distances of one drone as the sensor measures them, m. (height, width)
@@ -167,13 +218,12 @@ class ImageSensor(Plugin):
         sensor |= {"freq": self.freq, "latency": np.asarray(self.latency, np.float64).tolist()}
         formats = {}
         for name in self.outputs:
-            unit = {"normal": "1", "segmentation": "index"} | dict.fromkeys(COLORS, "1")
-            far = {"normal": 0.0, "segmentation": -1} | dict.fromkeys(COLORS, 0.0)
+            output = OUTPUTS[name]
             formats[name] = {
                 "height": height,
                 "width": width,
-                "unit": unit.get(name, "m"),
-                "far": far.get(name, self.far),
+                "unit": output.unit,
+                "far": self.far if output.empty is None else output.empty,
                 "output": name,
             } | sensor
         return formats
@@ -196,23 +246,26 @@ class ImageSensor(Plugin):
                 f"expected a latency of {self.name!r} of at most {MAX_ROWS - 1} images, got {self.latency} s. Use a "
                 f"shorter latency or a lower freq=."
             )
-        number_bytes = {name: (1 if name in COLORS else 4) * math.prod(OUTPUTS[name]) for name in self.outputs}
-        bytes_per_pixel = sum(number_bytes.values()) * (1 + n_rows) + BYTES_PER_RAY
+        outputs = [OUTPUTS[name] for name in self.outputs]
+        number_bytes = [np.dtype(x.dtype or np.float32).itemsize * math.prod(x.shape) for x in outputs]
+        bytes_per_pixel = sum(number_bytes) * (1 + n_rows) + BYTES_PER_RAY
         check_image_memory(sim.n_worlds * sim.n_drones, width, height, bytes_per_pixel, sim.scene.device)
 
     def image_fn(self, sim: Simulation) -> ImageFn:
         """Return a pure function of the data of all worlds that returns their images, without rate and latency.
 
-        The function is for the scene as it is now.
+        The function is for the scene as it is now. For flow, its second argument is the data at the image before.
         """
         self.check(sim)
         rays, far, camera = self.rays, self.far, self._drone_camera(sim)
         color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
         cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
-        rot = camera.rot
+        rot, (height, width) = camera.rot, self.image_size
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
 
-        def take_images(data: SimData) -> Images:
-            hits, quat = cast_rays(data), data.states.quat[..., None, None, :]
+        def take_images(data: SimData, before: SimData | None = None) -> Images:
+            before = before if self.compares_images else None
+            hits, quat = cast_rays(data, before=before), data.states.quat[..., None, None, :]
             cosine = jnp.asarray(rays[..., 0], hits.distance.dtype)
             distance = hits.distance
             if self.has_errors:
@@ -235,29 +288,47 @@ class ImageSensor(Plugin):
                 elif name == "gray":
                     parts = [weight * hits.color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
                     images[name] = jnp.round(sum(parts)).astype(np.uint8)
+                elif name in FLOWS and before is None:
+                    output = OUTPUTS[name]
+                    images[name] = jnp.zeros(distance.shape + output.shape, output.dtype or distance.dtype)
+                elif name in FLOWS:
+                    place, is_in_view = self.project(hits.earlier_point)
+                    images[name] = pixels - place if name == "flow" else is_in_view & ~hits.was_hidden
                 else:
                     images[name] = hits.color if name == "rgb" else hits.body_index
             return images
 
         return take_images
 
-    def initial_record(self, take_images: ImageFn, data: SimData, period: int) -> ImageData:
+    def capture_fn(self, sim: Simulation) -> CaptureFn:
+        """Return a function that takes images of all worlds, for ``initial_record`` and ``update``."""
+        take_images, names = self.image_fn(sim), [body.name for body in sim.scene.visual_model.objects]
+
+        def capture(data: SimData, poses: Poses | None) -> tuple[Images, Poses]:
+            if not self.compares_images:
+                return take_images(data), {"drone_poses": {}, "object_poses": {}}
+            images = take_images(data) if poses is None else take_images(data, _with_poses(data, poses))
+            return images, _poses_of(with_moved_objects(data, moving_plugins(sim.scene.plugins(), names)))
+
+        return capture
+
+    def initial_record(self, capture: CaptureFn, data: SimData, period: int) -> ImageData:
         """Return the record of all worlds with images that are taken and delivered now.
 
         Args:
-            take_images: Function that ``image_fn`` returned.
+            capture: Function that ``capture_fn`` returned.
             data: Data of all worlds.
             period: Steps between images.
         """
-        images, n = take_images(data), self._n_rows(data, period)
+        (images, poses), n = capture(data, None), self._n_rows(data, period)
         transit = {k: jnp.repeat(x[:, :, None], n, axis=2) for k, x in images.items()} if n else {}
-        return ImageData(images=images, taken_step=data.core.steps, transit=transit)
+        return ImageData(images=images, taken_step=data.core.steps, transit=transit, **poses)
 
-    def update(self, take_images: ImageFn, data: SimData, record: ImageData, period: int) -> ImageData:
+    def update(self, capture: CaptureFn, data: SimData, record: ImageData, period: int) -> ImageData:
         """Return the record of all worlds after a step: due images are taken, and images that arrive are delivered.
 
         Args:
-            take_images: Function that ``image_fn`` returned.
+            capture: Function that ``capture_fn`` returned.
             data: Data of all worlds.
             period: Steps between images.
         """
@@ -265,10 +336,17 @@ class ImageSensor(Plugin):
         is_due = steps % period == 0
 
         def select_due(new: Array, old: Array) -> Array:
-            return jnp.where(is_due.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+            return jnp.where(_over(is_due, old), new, old)
 
         def capture_images(record: ImageData) -> ImageData:
-            images = take_images(data)
+            before = {name: getattr(record, name) for name in ("drone_poses", "object_poses")}
+            images, poses = capture(data, before)
+            # An episode has no image before its first one.
+            for name in {*FLOWS} & {*images}:
+                images[name] = jnp.where(
+                    _over(steps < period, images[name]), jnp.zeros_like(images[name]), images[name]
+                )
+            record = record.replace(**jax.tree.map(select_due, poses, before))
             if not record.transit:
                 return record.replace(images=jax.tree.map(select_due, images, record.images))
             queues = {k: jnp.concatenate([x[:, :, None], record.transit[k][:, :, :-1]], 2) for k, x in images.items()}
@@ -297,21 +375,25 @@ class ImageSensor(Plugin):
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
         for name in self.outputs:
-            number = sim.data.states.pos.dtype
-            special = {"segmentation": (-1, np.int32), "normal": (0.0, number)} | dict.fromkeys(COLORS, (0, np.uint8))
-            value, dtype = special.get(name, (self.far, number))
-            images[name] = device_array(np.full(shape + OUTPUTS[name], value), dtype)
+            output = OUTPUTS[name]
+            dtype = output.dtype or sim.data.states.pos.dtype
+            value = self.far if output.empty is None else output.empty
+            images[name] = device_array(np.full(shape + output.shape, value), dtype)
             if n:
-                transit[name] = device_array(np.full((*shape[:2], n, *shape[2:], *OUTPUTS[name]), value), dtype)
-        return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit)
+                transit[name] = device_array(np.full((*shape[:2], n, *shape[2:], *output.shape), value), dtype)
+        poses: Poses = {"drone_poses": {}, "object_poses": {}}
+        if self.compares_images:
+            sim.scene.compile_if_edited()  # this record depends on the objects of the scene
+            poses = jax.tree.map(lambda x: device_array(np.zeros(x.shape), x.dtype), _poses_of(sim.data))
+        return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit, **poses)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         period, latency = sim.data.core.freq // rate_in(self, sim.data.core.freq), self._latency_steps(sim.data)
-        take_images = self.image_fn(sim)
+        capture = self.capture_fn(sim)
 
         def update_record(data: SimData) -> SimData:
             def update(data: SimData) -> SimData:
-                return self.write(data, self.update(take_images, data, self.read(data), period))
+                return self.write(data, self.update(capture, data, self.read(data), period))
 
             steps = data.core.steps
             is_due = (steps % period == 0) | ((steps - latency) % period == 0)
@@ -346,3 +428,21 @@ class ImageSensor(Plugin):
     def _n_rows(self, data: SimData, period: int) -> int:
         _, latency = self._latency_range(data.core.freq)
         return -(-latency // period) + 1 if latency else 0
+
+
+def _over(flag: Array, x: Array) -> Array:
+    # A flag of each world, (n_worlds, 1), for an array with more axes.
+    return flag.reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def _poses_of(data: SimData) -> Poses:
+    drones, objects = data.states, data.objects
+    return {
+        "drone_poses": {"pos": drones.pos, "quat": drones.quat},
+        "object_poses": {} if objects is None else {"pos": objects.pos, "quat": objects.quat},
+    }
+
+
+def _with_poses(data: SimData, poses: Poses) -> SimData:
+    objects = None if data.objects is None else data.objects.replace(**poses["object_poses"], recorded=True)
+    return data.replace(states=data.states.replace(**poses["drone_poses"]), objects=objects)

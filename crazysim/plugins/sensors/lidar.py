@@ -15,7 +15,7 @@ from crazysim.core.random import normal, uniform
 from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.errors import quantise
-from crazysim.plugins.sensors.image_sensor import COLORS, ImageSensor
+from crazysim.plugins.sensors.image_sensor import COLORS, FLOWS, ImageSensor
 
 VLP16_ELEVATIONS = tuple(range(15, -16, -2))
 """Elevations of the 16 rows, degrees (VLP-16 User Manual, 63-9243 revision D, table 9-1)."""
@@ -56,9 +56,9 @@ class Lidar(ImageSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if {"depth", *COLORS} & {*self.outputs}:
+        if {"depth", *COLORS, *FLOWS} & {*self.outputs}:
             raise ConfigError(
-                "expected outputs of a lidar without 'depth', since it has no axis, and colours. Use 'distance'."
+                "expected outputs of a lidar without 'depth', since it has no axis, colours and flow. Use 'distance'."
             )
         if 0 in self.image_size:
             raise ConfigError(f"expected at least one elevation and azimuth, got {self.image_size} of them")
