@@ -18,6 +18,9 @@ from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
+from crazysim.errors import require
+from crazysim.plugins.sensors.image_sensor import OUTPUTS
+from crazysim.train.convolution import images_of
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Network, Policy, Weights, choose_network, init_weights
 from crazysim.train.optimizer import all_finite, build_optimizer
@@ -50,6 +53,8 @@ class Config:
     """Size of the memory of the policy, as in PPO; 0 for none."""
     shape: str = "default"
     """Shape of the policy, as in PPO."""
+    convolution: tuple[int, ...] = ()
+    """Channels of the layers of a convolution over each image, as in PPO. The gradient passes through the image."""
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.99
@@ -101,16 +106,23 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
     """
+    constant = [name for name, x in env.image_formats().items() if OUTPUTS[x["output"]].dtype is not None]
+    require(
+        not constant,
+        f"expected images whose gradients are not zero, got {', '.join(constant)}. Use outputs=('depth',) of the "
+        f"camera, or algorithm='ppo'.",
+    )
     config = configs[0]
     k_policy, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
-    network = choose_network(config.memory, None, shape=config.shape)
+    images = images_of(env, state.obs) if config.convolution else ()
+    network = choose_network(config.memory, None, config.convolution, images, config.shape)
     hidden = config.hidden if network.is_built_in else ()
 
     def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
         policy: Any = init_weights(network, k_policy, obs.shape[-1], (*hidden, env.actions.size), 0.01)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations).init(policy)
-        return Agent(policy, optimizer, RunningStats.create(obs.shape[-1]).update(obs), key, network)
+        return Agent(policy, optimizer, RunningStats.create(obs.shape[-1], network.pixels).update(obs), key, network)
 
     obs = split_blocks(flatten(state.obs), len(configs))
     agents = for_each_seed(init_agent, k_policy, k_agent, obs)

@@ -532,7 +532,7 @@ def load_policy(
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
         interface = Interface.read(meta)
         n_obs, n_actions = sum(interface.sizes.values()), len(interface.ranges)
-        convolution = config.config["convolution"] if config.algorithm != "apg" else ()
+        convolution = config.config.get("convolution", ())
         images = find_images(meta["observations"], meta["images"]) if convolution else ()
     if config.own_network != (network is not None):
         expected = "the custom network" if config.own_network else "no network besides the built-in one"

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pictures import read_frames
 
-from crazysim import ConfigError
-from crazysim.envs import AutoReset, make
+from crazysim import Camera, ConfigError
+from crazysim.envs import AutoReset, CameraImages, make
 from crazysim.envs.statistics import RunningStats
-from crazysim.train import Network, dagger, ppo
-from crazysim.train.config import TrainConfig
+from crazysim.train import Network, apg, dagger, ppo
+from crazysim.train.config import ALGORITHMS, TrainConfig
 from crazysim.train.convolution import Image, convolve, find_images, scale_depth
 from crazysim.train.evaluation import evaluate
 from crazysim.train.export import describe, to_c, to_onnx
@@ -179,9 +179,11 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
 
 
 @pytest.mark.long("compiles a training")
-def test_the_policy_of_a_run_with_a_convolution_comes_back(tmp_path):
-    config = SMALL_CONFIG | {"iterations": 2}
-    config = TrainConfig.create("hover", n_worlds=8, options=OPTIONS | {"engine": "interpret"}, config=config)
+@pytest.mark.parametrize("algorithm", ["ppo", "apg"])
+def test_the_policy_of_a_run_with_a_convolution_comes_back(tmp_path, algorithm):
+    config = {k: x for k, x in SMALL_CONFIG.items() if k in ALGORITHMS[algorithm].Config.__annotations__}
+    options = OPTIONS | {"engine": "interpret" if algorithm == "ppo" else "auto"}
+    config = TrainConfig.create("hover", algorithm, n_worlds=8, options=options, config=config | {"iterations": 2})
     result = train(config, tmp_path, evaluation_worlds=8, log=lambda line: None, progress=False)
     policy, config, meta = load_policy(tmp_path)
     assert config.config["convolution"] == [2, 3]
@@ -231,7 +233,7 @@ def test_law_09_convolutions_that_do_not_fit_are_refused(env):
     def create(algorithm, network=None):
         TrainConfig.create("hover", algorithm, options=OPTIONS, config={"convolution": (2,)}, network=network)
 
-    keys = jax.random.key(0)[None]
+    keys, colors = jax.random.key(0)[None], CameraImages(env.env, Camera(2, 2, outputs=("rgb",)))
     network = Network(lambda key, n: init_mlp(key, (n, 2), 1.0), lambda weights, obs, memory: (obs, memory))
     for call, message in (
         (lambda: init_learner(env.env, convolution=(2,)), r"an image among the observations .*Use depth_im"),
@@ -239,7 +241,7 @@ def test_law_09_convolutions_that_do_not_fit_are_refused(env):
         (lambda: ppo.Config(convolution=8), r"convolution as the channels .*got 8\. Use"),
         (lambda: ppo.Config(convolution=(2, 0)), r"convolution\[1\] is 0"),
         (lambda: create("ppo", network), r"no convolution with a custom network"),
-        (lambda: create("apg"), r"hyperparameters of apg, got convolution"),
+        (lambda: apg.init(colors, (apg.Config(),), keys), r"gradients are not zero, got camera.rgb\. Use"),
     ):
         with pytest.raises(ConfigError, match=message):
             call()
