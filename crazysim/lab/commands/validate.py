@@ -36,7 +36,10 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         help="folder with logs in idsia/ and nanobench/; trained policies are kept in its folder policies/",
     )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="sections; by default all")
-    policy_help = "policy to compare with RAPTOR: rl-tools' .tar, or a run of the task any; by default the package's"
+    policy_help = (
+        "policy to compare with RAPTOR, rl-tools' .tar or a run of the task any, by default the package's; or a run of "
+        "the task forest, which is flown by other images"
+    )
     parser.add_argument("--policy", type=Path, metavar="FILE|FOLDER", help=policy_help)
     parser.add_argument("--out", type=Path, default=Path("validation.md"), metavar="FILE", help="page to write; its "
                         "pictures, of logs alone, go to the folder pictures next to it")  # fmt: skip

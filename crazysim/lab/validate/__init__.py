@@ -7,6 +7,7 @@ from pathlib import Path
 
 from crazysim.errors import ConfigError, require
 from crazysim.lab.validate.any_airframe import load_network
+from crazysim.lab.validate.by_sight import sees_forest
 from crazysim.lab.validate.rows import Row, measure_sections
 from crazysim.lab.validate.sections import NAMES, sections
 
@@ -22,11 +23,11 @@ def validate(
     is a row with a ``problem``.
 
     Args:
-        data: Folder with logs of real flights in ``idsia`` and ``nanobench``, and for trainings in ``policies``; None
+        data: Folder with logs of real flights in ``idsia`` and ``nanobench``, and trainings in ``policies``; None
             for none.
         only: Names of sections.
         policy: Policy of the section ``any``: a checkpoint of rl-tools (.tar) or the folder of a run; None for the one
-            of the package.
+            of the package. A run of the task ``forest`` is for the section ``sight``.
     """
     if unknown_names := [name for name in only if name not in NAMES]:
         raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown_names[0]!r}")
@@ -36,6 +37,6 @@ def validate(
         f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it.",
     )
     source = None if policy is None else Path(policy)
-    if source is not None:
+    if source is not None and not sees_forest(source):
         load_network(source)  # wrong files are refused before the work
     return measure_sections([section for section in sections(folder, source) if section.name in only])

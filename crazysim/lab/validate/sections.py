@@ -8,6 +8,7 @@ from pathlib import Path
 
 from crazysim.lab.validate import (
     any_airframe,
+    by_sight,
     closed_forms,
     commonroad_cars,
     firmware_controllers,
@@ -22,7 +23,7 @@ from crazysim.lab.validate.rows import Section
 
 NAMES = (
     "closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "any",
-    "sim2sim",
+    "sim2sim", "sight",
 )  # fmt: skip
 """Names of the sections."""
 RAPTOR = {"foundation_policy": "foundation-policy==1.0.2"}
@@ -34,8 +35,10 @@ def sections(data: Path | None = None, policy: Path | None = None) -> Sequence[S
 
     Args:
         data: Folder with logs in ``idsia`` and ``nanobench``; None for no logs.
-        policy: Policy of the section ``any``, see ``any_airframe.checks``.
+        policy: Policy of the section ``any``, see ``any_airframe.checks``, or run of ``forest`` for ``sight``.
     """
+    forest_runs = by_sight.find_runs(data, policy)
+    policy = None if policy in forest_runs else policy
     idsia, nanobench = ((data or Path()) / name for name in ("idsia", "nanobench"))
 
     def data_problem(folder: Path) -> str:
@@ -130,5 +133,10 @@ def sections(data: Path | None = None, policy: Path | None = None) -> Sequence[S
         Section(
             "sim2sim", "Sim to sim", sim_to_sim.SECTION_TEXT, sim_to_sim.checks(data),
             packages={"onnx": "onnx", "onnxruntime": "onnxruntime", "optax": "optax"}, peers=sim_to_sim.PEERS,
+        ),
+        Section(
+            "sight", "Sim to sim, by sight", by_sight.SECTION_TEXT, by_sight.checks(forest_runs),
+            packages={"optax": "optax"},
+            data_problem="" if forest_runs else "give `--policy` with a run of the task `forest`",
         ),
     )  # fmt: skip

@@ -140,13 +140,28 @@ class Mujoco(Simulator):
             thrusts = self._controller.compute_thrusts(self._states(), np.stack([body.act for body in self._bodies]))
             for body, thrust in zip(self._bodies, thrusts, strict=True):
                 body.ctrl[:] = thrust
+                self._push(body)
                 mujoco.mj_step(self._model, body)
         return self._states()
+
+    def _push(self, body: mujoco.MjData) -> None: ...
 
     def _states(self) -> States:
         qpos, qvel = (np.stack([getattr(body, name) for body in self._bodies]) for name in ("qpos", "qvel"))
         return {"pos": qpos[:, :3], "quat": np.roll(qpos[:, 3:], -1, axis=-1), "vel": qvel[:, :3],
                 "ang_vel": qvel[:, 3:]}  # fmt: skip
+
+
+class MujocoWithDrag(Mujoco):
+    """``Mujoco`` with the linear drag of crazysim's airframe."""
+
+    def __init__(self, start: States) -> None:
+        super().__init__(start)
+        self._drag = load_airframe(AIRFRAME).matrix("drag.coefficients")
+
+    def _push(self, body: mujoco.MjData) -> None:
+        rot = body.xmat[1].reshape(3, 3)  # of the previous step, 2 ms ago
+        body.xfrc_applied[1, :3] = rot @ self._drag @ rot.T @ body.qvel[:3]
 
 
 class RotorPy(Simulator):

@@ -213,7 +213,7 @@ class ImageSensor(Plugin):
 
         ``pos`` and ``rot`` are in the body frame of the first drone; the columns of ``rot`` are right, up and back.
         """
-        (height, width), camera = self.image_size, CarriedCamera.on_drone(self._drone_camera(sim), 0)
+        (height, width), camera = self.image_size, CarriedCamera.on_drone(self.drone_camera(sim), 0)
         sensor = {"sensor": self.name, **self.optics, "pos": list(camera.pos), "rot": [list(x) for x in camera.rot]}
         sensor |= {"freq": self.freq, "latency": np.asarray(self.latency, np.float64).tolist()}
         formats = {}
@@ -257,7 +257,7 @@ class ImageSensor(Plugin):
         The function is for the scene as it is now. For flow, its second argument is the data at the image before.
         """
         self.check(sim)
-        rays, far, camera = self.rays, self.far, self._drone_camera(sim)
+        rays, far, camera = self.rays, self.far, self.drone_camera(sim)
         color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
         cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
         rot, (height, width) = camera.rot, self.image_size
@@ -409,7 +409,8 @@ class ImageSensor(Plugin):
         """Return the time since the last images were taken, s; infinite before the first ones. (n_worlds, 1)"""
         return age_at(data, self.read(data).taken_step)
 
-    def _drone_camera(self, sim: Simulation) -> DroneCamera:
+    def drone_camera(self, sim: Simulation) -> DroneCamera:
+        """Return the camera for ``Scene.depth_fn``: directions of its rays, and its mounting on each drone."""
         fpv_pos = [body_shape(airframe)["fpv_camera"] for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
         return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline)
