@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3766,
     "geometry": 940,
-    "lab": 17519,
+    "lab": 17733,
     "media": 1087,
     "plugins": 4969,
     "scene": 2972,
