@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, SlungLoad
-    from crazysim.plugins.scenery import Clutter, Forest, Gates, Pillars, Rooms
+    from crazysim.plugins.scenery import Clutter, Forest, Gates, Maps, Pillars, Rooms
     from crazysim.plugins.sensors import IMU, Camera, Lidar, MotionCapture, RangeFinder, Sensor
 
 __all__ = [
@@ -85,6 +85,7 @@ __all__ = [
     "Kalman",
     "Latency",
     "Lidar",
+    "Maps",
     "Members",
     "MotionCapture",
     "MotorFailure",

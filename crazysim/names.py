@@ -39,7 +39,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.estimators.kalman": "Kalman",
         "crazysim.plugins.follow": "Follow",
         "crazysim.plugins.payloads": "Hook SlungLoad",
-        "crazysim.plugins.scenery": "Clutter Forest Gates Pillars Rooms",
+        "crazysim.plugins.scenery": "Clutter Forest Gates Maps Pillars Rooms",
         "crazysim.plugins.sensors": "Camera IMU Lidar MotionCapture RangeFinder Sensor",
     },
     "crazysim.control": {

@@ -27,6 +27,7 @@ from crazysim import (
     Hook,
     Kalman,
     Latency,
+    Maps,
     MotionCapture,
     MotorFailure,
     Pillars,
@@ -139,6 +140,10 @@ SHAPES = [
     hull([[0.4, 0, 0], [-0.3, 0.3, 0], [-0.2, -0.4, 0.1], [0, 0.1, 0.5], [0.1, 0, -0.3]]),
 ]
 FIGURE_EIGHT = figure_eight(2.0, 1.0, speed=1.0)
+MAPS = [
+    f"<mujoco><worldbody><geom type='box' size='.1 .1 1' pos='{x} 1 1'/><geom size='{x}'/></worldbody></mujoco>"
+    for x in (0.2, 0.4, 0.6)
+]
 HILLS = 0.5 * (1 + np.sin(np.arange(41) / 6)[:, None] * np.cos(np.arange(41) / 5))
 FIELD = Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0))
 EFFECTS = {
@@ -383,6 +388,9 @@ CASES |= {
         lambda: [Forest(size=(8.0, 8.0)), Pillars(size=(8.0, 8.0), speed=1.0), Clutter(size=(4.0, 4.0, 2.0)), Gates(),
                  Rooms()],
         control="rotor_vel",
+    ),
+    "maps": make_builder(
+        lambda: [Maps(MAPS), RangeFinder([(0, 1, 0), (0.5, 0, -1)]), ContactLog()], control="rotor_vel"
     ),
     "collisions": make_builder(lambda: [DroneCollisions()], control="attitude", prepare=let_drones_meet),
     "impact": make_builder(lambda: [ContactResponse()], control="attitude", height=0.05),

@@ -173,6 +173,10 @@ class Objects(PyTree):
     """Names of the bodies of the objects."""
     recorded: bool = static(default=False)
     """Whether a recording determines the poses of all objects, even those that plugins move, such as loads."""
+    map_index: Array | None = leaf("world", default=None)
+    """Index of the map of each world in ``Maps``; None without maps. (n_worlds, 1)"""
+    map_ids: Array | None = leaf("shared", 1, default=None)
+    """MuJoCo mocap ids of the bodies of the maps. (n_maps,)"""
 
     def with_poses(self, poses: Mapping[str, tuple[Array, Array]]) -> Objects:
         """Return the objects of one world with new poses for some of them.

@@ -57,6 +57,10 @@ class CollisionBody:
     """Geoms in the frame of the body; in the world frame where ``row`` is None."""
     initial_pos: tuple[float, ...] = dataclasses.field(default=(0.0, 0.0, 0.0), compare=False)
     """Position in the compiled scene, m. (3,)"""
+    maps: tuple[int, ...] = ()
+    """Index of the map of each geom, where each world has one of several maps; empty for other bodies."""
+    n_maps: int = 0
+    """Number of these maps; 0 for other bodies."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,13 +113,14 @@ class CollisionModel:
 
 
 def collision_model(
-    model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)
+    model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,), maps: Sequence[str] = ()
 ) -> CollisionModel:
     """Return the geoms that drones can touch.
 
     Args:
         handles: Names of bodies with handles, in the order of ``data.objects``.
         drone_groups: Drones of each airframe.
+        maps: Names of the bodies of maps, of which each world has one.
     """
 
     def can_touch(geom: int) -> bool:
@@ -124,15 +129,15 @@ def collision_model(
     def can_collide(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _build_model(model, handles, drone_groups, can_touch, can_collide)
+    return _build_model(model, handles, drone_groups, maps, can_touch, can_collide)
 
 
-def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,)) -> CollisionModel:
+def visual_model(
+    model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,), maps: Sequence[str] = ()
+) -> CollisionModel:
     """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
 
-    Args:
-        handles: Names of bodies with handles, in the order of ``data.objects``.
-        drone_groups: Drones of each airframe.
+    For the arguments see ``collision_model``.
     """
 
     def is_seen(geom: int) -> bool:
@@ -140,13 +145,14 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], drone_groups: Dr
         alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
         return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= MIN_ALPHA
 
-    return _build_model(model, handles, drone_groups, is_seen, is_seen)
+    return _build_model(model, handles, drone_groups, maps, is_seen, is_seen)
 
 
 def _build_model(
     model: mujoco.MjModel,
     handles: Sequence[str],
     drone_groups: DroneGroups,
+    maps: Sequence[str],
     is_included: Callable[[int], bool],
     is_drone_geom: Callable[[int], bool],
 ) -> CollisionModel:
@@ -179,12 +185,19 @@ def _build_model(
     mocap = {
         name: int(mocap_id)
         for body, mocap_id in enumerate(model.body_mocapid)
-        if mocap_id >= 0 and not (name := body_name(model, body)).startswith("drone:") and name not in handles
+        if mocap_id >= 0
+        and not (name := body_name(model, body)).startswith("drone:")
+        and name not in handles
+        and name not in maps
     }
     rows = {name: row for row, name in enumerate((*handles, *mocap))}
     # Geoms in the frame of their body, or of the world if it stays.
-    objects = []
+    objects, map_geoms, map_indices = [], [], []
     for root, geoms in geoms_by_root.items():
+        if body_name(model, root) in maps:
+            map_geoms += [_read_geom(model, data, geom, None) for geom in geoms]
+            map_indices += [maps.index(body_name(model, root))] * len(geoms)
+            continue
         row = rows.get(body_name(model, root))
         frame = None if row is None else root
         objects.append(
@@ -195,6 +208,9 @@ def _build_model(
                 tuple(map(float, data.xpos[root])),
             )
         )
+    if maps:
+        name = maps[0].rpartition(":")[0]
+        objects.append(CollisionBody(name, None, tuple(map_geoms), maps=tuple(map_indices), n_maps=len(maps)))
     drones = tuple(
         [DroneGeoms(tuple(geoms), group) for geoms, group in zip(drone_geoms.values(), drone_groups, strict=True)]
     )

@@ -32,11 +32,13 @@ from crazysim.geometry.shapes import bounding_box
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.nearest_geom import nearest_geom
-from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
+from crazysim.scene.object_poses import ListPlugins, map_index_of, moving_plugins, with_moved_objects
 from crazysim.scene.objects import Handle
 
 MAX_UNROLLED_GEOMS = 16
 """Largest number of fixed geoms of one shape whose distances are computed one by one."""
+SIZED_KINDS = ("sphere", "capsule", "box", "cylinder")
+"""Kinds of the shapes of maps that are searched together, whatever their sizes; other shapes one shape at a time."""
 MAX_LISTED_GEOMS = 64
 """Largest number of fixed geoms of one shape in a body whose distances are all computed for one drone; more geoms are
 searched in a bounding volume hierarchy."""
@@ -199,6 +201,8 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, require_data:
 
 def _group_key(body: CollisionBody) -> tuple[Any, ...]:
     # Its first entry is True for objects that can move.
+    if body.n_maps:
+        return (False, body.name)
     if body.row is not None:
         return (True, body.geoms)
     kinds = tuple([(geom.shape, geom.rot is None) for geom in body.geoms])
@@ -232,6 +236,8 @@ def _mask_absent(is_present: Array | None, gap: Array) -> Array:
 
 def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
     geoms = group[0].geoms
+    if group[0].n_maps:
+        return map_distance(parts, drone_rot, group[0], map_index_of(data))[..., None]
     if group[0].row is None:
         if len(group) > MAX_UNROLLED_GEOMS:
             stacked_geoms = StackedGeoms.from_geoms([body.geoms[0] for body in group])
@@ -264,7 +270,8 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
     for geoms_of_kind in _geoms_by_kind(geoms):
         for part, part_pos, is_present in parts:
             if len(geoms_of_kind) > MAX_LISTED_GEOMS and part_pos.ndim == 1:
-                gap = _nearest_distance(part, part_pos, drone_rot, StackedGeoms.from_geoms(geoms_of_kind))
+                everything = [np.arange(len(geoms_of_kind))]
+                gap = _nearest_distance(part, geoms_of_kind, everything, part_pos, drone_rot, jnp.int32(0))
                 gaps.append(_mask_absent(is_present, gap))
             elif len(geoms_of_kind) > MAX_UNROLLED_GEOMS:
                 gaps.append(
@@ -282,6 +289,31 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
     return _minimum(gaps, parts[0][1])
 
 
+def map_distance(parts: DroneParts, drone_rot: Array | None, body: CollisionBody, map_index: Array) -> Array:
+    """Return the distance of parts to the geoms of the map that a world has, m; infinite if it has none. (...)
+
+    Args:
+        parts: Parts, at positions (..., 3).
+        drone_rot: Rotation matrices of all parts; None for the identity. (..., 3, 3)
+        body: The maps.
+        map_index: Index of the map; it broadcasts with the leading axes. (...)
+    """
+    kinds: dict[Any, list[int]] = {}
+    for k, geom in enumerate(body.geoms):
+        kinds.setdefault(geom.shape.kind if geom.shape.kind in SIZED_KINDS else geom.shape, []).append(k)
+    maps, gaps = np.array(body.maps), []
+    for rows in kinds.values():
+        geoms, groups = [body.geoms[k] for k in rows], [np.flatnonzero(maps[rows] == k) for k in range(body.n_maps)]
+        for part, part_pos, is_present in parts:
+            nearest = functools.partial(_nearest_distance, part, geoms, groups)
+            in_axes = (0, None if drone_rot is None else 0, 0)
+            index = jnp.broadcast_to(map_index, part_pos.shape[:-1])
+            for _ in range(part_pos.ndim - 1):
+                nearest = jax.vmap(nearest, in_axes)
+            gaps.append(_mask_absent(is_present, nearest(part_pos, drone_rot, index)))
+    return _minimum(gaps, parts[0][1])
+
+
 def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:
@@ -290,21 +322,23 @@ def _geoms_by_kind(geoms: Sequence[CollisionGeom]) -> list[list[CollisionGeom]]:
 
 
 class StackedGeoms(NamedTuple):
-    """Geoms of one shape, or boxes, at different poses."""
+    """Geoms of one shape, or of one kind, at different poses."""
 
     shape: Shape
-    """Shape of all geoms, in its own frame; if sizes of boxes differ, the shape of the first box."""
+    """Shape of all geoms, in its own frame; if their sizes differ, the shape of the first."""
     pos: NDArray | Array
     """Origins, m. (n, 3)"""
     rot: NDArray | Array | None
     """Rotation matrices; None for the identity. (n, 3, 3)"""
-    box_sizes: NDArray | Array | None
-    """Half lengths of boxes, m; None if all shapes are equal. (n, 3)"""
+    sizes: NDArray | Array | None
+    """Sizes, m; None if all shapes are equal. (n, k)"""
 
     @staticmethod
     def from_geoms(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
-        """Return the stack of geoms of one shape, or of boxes; either all of them are rotated or none."""
-        rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
+        """Return the stack of geoms of one shape, or of one kind."""
+        rot = None
+        if any(geom.rot is not None for geom in geoms):
+            rot = np.array([np.eye(3) if geom.rot is None else geom.rot for geom in geoms])
         sizes = None
         if any(geom.shape != geoms[0].shape for geom in geoms):
             sizes = np.array([geom.shape.size for geom in geoms])
@@ -321,20 +355,30 @@ def _stacked_distances(
     return _mask_absent(None if is_present is None else is_present[..., None], gap)
 
 
-def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms) -> Array:
-    n, dtype = len(geoms.pos), part_pos.dtype
-    offset, half = bounding_box(geoms.shape)
-    halves = np.broadcast_to(half, (n, 3)) if geoms.box_sizes is None else geoms.box_sizes
-    middles = geoms.pos + (offset if geoms.rot is None else geoms.rot @ offset)
+def _nearest_distance(
+    part: CollisionGeom,
+    all_geoms: Sequence[CollisionGeom],
+    groups: Sequence[NDArray],
+    part_pos: Array,
+    drone_rot: Array | None,
+    group: Array,
+) -> Array:
+    geoms, n, dtype = StackedGeoms.from_geoms(all_geoms), len(all_geoms), part_pos.dtype
+    offsets, halves = (np.array(x) for x in zip(*(bounding_box(geom.shape) for geom in all_geoms), strict=True))
+    middles = geoms.pos + (offsets if geoms.rot is None else np.einsum("nij,nj->ni", geoms.rot, offsets))
     aligned_halves = halves if geoms.rot is None else np.einsum("nij,nj->ni", np.abs(geoms.rot), halves)
-    columns = [geoms.pos, halves, *([] if geoms.rot is None else [geoms.rot.reshape(n, 9)])]
+    columns = [
+        geoms.pos,
+        np.zeros((n, 9)) if geoms.rot is None else geoms.rot.reshape(n, 9),
+        np.zeros((n, 0)) if geoms.sizes is None else geoms.sizes,
+    ]
     table = jnp.asarray(np.concatenate(columns, axis=1), dtype)
 
     def distance_to_row(row: list[Array], part_pos: Array, drone_rot: Array | None) -> Array:
-        pos, rot_entries = jnp.stack(row[:3]), row[6:]
-        rot = jnp.stack(rot_entries).reshape(3, 3) if rot_entries else None
-        sizes = None if geoms.box_sizes is None else jnp.stack(row[3:6])
-        return _geom_distance(part, part_pos, drone_rot, StackedGeoms(geoms.shape, pos, rot, sizes))
+        rot = None if geoms.rot is None else jnp.stack(row[3:12]).reshape(3, 3)
+        sizes = None if geoms.sizes is None else jnp.stack(row[12:])
+        stacked = StackedGeoms(geoms.shape, jnp.stack(row[:3]), rot, sizes)
+        return _geom_distance(part, part_pos, drone_rot, stacked)
 
     fixed_pos, fixed_rot = jax.lax.stop_gradient((part_pos, drone_rot))
     index = nearest_geom(
@@ -343,8 +387,11 @@ def _nearest_distance(part: CollisionGeom, part_pos: Array, drone_rot: Array | N
         list(components(part_pos)),
         float(np.linalg.norm(bounding_box(part.shape)[1])) if part.shape.kind != "sphere" else part.shape.size[0],
         lambda k: distance_to_row(table_rows(table, k), fixed_pos, fixed_rot),
+        groups,
+        group,
     )
-    return distance_to_row(list(jnp.take(table, index, axis=0)), part_pos, drone_rot)
+    gap = distance_to_row(list(jnp.take(table, jnp.maximum(index, 0), axis=0)), part_pos, drone_rot)
+    return jnp.where(index < 0, jnp.inf, gap)
 
 
 def _geom_distance(
@@ -360,8 +407,8 @@ def _geom_distance(
     if rot is not None and part.rot is not None:
         rot = _matrix_product(rot, jnp.asarray(part.rot, part_pos.dtype))
     shape: Shape | SizedShapes = geom.shape
-    if isinstance(geom, StackedGeoms) and geom.box_sizes is not None:
-        shape = SizedShapes("box", [jnp.asarray(half, part_pos.dtype) for half in geom.box_sizes.T])
+    if isinstance(geom, StackedGeoms) and geom.sizes is not None:
+        shape = SizedShapes(geom.shape.kind, [jnp.asarray(half, part_pos.dtype) for half in geom.sizes.T])
     return distance(part.shape, shape, local_pos, jnp.eye(3) if rot is None else rot)  # type: ignore[arg-type]
 
 

@@ -333,7 +333,7 @@ def build_depth_fn(
         keys = {name: getattr(core, name) for name in keyed_fields if name != "rng_key" or core.rng_key.ndim}
 
         def poses_of(data: SimData) -> tuple[Any, ...]:
-            objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
+            objects = None if data.objects is None else data.objects.replace(mocap_ids=None, map_ids=None)
             return data.states.pos, data.states.quat, objects
 
         def cast_in_world(parts: Any) -> Hits:

@@ -51,6 +51,8 @@ class Target:
     """Index of the body, as in ``Hits.body_index``."""
     initial_pos: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Position of an object in the compiled scene, m. (3,)"""
+    map_index: int = -1
+    """Index of the map to which the geom belongs; -1 for geoms of all worlds."""
 
     @property
     def surface(self) -> Surface:
@@ -72,7 +74,10 @@ class Target:
 
 
 class Hierarchy(NamedTuple):
-    """Hierarchy of the geoms that do not move, as tables in memory. Nodes are in the orders of ``build_hierarchy``."""
+    """Hierarchies of the geoms that do not move, one for each map, as tables in memory.
+
+    Nodes are in the orders of ``build_hierarchies``. A scene without maps has one hierarchy.
+    """
 
     codes: Array
     """Index of the surface of each geom, and index of its drone or ``NOT_A_DRONE``. (n, 2)"""
@@ -82,13 +87,16 @@ class Hierarchy(NamedTuple):
     """Index of the node after the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
     geoms: Array
     """Geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
+    ranges: Array
+    """First node, and number of nodes, of the hierarchy of each map. (n_maps, 2)"""
 
 
 class Tables(NamedTuple):
     """Everything that rays of all worlds need, as tables in memory."""
 
     counts: Array
-    """Numbers of fixed nodes per order, of fixed geoms, of movable geoms, and of movable nodes per order. (1, 4)"""
+    """Numbers of fixed nodes per order, of fixed geoms, of movable geoms, and of movable nodes per order. (1, 4) With
+    maps, the same for each world, then first node and number of nodes of its hierarchy. (n_worlds, 6)"""
     codes: Array
     """As in ``Hierarchy``, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
@@ -116,7 +124,11 @@ class Targets:
         targets = [Target(geom, "world", 0, 0) for geom in model.floor]
         for index, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
-            targets += [Target(geom, carrier, body.row or 0, index, body.initial_pos) for geom in body.geoms]
+            maps = body.maps or [-1] * len(body.geoms)
+            targets += [
+                Target(geom, carrier, body.row or 0, index, body.initial_pos, map_index)
+                for geom, map_index in zip(body.geoms, maps, strict=True)
+            ]
         for drone_geoms in model.drones if drones else ():
             for row in range(n_drones) if drone_geoms.drones is None else drone_geoms.drones:
                 if row != ignored_drone:
@@ -127,6 +139,8 @@ class Targets:
         """Geoms of movable objects, then geoms of drones."""
         self.all_geoms = [*self.fixed_geoms, *self.movable_geoms]
         """All geoms, in the order of their indices."""
+        self.n_maps = max((body.n_maps for body in model.objects), default=0)
+        """Number of maps, of which each world has one; 0 without maps."""
         self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all_geoms))
         """Distinct surfaces of the geoms."""
         owners = [x.row if x.carrier == "drone" else NOT_A_DRONE for x in self.all_geoms]
@@ -142,10 +156,14 @@ class Targets:
             middle, half = bounding_box(target.geom.shape)
             middle, half = np.array(target.geom.pos) + rot @ middle, np.abs(rot) @ half
             low[k], high[k] = middle - half, middle + half
-        boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build_hierarchy(low, high))
+        map_index = np.array([x.map_index for x in self.fixed_geoms], int)
+        groups = [np.flatnonzero((map_index == k) | (map_index < 0)) for k in range(max(self.n_maps, 1))]
+        *tables, ranges = hierarchy.build_hierarchies(low, high, groups)
+        boxes, links = (x.reshape(-1, x.shape[-1]) for x in tables)
         geoms = np.array([x.table_row(np.array(x.geom.pos)) for x in self.fixed_geoms]).reshape(-1, 16)
         codes = self.codes[: len(self.fixed_geoms)]
-        return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
+        arrays = codes, np.asarray(boxes, dtype), links, np.asarray(geoms, dtype), ranges
+        return Hierarchy(*map(jnp.asarray, arrays))
 
     def movable_nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the nodes of the hierarchy of movable geoms, built from their positions in the compiled scene.
@@ -206,7 +224,15 @@ class Targets:
             geoms.append(jnp.concatenate([geom_pos, zero, axes.reshape(*geom_pos.shape[:2], 9), size], axis=-1))
         return jnp.concatenate(boxes, axis=1), jnp.concatenate(geoms, axis=1)
 
-    def tables(self, boxes: Array, links: np.ndarray, geoms: Array, camera_poses: Array, pixels: Array) -> Tables:
+    def tables(
+        self,
+        boxes: Array,
+        links: np.ndarray,
+        geoms: Array,
+        camera_poses: Array,
+        pixels: Array,
+        map_index: Array | None,
+    ) -> Tables:
         """Return the tables of rays of all worlds.
 
         Args:
@@ -215,12 +241,16 @@ class Targets:
             geoms: From ``movable_rows``.
             camera_poses: As in ``Tables``. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
+            map_index: ``Objects.map_index``; None without maps. (n_worlds, 1)
         """
         fixed_hierarchy = self.build_fixed_hierarchy(camera_poses.dtype)
         n_nodes = len(fixed_hierarchy.boxes) // hierarchy.N_ORDERS
         counts = np.array([[n_nodes, len(self.fixed_geoms), len(self.movable_geoms), links.shape[1]]], np.int32)
+        if map_index is not None:
+            ranges = fixed_hierarchy.ranges[map_index[:, 0]]
+            counts = jnp.concatenate([jnp.broadcast_to(counts, (len(ranges), 4)), ranges], axis=-1)
         tables = (
-            jnp.asarray(counts), jnp.asarray(self.codes), *fixed_hierarchy[1:], boxes, jnp.asarray(links), geoms,
+            jnp.asarray(counts), jnp.asarray(self.codes), *fixed_hierarchy[1:4], boxes, jnp.asarray(links), geoms,
             camera_poses, pixels,
         )  # fmt: skip
         # Empty tables get a row of zeros, since an array without rows has no memory.
@@ -287,8 +317,8 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         *tables: Fields of ``Tables``.
     """
     t = Tables(*tables)
-    counts = table_rows(t.counts, jnp.int32(0))
     world, ray = camera_ray(t, n_pixels, n_cameras, index)
+    counts = counts_in_world(t, world)
     return first_hit_of_ray(surfaces, t, counts, world, ray, jnp.full_like(ray.origin[0], jnp.inf))
 
 
@@ -300,14 +330,15 @@ def first_hit_of_ray(
     Args:
         surfaces: ``Targets.surfaces``.
         t: Geoms of all worlds.
-        counts: The row of ``Tables.counts``.
+        counts: From ``counts_in_world``.
         world: Index of the world. ()
         ray: The ray.
         limit: Distance beyond which nothing is met, m. ()
     """
-    n_nodes, n_fixed, n_movable, n_movable_nodes = counts
+    n_nodes, n_fixed, n_movable, n_movable_nodes, *map_range = counts
     best = limit, jnp.int32(-1)
-    best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed_geoms), ray, best, n_nodes)
+    fixed = t.codes, t.boxes, t.links, t.fixed_geoms
+    best = first_fixed_hit(surfaces, Hierarchy(*fixed, t.counts), ray, best, n_nodes, map_range or (0, n_nodes))
 
     def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:
         next_node, geom, first_order = table_rows(t.movable_links, k)
@@ -319,7 +350,12 @@ def first_hit_of_ray(
         row = table_rows(t.movable_geoms, world * n_movable + k)
         return _nearer_hit(surfaces, code, n_fixed + k, row, ray, is_near, best)
 
-    return _walk_hierarchy(read_node, hit_geom, ray, best, n_movable_nodes)
+    return _walk_hierarchy(read_node, hit_geom, ray, best, n_movable_nodes, 0, n_movable_nodes)
+
+
+def counts_in_world(t: Tables, world: Array) -> list[Array]:
+    """Return the row of ``Tables.counts`` that concerns a world."""
+    return table_rows(t.counts, world if t.counts.shape[1] > 4 else jnp.int32(0))
 
 
 def camera_ray(t: Tables, n_pixels: int, n_cameras: int, index: Array) -> tuple[Array, Ray]:
@@ -374,8 +410,8 @@ def surface_at_hit(
         *tables: Fields of ``Tables``, then the two results of ``first_hit`` for all rays. (n_rays, 1) each
     """
     t, (distances, geoms) = Tables(*tables[:-2]), tables[-2:]
-    _, n_fixed, n_movable, _ = table_rows(t.counts, jnp.int32(0))
     world, ray = camera_ray(t, n_pixels, n_cameras, index)
+    _, n_fixed, n_movable, *_ = counts_in_world(t, world)
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
     code, _ = table_rows(t.codes, _maximum(geom, jnp.int32(0)))
 
@@ -432,16 +468,22 @@ def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
 
 
 def first_fixed_hit(
-    surfaces: Sequence[Surface], tables: Hierarchy, ray: Ray, best: BestHit, n_nodes: Array | int | None = None
+    surfaces: Sequence[Surface],
+    tables: Hierarchy,
+    ray: Ray,
+    best: BestHit,
+    n_nodes: Array | int,
+    map_range: Sequence[Array | int],
 ) -> BestHit:
     """Return the best hit so far, or a nearer hit of a fixed geom.
 
     Args:
         surfaces: ``Targets.surfaces``.
         tables: The fixed geoms.
-        n_nodes: Number of nodes in one order of the hierarchy; None to take it from the tables.
+        n_nodes: Number of nodes in one order of all hierarchies.
+        map_range: First node, and number of nodes, of the hierarchy of the ray's world.
     """
-    n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
+    first_node, n_nodes_of_map = map_range
 
     def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:
         next_node, geom = table_rows(tables.links, k)
@@ -451,7 +493,7 @@ def first_fixed_hit(
         code, _ = table_rows(tables.codes, geom)
         return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, is_crossing, best)
 
-    return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes)
+    return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes, first_node, n_nodes_of_map)
 
 
 def _walk_hierarchy(
@@ -459,13 +501,15 @@ def _walk_hierarchy(
     hit_geom: Callable[[Array, Array, BestHit], BestHit],
     ray: Ray,
     best: BestHit,
+    nodes_per_order: Array | int,
+    first_node: Array | int,
     n_nodes: Array | int,
 ) -> BestHit:
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     are_negative = [any_lane(d < 0) for d in ray.direction]
     order = sum(jnp.where(is_negative, jnp.int32(1 << k), 0) for k, is_negative in enumerate(are_negative))
-    first_node = order * n_nodes
+    first_node = order * nodes_per_order + first_node
 
     def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         node, best = carry

@@ -7,6 +7,7 @@ node continues there. Each of the eight octants of directions has its own order,
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -53,6 +54,33 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
         roots.append(_build_tree(low, high, np.flatnonzero(is_bounded)))
     rows = np.array([_node_rows(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
     return rows[..., :6], rows[..., 6:].astype(np.int32)
+
+
+def build_hierarchies(
+    low: np.ndarray, high: np.ndarray, groups: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return hierarchies of groups of boxes, one after the other in every order; see ``build_hierarchy``.
+
+    Args:
+        low: Lower corners of all boxes, m. (n, 3)
+        high: Upper corners, m. (n, 3)
+        groups: Indices of the boxes of each group.
+
+    Returns:
+        Boxes of the nodes. (8, n_nodes, 6)
+        Links, in which nodes are counted from the first node of their group. (8, n_nodes, 2)
+        First node and number of nodes of each group. (n_groups, 2)
+    """
+    boxes, links, counts = [np.zeros((N_ORDERS, 0, 6))], [np.zeros((N_ORDERS, 0, 2), np.int32)], []
+    for group in groups:
+        group_boxes, group_links = build_hierarchy(low[group], high[group])
+        is_leaf = group_links[..., 1] >= 0
+        group_links[..., 1][is_leaf] = group[group_links[..., 1][is_leaf]]
+        boxes.append(group_boxes)
+        links.append(group_links)
+        counts.append(group_boxes.shape[1])
+    ranges = np.stack([np.cumsum([0, *counts[:-1]]), counts], axis=-1).astype(np.int32)
+    return np.concatenate(boxes, axis=1), np.concatenate(links, axis=1), ranges
 
 
 def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:

@@ -20,6 +20,7 @@ from crazysim.scene.first_hit import (
     Surface,
     Tables,
     camera_ray,
+    counts_in_world,
     first_hit_of_ray,
     normal_in_frame,
     surface_at_hit,
@@ -133,8 +134,8 @@ def color_at_hit(
     """
     n_paint = len(Paint._fields)
     paint, t, (distances, geoms) = Paint(*tables[:n_paint]), Tables(*tables[n_paint:-2]), tables[-2:]
-    counts = table_rows(t.counts, jnp.int32(0))
     world, ray = camera_ray(t, n_pixels, n_cameras, index)
+    counts = counts_in_world(t, world)
     pose = table_rows(t.camera_poses, lax.div(index, jnp.int32(n_pixels)))
     back = pose[5], pose[8], pose[11]
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)

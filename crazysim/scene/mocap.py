@@ -36,11 +36,13 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
     if has_worlds:
         pos, quat = pos[:, None], quat[:, None]
     names: tuple[str, ...] = ()
+    map_index = None if data.objects is None else data.objects.map_index
     if data.objects is not None:
         names = data.objects.names
         pos, quat = (jnp.concatenate(x, axis=-2) for x in ((data.objects.pos, pos), (data.objects.quat, quat)))
     # Queries need poses only.
-    return data.replace(objects=Objects(pos, quat, None, None, (*names, *model.mocap_bodies)))  # type: ignore[arg-type]
+    objects = Objects(pos, quat, None, None, (*names, *model.mocap_bodies), map_index=map_index)  # type: ignore[arg-type]
+    return data.replace(objects=objects)
 
 
 def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses) -> None:

@@ -10,13 +10,19 @@ from jax import Array, lax
 
 from crazysim.core.branches import any_lane, compute_where, table_rows
 from crazysim.rotation import safe_sqrt
-from crazysim.scene.hierarchy import build_hierarchy
+from crazysim.scene.hierarchy import build_hierarchies
 
 
 def nearest_geom(
-    low: np.ndarray, high: np.ndarray, point: Sequence[Array], reach: float, distance: Callable[[Array], Array]
+    low: np.ndarray,
+    high: np.ndarray,
+    point: Sequence[Array],
+    reach: float,
+    distance: Callable[[Array], Array],
+    groups: Sequence[np.ndarray],
+    group: Array,
 ) -> Array:
-    """Return the index of the geom with the smallest distance, int32, without a derivative. ()
+    """Return the index of the geom with the smallest distance, int32, -1 if there is none, without a derivative. ()
 
     Nodes are visited in depth-first order. If the box of a node is no nearer than the best geom so far, its
     subtree is skipped.
@@ -27,15 +33,18 @@ def nearest_geom(
         point: Coordinates of the position of a body, m. () each
         reach: Radius of the ball around the position that contains the body, m.
         distance: Function from the index of a geom to the signed distance of the body to it, m. () -> ()
+        groups: Indices of the geoms of each group.
+        group: Index of the group that is searched. ()
     """
     dtype = point[0].dtype
-    node_boxes, node_links = build_hierarchy(low, high)
+    node_boxes, node_links, ranges = build_hierarchies(low, high, groups)
+    first_node, n_nodes = table_rows(jnp.asarray(ranges), group)
     boxes, links = jnp.asarray(node_boxes[0], dtype), jnp.asarray(node_links[0])
     point = [lax.stop_gradient(x) for x in point]
 
     def check_node(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
         node, best = carry
-        (next_node, geom), box = table_rows(links, node), table_rows(boxes, node)
+        (next_node, geom), box = table_rows(links, first_node + node), table_rows(boxes, first_node + node)
         is_near = _box_distance(box[:3], box[3:], point) - reach < best[0]
 
         def compare_geom(best: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -48,8 +57,8 @@ def nearest_geom(
 
         return compute_where(any_lane(is_near), descend, (next_node, best))
 
-    start = jnp.int32(0), (jnp.full_like(point[0], jnp.inf), jnp.int32(0))
-    return lax.while_loop(lambda carry: carry[0] < len(links), check_node, start)[1][1]
+    start = jnp.int32(0), (jnp.full_like(point[0], jnp.inf), jnp.int32(-1))
+    return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, start)[1][1]
 
 
 def _box_distance(low: Sequence[Array], high: Sequence[Array], point: Sequence[Array]) -> Array:

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from jax import Array
+
 from crazysim.core.data import SimData, require_data
 from crazysim.core.plugin import BoundMethod, Plugin
 from crazysim.engine.stage import vmap_worlds
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, require
 
 ListPlugins = Callable[[], Iterable[Plugin]]
 """Function that returns the plugins of the simulation."""
+
+
+def map_index_of(data: SimData) -> Array:
+    """Return the index of the map that each world has, (n_worlds, 1), or () in one world or drone."""
+    index = None if data.objects is None else data.objects.map_index
+    require(index is not None, "expected data with maps, got data.objects.map_index None. Use sim.data after sim.add.")
+    return index  # type: ignore[return-value]
 
 
 def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plugin]:

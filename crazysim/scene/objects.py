@@ -20,7 +20,8 @@ from crazysim.core.settings import as_mask, positive_integer
 from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
-from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
+from crazysim.scene.collision import DRONE_BITS
+from crazysim.scene.primitives import DRONE_TOUCH_BITS, PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000
 """Largest number of objects that can be added at once."""
@@ -174,6 +175,8 @@ class SceneObjects:
         self._n_worlds = n_worlds
         self._handles: list[Handle] = []
         self._initial_poses: list[tuple[NDArray, NDArray]] = []
+        self.maps: tuple[str, ...] = ()
+        """Names of the bodies of maps, of which each world has one."""
 
     @property
     def movable(self) -> tuple[str, ...]:
@@ -217,10 +220,22 @@ class SceneObjects:
             self._initial_poses.append((poses[0], poses[1]))
         return handle
 
+    def add_maps(self, spec: mujoco.MjSpec, sources: Sequence[Source], name: str) -> None:
+        """Add maps to a spec, of which each world has one; see ``Maps``."""
+        origin = (0.0, 0.0, 0.0)
+        handle = self.add(spec, list(sources), name, len(sources), origin, IDENTITY_QUAT, False, {})
+        for body in (spec.body(x) for x in handle.bodies):
+            body.mocap = True
+            for geom in body.find_all("geom"):
+                # MJX would check all pairs of geoms of two maps.
+                touches_drones = DRONE_BITS[0] & geom.conaffinity or DRONE_BITS[1] & geom.contype
+                geom.contype, geom.conaffinity = 0, DRONE_TOUCH_BITS["conaffinity"] if touches_drones else 0
+        self.maps = handle.bodies
+
     def repeated(self, n: int) -> SceneObjects:
         """Return the same objects with each world ``n`` times."""
         objects = SceneObjects(n * self._n_worlds)
-        objects._handles = self._handles[:]
+        objects._handles, objects.maps = self._handles[:], self.maps
         objects._initial_poses = [
             (np.repeat(pos, n, axis=0), np.repeat(quat, n, axis=0)) for pos, quat in self._initial_poses
         ]
@@ -243,19 +258,24 @@ class SceneObjects:
         for element in added:
             spec.delete(element)
         self._handles, self._initial_poses = snapshot.handles, snapshot.initial_poses
+        self.maps = (
+            self.maps if any(body in handle.bodies for handle in self._handles for body in self.maps[:1]) else ()
+        )
         return bool(added)
 
-    def build_record(self, previous: Objects | None, mocap_ids: list[int]) -> Objects | None:
+    def build_record(self, previous: Objects | None, mocap_ids: list[int], map_ids: list[int]) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of other objects.
 
         Args:
             previous: Earlier record, or None.
             mocap_ids: Mocap ids of the bodies, in the order of ``movable``.
+            map_ids: Mocap ids of the maps.
         """
-        if not self._initial_poses:
+        if not self._initial_poses and not map_ids:
             return None
-        names = self.movable
-        pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in zip(*self._initial_poses, strict=True))
+        names, no_poses = self.movable, tuple(np.zeros((self._n_worlds, 0, n)) for n in (3, 4))
+        initial_poses = zip(no_poses, *self._initial_poses, strict=True)
+        pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in initial_poses)
         poses = [pos, quat, np.zeros_like(pos)]
         if previous is not None:
             old_rows = {name: k for k, name in enumerate(previous.names)}
@@ -264,7 +284,13 @@ class SceneObjects:
             for new, old in zip(poses, (previous.pos, previous.quat, previous.vel), strict=True):
                 new[..., rows, :] = np.asarray(old)[..., kept_rows, :]
         pos, quat, vel = (device_array(x) for x in poses)
-        return Objects(pos, quat, vel, device_array(mocap_ids, np.int32), names)
+        objects = Objects(pos, quat, vel, device_array(mocap_ids, np.int32), names)
+        if not map_ids:
+            return objects
+        map_index = None if previous is None else previous.map_index
+        if map_index is None:
+            map_index = device_array(np.zeros((self._n_worlds, 1)), np.int32)
+        return objects.replace(map_index=map_index, map_ids=device_array(map_ids, np.int32))
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:

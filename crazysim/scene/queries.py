@@ -66,8 +66,9 @@ class SceneQueries:
         if is_new:
             compiled[name, *settings] = jax.jit(_restrict_to_poses(build(), data))
         states, objects = data.states, data.objects
+        object_poses = (None,) * 3 if objects is None else (objects.pos, objects.quat, objects.map_index)
         # Pass only the arrays that the query needs, since the cost of a compiled call grows with their number.
-        poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
+        poses = (states.pos, states.quat, *object_poses)
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         with keep_programs(enabled=is_new):
             return compiled[name, *settings](*poses, mocap)
@@ -107,13 +108,18 @@ def _restrict_to_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., A
     empty_data = jax.tree.map(lambda _: None, data)
 
     def query_poses(
-        pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: MocapPoses
+        pos: Array,
+        quat: Array,
+        objects_pos: Array | None,
+        objects_quat: Array | None,
+        map_index: Array | None,
+        mocap: MocapPoses,
     ) -> Any:
         states, objects = empty_data.states.replace(pos=pos, quat=quat), empty_data.objects
         core = empty_data.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
             # Plugins have already moved their objects, so their records are not needed.
-            objects = objects.replace(pos=objects_pos, quat=objects_quat, recorded=True)
+            objects = objects.replace(pos=objects_pos, quat=objects_quat, map_index=map_index, recorded=True)
         return fn(empty_data.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
     return query_poses

@@ -14,6 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim import rotation
+from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
@@ -39,8 +40,10 @@ from crazysim.scene.first_hit import (
     normal_at_hit,
     ray_in_frame,
 )
+from crazysim.scene.hierarchy import N_ORDERS
 from crazysim.scene.hit_color import color_at_hit
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.object_poses import map_index_of
 
 T = TypeVar("T")
 MAX_UNROLLED_GEOMS = 16
@@ -154,11 +157,13 @@ def cast_rays(
     )
     # Fixed geoms, by a hierarchy if there are many.
     targets = Targets(model, 0, drones=False)
-    if len(targets.fixed_geoms) * len(origin) <= MAX_PAIRS:
+    map_index = map_index_of(data) if targets.n_maps else None
+    n_pairs = len(targets.fixed_geoms) * len(origin)
+    if n_pairs <= MAX_PAIRS and (map_index is None or not n_pairs):
         for target in targets.fixed_geoms:
             best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.body_index)
     else:
-        best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit))
+        best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit, map_index))
     # Objects that have the same geoms are one batch.
     groups: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
     for index, body in enumerate(model.objects, start=1):
@@ -233,19 +238,24 @@ def _nearer_hits(best: Hits, distance: Array, normal: Array, body_index: Array |
 
 
 def _hit_fixed_geoms(
-    targets: Targets, origin: Array, direction: Array, limit: Array | float
+    targets: Targets, origin: Array, direction: Array, limit: Array | float, map_index: Array | None
 ) -> tuple[Array, Array, Array]:
     # A loop over the rays finds the nearest geoms without derivatives. The distances to these geoms have derivatives.
     tables = targets.build_fixed_hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed_geoms), 0].max()]
     origins, directions = jax.lax.stop_gradient((origin, direction))
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
+    n_nodes = len(tables.boxes) // N_ORDERS
+    map_range = (0, n_nodes) if map_index is None else table_rows(tables.ranges, map_index)
 
     def first_geoms(origins: Array, directions: Array) -> Array:
         def cast_next(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, geom_index = carry
             ray = Ray(components(origins[k]), components(directions[k]), jnp.int32(IGNORES_NONE))
-            return (k + 1, geom_index.at[k].set(first_fixed_hit(surfaces, tables, ray, initial)[1])), None
+            return (
+                k + 1,
+                geom_index.at[k].set(first_fixed_hit(surfaces, tables, ray, initial, n_nodes, map_range)[1]),
+            ), None
 
         initial_carry = jnp.int32(0), jnp.full(len(origins), -1, jnp.int32)
         return jax.lax.scan(cast_next, initial_carry, length=len(origins))[0][1]
@@ -324,7 +334,9 @@ def cast_rays_in_worlds(
     # The nearest geom of each ray, in kernels.
     boxes, movable = targets.movable_rows(data)
     boxes, links = kernels.node_boxes(targets, jax.lax.stop_gradient(boxes))
-    tables = targets.tables(boxes, links, movable, camera_poses, jnp.asarray(pixels, camera_poses.dtype))
+    map_index = map_index_of(data) if targets.n_maps else None
+    pixel_table = jnp.asarray(pixels, camera_poses.dtype)
+    tables = targets.tables(boxes, links, movable, camera_poses, pixel_table, map_index)
     n, tables = n_worlds * n_cameras * n_pixels, jax.lax.stop_gradient(tables)
     ray_fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
     (ray_length, geom_index), platform = kernels.run(ray_fn, n, tables, targets)
@@ -346,11 +358,11 @@ def cast_rays_in_worlds(
     if not targets.all_geoms:
         return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names, color)
     # The normal, in a kernel if possible, and derivatives of both.
-    fixed_rows = jnp.broadcast_to(
-        tables.fixed_geoms[: len(targets.fixed_geoms)], (n_worlds, len(targets.fixed_geoms), 16)
-    )
-    rows = jnp.concatenate([fixed_rows, movable], axis=1)
-    rows = jnp.take_along_axis(rows, jnp.maximum(geom_index, 0)[..., None], axis=1)
+    n_fixed = len(targets.fixed_geoms)
+    rows = jnp.take(tables.fixed_geoms, jnp.clip(geom_index, 0, max(n_fixed - 1, 0)), axis=0)
+    if targets.movable_geoms:
+        movable_rows = jnp.take_along_axis(movable, jnp.maximum(geom_index - n_fixed, 0)[..., None], axis=1)
+        rows = jnp.where((geom_index < n_fixed)[..., None], rows, movable_rows)
     _, normal_at = _hit_rows(targets.surfaces, targets.codes, geom_index, rows, origin, direction)
     if platform is None:
         normal = normal_at(distance)

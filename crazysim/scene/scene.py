@@ -186,6 +186,20 @@ class Scene:
             name = Path(source).stem if isinstance(source, (str, Path)) else "map"
         return self.add(spec, name, mocap=False)
 
+    def add_maps(self, sources: Sequence[Source], name: str) -> None:
+        """Add maps of which each world has one, ``data.objects.map_index``; see ``Maps``."""
+        maps = self.added_objects.maps
+        names = tuple(f"{name}:{k}" for k in range(len(sources)))
+        require(
+            maps in ((), names),
+            f"expected the {len(maps)} maps that the scene already has, got {len(names)} {name!r}. A scene has one "
+            f"list of maps. Use a new simulation.",
+        )
+        if not maps:
+            with self.restore_on_error():
+                self.added_objects.add_maps(self.spec, sources, name)
+            self.revision += 1
+
     def add_once(self, source: Source, name: str, count: int, **options: Any) -> None:
         """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced.
 
@@ -232,7 +246,9 @@ class Scene:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         mj_model = build.compile_spec(self.spec)
         drone_ids = build.mocap_ids(mj_model, [f"drone:{i}" for i in range(self.n_drones)])
-        self._object_ids = build.mocap_ids(mj_model, self.added_objects.movable)
+        self._object_ids, self._map_ids = (
+            build.mocap_ids(mj_model, names) for names in (self.added_objects.movable, self.added_objects.maps)
+        )
         self._drone_ids = drone_ids
         self.renderer.close()
         self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
@@ -261,10 +277,10 @@ class Scene:
 
     def objects(self, previous: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
-        movable = self.added_objects.movable
-        return self.added_objects.build_record(
-            previous, self._spec_mocap_ids(movable) if self._is_edited else self._object_ids
-        )
+        ids = self._object_ids, self._map_ids
+        if self._is_edited:
+            ids = tuple(self._spec_mocap_ids(x) for x in (self.added_objects.movable, self.added_objects.maps))
+        return self.added_objects.build_record(previous, *ids)
 
     def _check_image_memory(self, n_cameras: int, size: tuple[int, int], bytes_per_pixel: float) -> None:
         n_devices = 1 if self.mesh is None else self.mesh.size
@@ -286,7 +302,8 @@ class Scene:
         """Geoms that drones can touch; rebuilt after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._collision_model is None:
-            self._collision_model = collision.collision_model(model, self.added_objects.movable, self.drone_groups)
+            objects = self.added_objects
+            self._collision_model = collision.collision_model(model, objects.movable, self.drone_groups, objects.maps)
         return self._collision_model
 
     @property
@@ -294,7 +311,8 @@ class Scene:
         """Geoms that cameras see; rebuilt after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._visual_model is None:
-            self._visual_model = collision.visual_model(model, self.added_objects.movable, self.drone_groups)
+            objects = self.added_objects
+            self._visual_model = collision.visual_model(model, objects.movable, self.drone_groups, objects.maps)
         return self._visual_model
 
     @property

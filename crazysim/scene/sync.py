@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,9 +21,13 @@ COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAML
 cameras."""
 
 
-Poses = tuple[tuple[Array, Array, Array], ...]
+HIDDEN_MAP_DEPTH = 1e4
+"""Depth at which MuJoCo has the maps that a world does not have, m."""
+
+Poses = tuple[tuple[Any, ...], ...]
 """Mocap ids (n,), positions, world frame, m (n_worlds, n, 3), and attitudes, body to world, xyzw (n_worlds, n, 4), of
-all drones, and of all objects with handles, whose poses have a further axis of length 1 after n_worlds."""
+all drones, and of all objects with handles, whose poses have a further axis of length 1 after n_worlds. With maps,
+their mocap ids (n_maps,), and the index of each world's map (n_worlds, 1)."""
 
 
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
@@ -33,7 +39,10 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
 def poses_of(data: SimData) -> Poses:
     """Return the poses of everything in the scene that the data moves."""
     drones, objects = (data.core.drone_mocap_ids, data.states.pos, data.states.quat), data.objects
-    return (drones,) if objects is None else (drones, (objects.mocap_ids, objects.pos, objects.quat))
+    if objects is None:
+        return (drones,)
+    poses = drones, (objects.mocap_ids, objects.pos, objects.quat)
+    return poses if objects.map_ids is None else (*poses, (objects.map_ids, objects.map_index))
 
 
 @jax.jit
@@ -64,8 +73,14 @@ def sync_poses(poses: Poses, mjx_data: mjx.Data, mjx_model: mjx.Model) -> mjx.Da
 
 
 def _groups(poses: Poses) -> list[tuple[Array, Array, Array]]:
-    drones, *objects = poses
-    return [drones, *[(ids, pos[:, 0], quat[:, 0]) for ids, pos, quat in objects]]
+    drones, *others = poses
+    objects = [(ids, pos[:, 0], quat[:, 0]) for ids, pos, quat in others[:1]]
+    return [drones, *objects, *[(ids, *_map_poses(len(ids), index)) for ids, index in others[1:]]]  # type: ignore[list-item]
+
+
+def _map_poses(n_maps: int, index: Array | NDArray) -> tuple[Array, Array]:
+    z = jnp.where(index == np.arange(n_maps), 0.0, -HIDDEN_MAP_DEPTH)[..., None]
+    return z * np.array([0.0, 0.0, 1.0]), jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (*z.shape[:2], 4))
 
 
 def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -98,8 +113,8 @@ def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, A
 def host_poses(data: SimData, worlds: NDArray, poses: tuple[NDArray, ...]) -> tuple[NDArray, NDArray]:
     """Return mocap poses as ``with_data_poses``, in NumPy: m (n, n_mocap, 3), and wxyz (n, n_mocap, 4)."""
     mocap_pos, mocap_quat = (np.array(x, float) for x in poses[:2])
-    for ids, pos, quat in poses_of(data):
-        new_pos, new_quat = (fetch_rows(x, worlds).reshape(len(worlds), len(ids), -1) for x in (pos, quat))
+    selected_poses = tuple((ids, *(fetch_rows(x, worlds) for x in arrays)) for ids, *arrays in poses_of(data))
+    for ids, new_pos, new_quat in _groups(selected_poses):
         mocap_pos[:, np.asarray(ids)], mocap_quat[:, np.asarray(ids)] = new_pos, np.roll(new_quat, 1, axis=-1)
     return mocap_pos, mocap_quat
 

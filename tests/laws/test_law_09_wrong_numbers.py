@@ -69,6 +69,7 @@ EXAMPLES = {
     "Residual": {"linear": np.zeros((6, 14)), "hidden": np.zeros((3, 14)), "output": np.zeros((6, 3))},
     "SharedLoad": {"mass": 0.01},
     "SlungLoad": {"mass": 0.01},
+    "Maps": {"maps": ("<mujoco/>",)},
     "Terrain": {"heights": np.zeros((3, 3)), "size": (4.0, 4.0)},
     "UWB": {"anchors": FOUR_POINTS},
     "WindField": {"field": Grid(np.zeros((2, 2, 2, 3)))},

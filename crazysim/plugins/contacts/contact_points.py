@@ -20,6 +20,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
 from crazysim.drones.body import body_shape
+from crazysim.errors import require
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.plugins.effects.ground import HeightField
@@ -72,6 +73,11 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, excluded: Collectio
     moved_kinds = {kind for plugin in sim.scene.plugins() for kind in plugin.moved_kinds or ()}
     members = populations(sim.data)
     for body in select_bodies(model, objects):
+        require(
+            not body.n_maps,
+            f"expected objects that push drones, got {body.name!r}, of which each world has one. Use objects= to "
+            f"leave the maps out, and ContactLog for contacts with them.",
+        )
         kind, _, number = body.name.rpartition(":")
         if kind in excluded:
             continue
