@@ -89,13 +89,12 @@ class Condition(NamedTuple):
 CONDITIONS = (
     Condition("crazysim", "crazysim"),
     Condition("crazysim"),
-    *(Condition(freq=x, latency=y, noise=noise) for x, y, noise in itertools.product(RATES, LATENCIES, NOISES[:2])),
-    *(Condition(freq=x, latency=y, noise=NOISES[2]) for x, y in ((50, 0), (30, 20), (15, 60))),
-    *(
-        Condition(simulator, images, freq, latency, noise)
-        for simulator, images in (("C MuJoCo", "mj_multiRay"), ("C MuJoCo with drag", "renderer"))
-        for freq, latency, noise in ((50, 0, "none"), (30, 20, "stereo"))
-    ),
+    *(Condition(latency=latency) for latency in LATENCIES),
+    *(Condition(freq=freq) for freq in RATES[1:]),
+    *(Condition(freq=x, latency=y, noise="stereo") for x, y in itertools.product(RATES, LATENCIES)),
+    *(Condition(freq=x, latency=y, noise="stereo, filled") for x, y in ((50, 0), (30, 20))),
+    *(Condition("C MuJoCo", freq=x, latency=y, noise=noise) for x, y, noise in ((50, 0, "none"), (30, 20, "stereo"))),
+    Condition(images="renderer", freq=30, latency=20, noise="stereo"),
 )
 """Conditions in which a policy is flown."""
 
@@ -114,13 +113,14 @@ class OwnRays:
         self.camera, self._data, self._mount = camera, data, camera.drone_camera(sim)
         self._cast = jax.jit(sim.scene.depth_fn(self._mount))
 
-    def take(self, states: States, flying: NDArray) -> tuple[NDArray, NDArray]:
+    def take(self, states: States, flying: NDArray, has_holes: bool = True) -> tuple[NDArray, NDArray]:
         """Return depths, m, and whether the second imager does not see the points. (n, height, width) each
 
         Args:
             flying: Worlds whose images are needed. (n,)
+            has_holes: Whether the second imager is needed.
         """
-        del flying
+        del flying, has_holes
         hits = self._cast(with_states(self._data, states))
         return np.asarray(hits.distance)[:, 0], np.asarray(hits.is_hidden)[:, 0]
 
@@ -141,14 +141,14 @@ class MujocoRays(OwnRays):
         own = self._model.body_rootid[self._model.geom_bodyid] == drone  # a drone never sees itself
         self._model.geom_matid[own], self._model.geom_rgba[own, 3] = -1, 0.0
 
-    def take(self, states: States, flying: NDArray) -> tuple[NDArray, NDArray]:
+    def take(self, states: States, flying: NDArray, has_holes: bool = True) -> tuple[NDArray, NDArray]:
         depth = np.full((len(flying), *self.camera.image_size), np.inf)
         is_hidden = np.zeros_like(depth, bool)
         for k in np.flatnonzero(flying):
-            depth[k], is_hidden[k] = self._take_one(self._worlds[k], states["pos"][k], states["quat"][k])
+            depth[k], is_hidden[k] = self._take_one(self._worlds[k], states["pos"][k], states["quat"][k], has_holes)
         return depth, is_hidden
 
-    def _take_one(self, data: mujoco.MjData, pos: NDArray, quat: NDArray) -> tuple[NDArray, NDArray]:
+    def _take_one(self, data: mujoco.MjData, pos: NDArray, quat: NDArray, has_holes: bool) -> tuple[NDArray, Any]:
         data.mocap_pos[self._mocap], data.mocap_quat[self._mocap] = pos, np.roll(quat, 1)
         mujoco.mj_kinematics(self._model, data)
         body = np.zeros(9)
@@ -157,12 +157,14 @@ class MujocoRays(OwnRays):
         left, rot = pos + body @ self._mount.pos[0], body @ self._mount.rot
         rays = self.camera.rays.reshape(-1, 3) @ rot.T
         distance = self._cast_rays(data, left, rays)
+        depth = self._depth(data, distance.reshape(self.camera.image_size))
+        if not has_holes:
+            return depth, False
         right = left - self.camera.baseline * rot[:, 1]
         to_point = left + np.minimum(distance, 1e3)[:, None] * rays - right
         length = np.linalg.norm(to_point, axis=-1)
         is_nearer = self._cast_rays(data, right, to_point / length[:, None]) < (1 - HIDDEN_TOLERANCE) * length
-        is_hidden = (is_nearer & np.isfinite(distance)).reshape(self.camera.image_size)
-        return self._depth(data, distance.reshape(self.camera.image_size)), is_hidden
+        return depth, (is_nearer & np.isfinite(distance)).reshape(self.camera.image_size)
 
     def _depth(self, data: mujoco.MjData, distance: NDArray) -> NDArray:
         del data
@@ -297,7 +299,7 @@ def fly_forest(pilot: Pilot, condition: Condition, n: int = N_FORESTS) -> tuple[
     drones = SIMULATORS[condition.simulator](states)
 
     def look(states: States, index: int) -> Array:
-        depth, is_hidden = source.take(states, flying)
+        depth, is_hidden = source.take(states, flying, condition.noise != "none")
         key = jax.random.fold_in(jax.random.key(0), index)
         return add_errors(jnp.asarray(depth), jnp.asarray(is_hidden), key, camera, condition.noise).reshape(n, 1, -1)
 
