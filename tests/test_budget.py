@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6785,
     "envs": 3766,
     "geometry": 940,
-    "lab": 17733,
+    "lab": 17735,
     "media": 1087,
     "plugins": 5036,
     "scene": 3090,
