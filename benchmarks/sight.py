@@ -1,10 +1,12 @@
-"""Rates of flying by sight: the task ``forest`` with its convolution, and lidars among trees.
+"""Rates of flying by sight: the task ``forest`` with its convolution, its gradient, and lidars among trees.
 
-    python benchmarks/sight.py [--device gpu] [--worlds 4096] [--repeats 7] [--small]
+    python benchmarks/sight.py [--device gpu] [--worlds 4096] [--repeats 7] [--cases policy gradient lidar] [--small]
 
 ``policy``: rollouts of ``forest`` with automatic resets, in a corridor that is long enough for 200 trees, which every
 world draws anew in every episode. The policy has the convolution and the layers of the recipe, and receives a depth
 image of 16 x 12 pixels in every step.
+``gradient``: the gradient of the mean reward of 150 steps of ``forest`` with respect to the weights of this policy,
+through every image. ``forward_passes`` is its time over the time of the mean reward alone.
 ``lidar``: steps of hovering drones among 200 trees, whose lidars take 16 x 360 rays at 10 Hz. ``realtime`` is the
 simulated time of one world divided by the real time.
 """
@@ -44,25 +46,23 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--cases", nargs="+", choices=("policy", "gradient", "lidar"), default=["policy", "lidar"])
     parser.add_argument("--small", action="store_true", help="few steps, to try the script")
     args = parser.parse_args()
-    n_steps = 4 if args.small else 50
-    measure_rollouts(args, n_steps)
-    measure_lidars(args, 2 if args.small else 10)
+    if "policy" in args.cases:
+        measure_rollouts(args, 4 if args.small else 50)
+    if "gradient" in args.cases:
+        measure_gradients(args, 4 if args.small else 150)
+    if "lidar" in args.cases:
+        measure_lidars(args, 2 if args.small else 10)
 
 
 def measure_rollouts(args: argparse.Namespace, n_steps: int) -> None:
     """Time rollouts of ``forest`` with its recipe's network."""
     length = N_TREES * AREA_OF_TREE / CORRIDOR
     env = envs.AutoReset(envs.make("forest", args.worlds, length=length, device=args.device))
-    recipe: Any = TrainConfig.create("forest", "ppo", n_worlds=args.worlds).algorithm_config()
     state = jax.jit(env.reset)(jax.device_put(jax.random.key(0), env.sim.device))
-    images = find_images({name: x.shape[-1] for name, x in state.obs.items()}, env.image_formats())
-    network = choose_network(0, None, recipe.convolution, images)
-    n_obs, shape = flatten(state.obs).shape[-1], state.action.shape
-    weights = init_weights(network, jax.random.key(1), n_obs, (*recipe.hidden, env.actions.size), 0.01)
-    policy = Policy(RunningStats.create(n_obs, network.pixels), weights.layers, weights.body, network)
-    policy = jax.device_put(policy, env.sim.device)
+    policy, shape = make_policy(env, state), state.action.shape
 
     def act(obs: Any, memory: Any, key: Any) -> Any:
         return policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ()
@@ -80,6 +80,53 @@ def measure_rollouts(args: argparse.Namespace, n_steps: int) -> None:
         n_trees=N_TREES, image=[16, 12], env_steps_per_s=round_digits(args.worlds * n_steps / call_s),
         rays_per_s=round_digits(args.worlds * n_steps * 16 * 12 / call_s), done=round_digits(float(np.mean(done))),
         first_s=round(first_s, 1), crazysim=__version__,
+    )  # fmt: skip
+
+
+def make_policy(env: envs.Env, state: Any) -> Policy:
+    """Make an untrained policy of ``forest`` with the network of its recipe."""
+    recipe: Any = TrainConfig.create("forest", "ppo").algorithm_config()
+    images = find_images({name: x.shape[-1] for name, x in state.obs.items()}, env.image_formats())
+    network, n_obs = choose_network(0, None, recipe.convolution, images), flatten(state.obs).shape[-1]
+    weights = init_weights(network, jax.random.key(1), n_obs, (*recipe.hidden, env.actions.size), 0.01)
+    policy = Policy(RunningStats.create(n_obs, network.pixels), weights.layers, weights.body, network)
+    return jax.device_put(policy, env.sim.device)
+
+
+def measure_gradients(args: argparse.Namespace, n_steps: int) -> None:
+    """Time the mean reward of steps of ``forest``, and its gradient by the weights of the policy."""
+    env = envs.make("forest", args.worlds, device=args.device)
+    key = jax.device_put(jax.random.key(0), env.sim.device)
+    state = jax.jit(env.reset)(key)
+    policy = make_policy(env, state)
+
+    def mean_reward(weights: Any) -> Any:
+        own_policy = policy.replace(layers=weights[0], body=weights[1])
+        act = lambda obs, memory, key: (own_policy(obs), memory, ())  # noqa: E731
+        return envs.rollout(env, state, act, key, n_steps, lambda x: x.reward.mean())[2].mean()
+
+    weights = policy.layers, policy.body
+    functions = {"forward": jax.jit(mean_reward), "gradient": jax.jit(jax.grad(mean_reward))}
+
+    def seconds(fn: Any) -> float:
+        start_time = time.perf_counter()
+        jax.block_until_ready(fn(weights))
+        return time.perf_counter() - start_time
+
+    first_s = {name: seconds(fn) for name, fn in functions.items()}
+    call_s = medians({name: partial(seconds, fn) for name, fn in functions.items()}, args.repeats)
+    slopes = [np.asarray(x) for x in jax.tree.leaves(functions["gradient"](weights))]
+    if not (all(np.isfinite(x).all() for x in slopes) and any(np.any(x) for x in slopes)):
+        raise SystemExit("the gradient is zero or not finite; no figure")
+    stats = getattr(env.sim.device, "memory_stats", lambda: None)() or {}
+    report(
+        args.device, benchmark="sight", case="gradient", engine=engine_name(env.sim), n_worlds=args.worlds,
+        n_steps=n_steps, image=[16, 12], forward_s=round_digits(call_s["forward"]),
+        gradient_s=round_digits(call_s["gradient"]),
+        steps_per_s=round_digits(args.worlds * n_steps / call_s["gradient"]),
+        forward_passes=round_digits(call_s["gradient"] / call_s["forward"]),
+        memory_gb=round(stats.get("peak_bytes_in_use", 0) / 1e9, 1), first_s=round(first_s["gradient"], 1),
+        crazysim=__version__,
     )  # fmt: skip
 
 

@@ -61,6 +61,7 @@ SCRIPTS = [
     ("vehicles.py --worlds 4 --cases path beside_drone --repeats 1", "steps_per_s",
      [{"case": "path", "alone": True}, {"case": "beside_drone", "alone": False}]),
     ("racing.py --small", "duration_s", [{"track": "split_s_shapes", "dt": 0.04}]),
+    ("sight.py --worlds 4 --cases gradient --small --repeats 1", "forward_passes", [{"case": "gradient"}]),
     ("gradient.py --worlds 4 --controls rotor_vel --steps 3 --repeats 1", "steps_per_s", [{"control": "rotor_vel"}]),
 ]  # fmt: skip
 """Scripts with small settings, a positive number that each line has, and parts of the lines."""

@@ -1,8 +1,12 @@
-"""Analytic policy gradients: the return of a short horizon is differentiated through the simulator."""
+"""Analytic policy gradients: the return of a short horizon is differentiated through the simulator.
+
+With ``critic_epochs`` a value function estimates the return after the horizon, as in SHAC (Xu et al. 2022, "Accelerated
+policy learning with parallel differentiable simulation").
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -21,9 +25,26 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.errors import require
 from crazysim.plugins.sensors.image_sensor import OUTPUTS
 from crazysim.train.convolution import images_of
+from crazysim.train.critic import (
+    check_factors,
+    critic_input,
+    critic_obs,
+    estimate_advantages,
+    policy_obs,
+    rescale_value,
+    return_std,
+)
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import Network, Policy, Weights, choose_network, init_weights
-from crazysim.train.optimizer import all_finite, build_optimizer
+from crazysim.train.networks import (
+    MEMORYLESS_NETWORK,
+    Network,
+    Policy,
+    Weights,
+    choose_network,
+    forward,
+    init_weights,
+)
+from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
 from crazysim.train.seeds import (
     Step,
     are_seeds_divided,
@@ -36,7 +57,7 @@ from crazysim.train.seeds import (
 
 T = TypeVar("T")
 STATS_ITERATIONS = 20
-"""Number of iterations at the start during which the observation statistics are updated."""
+"""Number of iterations at the start during which the observation statistics are updated, and values do not count."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +76,35 @@ class Config:
     """Shape of the policy, as in PPO."""
     convolution: tuple[int, ...] = ()
     """Channels of the layers of a convolution over each image, as in PPO. The gradient passes through the image."""
+    critic_epochs: int = 0
+    """Passes over the samples of a rollout by which a value function learns the return after the horizon; 0 for none.
+    The policy then also learns from ends of episodes, which have no gradient themselves."""
+    minibatches: int = 4
+    """Minibatches of worlds, and hence updates of the value function, in each of these passes."""
+    critic: str = "observations"
+    """Inputs of the value function, as in PPO."""
     learning_rate: float = 3e-3
     """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.99
     """Discount factor per environment step."""
+    gae_lambda: float = 0.95
+    """Lambda of the returns that the value function learns."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
+    rewards: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
+    """Factors of terms of the reward in training, as in PPO."""
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
+
+    @property
+    def epochs(self) -> int:
+        return self.critic_epochs
+
+    @property
+    def n_updates(self) -> int:
+        """Updates of the value function."""
+        return self.iterations * self.critic_epochs * self.minibatches
 
 
 class Agent(PyTree):
@@ -74,11 +115,31 @@ class Agent(PyTree):
     optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
-    """Mean and variance with which observations are normalised."""
+    """Mean and variance with which observations are normalised; the policy's observations come first."""
+    returns: RunningStats
+    """Mean and variance of returns, to scale the outputs of the value network. (1,) each"""
     key: Array
     """Random key. ()"""
-    network: Network = static()
+    value: Any = ()
+    """``Weights`` from the normalised inputs of the critic to the normalised expected return; ``()`` without one."""
+    value_optimizer: Any = ()
+    """State of its optimiser."""
+    n_obs: int = static(default=0)
+    """Number of observations of the policy."""
+    network: Network = static(default=MEMORYLESS_NETWORK)
     """Network of the policy."""
+    critic_network: Network = static(default=MEMORYLESS_NETWORK)
+    """Network of the value function."""
+
+    def estimate_value(self, raw_obs: Array, config: Config) -> Array:
+        """Estimate the returns after observations. (...)"""
+        x = critic_input(self.stats.normalize(raw_obs), config.critic)
+        output, _ = forward(self.critic_network, self.value, x, ())
+        return output[..., 0] * return_std(self.returns) + self.returns.mean
+
+    def as_policy(self, weights: Weights) -> Policy:
+        stats = self.stats.replace(mean=self.stats.mean[..., : self.n_obs], var=self.stats.var[..., : self.n_obs])
+        return Policy(stats, weights.layers, weights.body, self.network)
 
 
 class Learner(PyTree):
@@ -95,7 +156,7 @@ class Learner(PyTree):
 
     def as_policy(self) -> Policy:
         """Return the policies of all seeds. (n_seeds, ...) each"""
-        return Policy(self.agents.stats, self.agents.policy.layers, self.agents.policy.body, self.agents.network)
+        return self.agents.as_policy(self.agents.policy)
 
 
 def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
@@ -113,19 +174,33 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         f"camera, or algorithm='ppo'.",
     )
     config = configs[0]
+    if config.critic_epochs:
+        check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
     k_policy, k_env, k_agent = split_keys(keys, 3)
     state = env.reset(k_env)
-    images = images_of(env, state.obs) if config.convolution else ()
+    check_factors(config, state)
+    obs = policy_obs(state.obs, config.critic)
+    images = images_of(env, obs) if config.convolution else ()
     network = choose_network(config.memory, None, config.convolution, images, config.shape)
+    critic_network = choose_network(0, None, config.convolution, images)
     hidden = config.hidden if network.is_built_in else ()
+    n_obs = flatten(obs).shape[-1]
 
-    def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
-        policy: Any = init_weights(network, k_policy, obs.shape[-1], (*hidden, env.actions.size), 0.01)
+    def init_agent(k_policy: Array, key: Array, raw_obs: Array) -> Agent:
+        policy: Any = init_weights(network, k_policy, n_obs, (*hidden, env.actions.size), 0.01)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations).init(policy)
-        return Agent(policy, optimizer, RunningStats.create(obs.shape[-1], network.pixels).update(obs), key, network)
+        value, value_optimizer = (), ()
+        if config.critic_epochs:
+            n_inputs = critic_input(raw_obs, config.critic).shape[-1]
+            sizes = (*config.hidden, 1)
+            value: Any = init_weights(critic_network, jax.random.fold_in(k_policy, 2), n_inputs, sizes, 1.0)
+            value_optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(value)
+        stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
+        networks = network, critic_network
+        return Agent(policy, optimizer, stats, returns, key, value, value_optimizer, n_obs, *networks)
 
-    obs = split_blocks(flatten(state.obs), len(configs))
-    agents = for_each_seed(init_agent, k_policy, k_agent, obs)
+    raw_obs = split_blocks(critic_obs(state.obs, config.critic), len(configs))
+    agents = for_each_seed(init_agent, k_policy, k_agent, raw_obs)
     return Learner(agents, state, network.make_memory(*state.reward.shape), jnp.int32(0))
 
 
@@ -140,6 +215,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     """
     initial_state = env.restart(learner.env, learner.env.done)
     agents, config, n_seeds, mesh = learner.agents, stack_configs(configs), len(configs), env.sim.mesh
+    iterations = jnp.broadcast_to(learner.iteration, n_seeds)
     initial_memory = agents.network.make_memory(*learner.env.reward.shape)
     restart = partial(select_worlds, learner.env.done)
     initial_memory = jax.tree.map(restart, initial_memory, learner.memory)
@@ -154,47 +230,54 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
         return jax.lax.with_sharding_constraint(copies, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))
 
     def loss(weights: Weights) -> tuple[Array, Any]:
-        copies = Policy(copy(agents.stats), weights.layers, weights.body, agents.network)
+        seeds = agents.replace(stats=copy(agents.stats)).as_policy(weights), copy(config)
         state, memory, records = rollout_seeds(
-            env, initial_state, act, record, (copies,), copy(agents.key), configs[0].n_steps, initial_memory
+            env, initial_state, act, record, seeds, copy(agents.key), configs[0].n_steps, initial_memory
         )
         records = jax.tree.map(lambda x: x.reshape(x.shape[0], n_seeds, -1, *x.shape[3:]), records)
-        errors = split_blocks(state.info["error"], n_seeds)
-        losses, metrics = for_each_seed(compute_loss, config, records, errors, axes=(0, 1, 0))
-        return losses.sum(), (losses, metrics, state, memory, records[0])
+        errors, last_obs = split_blocks((state.info["error"], critic_obs(state.obs, configs[0].critic)), n_seeds)
+        args = agents, config, records, errors, last_obs, iterations
+        losses, metrics = for_each_seed(compute_loss, *args, axes=(0, 0, 1, 0, 0, 0))
+        return losses.sum(), (losses, metrics, state, memory, records, last_obs)
 
-    (_, (losses, metrics, state, memory, raw_obs)), grads = jax.value_and_grad(loss, has_aux=True)(copy(agents.policy))
+    (_, (losses, metrics, state, memory, *samples)), grads = jax.value_and_grad(loss, has_aux=True)(copy(agents.policy))
     grads = jax.tree.map(lambda x: x.reshape(n_seeds, n_copies, *x.shape[1:]).sum(axis=1), grads)
-    is_early = jnp.broadcast_to(learner.iteration < STATS_ITERATIONS, n_seeds)
     agents, update_metrics = for_each_seed(
-        learn, agents, config, losses, grads, raw_obs, is_early, axes=(0, 0, 0, 0, 1, 0)
+        learn, agents, config, losses, grads, *samples, iterations, axes=(0, 0, 0, 0, 1, 0, 0)
     )
     return Learner(agents, state, memory, learner.iteration + 1), metrics | update_metrics
 
 
-def act(policy: Policy, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Array]:
-    """Return the action of the policy; the observations are kept for the statistics."""
+def act(policy: Policy, config: Config, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Array]:
+    """Return the action of the policy; the observations are kept for the statistics and the value function."""
     del key
-    return *policy.act(obs, memory), flatten(obs)
+    return *policy.act(policy_obs(obs, config.critic), memory), critic_obs(obs, config.critic)
 
 
-def record(policy: Policy, step: Step, raw_obs: Array) -> tuple[Array, Array, Array]:
-    """Return what loss, statistics and metrics need of a step."""
+def record(policy: Policy, config: Config, step: Step, raw_obs: Array) -> tuple[Array, Array, Array]:
+    """Return what loss, statistics, value function and metrics need of a step."""
     del policy
-    return raw_obs, step.reward, step.terminated
+    return raw_obs, step.scaled_reward(config.rewards), step.terminated
 
 
-def compute_loss(config: Config, records: Any, error: Array) -> tuple[Array, dict[str, Array]]:
-    """Compute the negative mean of the discounted rewards of a rollout, and its metrics."""
+def compute_loss(
+    agent: Agent, config: Config, records: Any, error: Array, last_obs: Array, iteration: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Compute the negative mean of the discounted rewards of a rollout and of the value after it, and its metrics."""
     _, rewards, terminated = records
     rewards = rewards.mean(axis=(1, 2))
     discounts = config.discount ** jnp.arange(len(rewards), dtype=rewards.dtype)
     metrics = {"reward": rewards.mean(), "crashed": terminated.mean(axis=1).mean(), "error": jnp.nanmean(error)}
-    return -(discounts * rewards).mean(), metrics
+    loss = -(discounts * rewards).mean()
+    if config.critic_epochs:
+        value = jnp.where(terminated.any(axis=0)[:, None], 0.0, agent.estimate_value(last_obs, config)).mean()
+        value = jnp.where(iteration < STATS_ITERATIONS, 0.0, value)  # which has learnt nothing yet
+        loss = loss - config.discount ** len(rewards) * value / len(rewards)
+    return loss, metrics
 
 
 def learn(
-    agent: Agent, config: Config, loss: Array, grads: Any, raw_obs: Array, is_early: Array
+    agent: Agent, config: Config, loss: Array, grads: Any, records: Any, last_obs: Array, iteration: Array
 ) -> tuple[Agent, dict[str, Array]]:
     """Update the agent, or keep its weights and its optimiser state if the gradient is not finite."""
     grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
@@ -202,10 +285,39 @@ def learn(
     updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
     updated = optax.apply_updates(agent.policy, updates), optimizer
     policy, optimizer = _where(jnp.isfinite(grad_norm), updated, (agent.policy, agent.optimizer))
+    metrics = {"gradient": grad_norm}
+    if config.critic_epochs:
+        agent, value_metrics = learn_value(agent, config, records, last_obs, iteration)
+        metrics |= value_metrics
     # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
-    stats = _where(is_early, agent.stats.update(raw_obs), agent.stats)
-    finite = all_finite((policy, optimizer, stats, loss))
-    return agent.replace(policy=policy, optimizer=optimizer, stats=stats), {"gradient": grad_norm, "finite": finite}
+    stats = _where(iteration < STATS_ITERATIONS, agent.stats.update(records[0]), agent.stats)
+    finite = all_finite((policy, optimizer, stats, loss, agent.value))
+    return agent.replace(policy=policy, optimizer=optimizer, stats=stats), metrics | {"finite": finite}
+
+
+def learn_value(
+    agent: Agent, config: Config, records: Any, last_obs: Array, iteration: Array
+) -> tuple[Agent, dict[str, Array]]:
+    """Update the value function by the returns of a rollout until its episodes end; the environment goes on."""
+    raw_obs, rewards, terminated = records
+    done = jnp.broadcast_to(terminated[..., None], rewards.shape)
+    is_flying = jnp.cumsum(done, axis=0) - done == 0
+    values, last_value = (agent.estimate_value(x, config) for x in (raw_obs, last_obs))
+    _, targets = estimate_advantages((rewards, values, done), last_value, config)
+    returns = agent.returns.update(targets[..., None])
+    targets = (targets - returns.mean) / return_std(returns)
+    value = rescale_value(agent.value, agent.returns, returns)
+    inputs = critic_input(agent.stats.normalize(raw_obs), config.critic)
+
+    def value_loss(value: Weights, minibatch: Any) -> tuple[Array, dict[str, Array]]:
+        inputs, targets, is_flying = minibatch
+        output, _ = forward(agent.critic_network, value, inputs, ())
+        loss = 0.5 * (is_flying * jnp.square(output[..., 0] - targets)).mean()
+        return loss, {"value_error": loss}
+
+    key, samples = jax.random.fold_in(agent.key, iteration), (inputs, targets, is_flying)
+    value, optimizer, metrics = run_epochs(value_loss, value, agent.value_optimizer, samples, config, key)
+    return agent.replace(value=value, value_optimizer=optimizer, returns=returns), metrics
 
 
 def _where(condition: Array, new: Any, old: Any) -> Any:

@@ -1,13 +1,16 @@
-"""Value functions: their inputs, which may be more than the policy observes, and the scale of their outputs."""
+"""Value functions: their inputs, which may be more than the policy observes, their targets, and their scale."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.envs.state import PRIVILEGED, Obs, flatten
+from crazysim.envs.state import PRIVILEGED, EnvState, Obs, flatten, terms_of
 from crazysim.envs.statistics import EPSILON, RunningStats
-from crazysim.errors import require
+from crazysim.errors import expect, require
 from crazysim.train.networks import Weights
 
 PRIVILEGED_CRITICS = ("privileged", "all_drones_privileged")
@@ -41,6 +44,32 @@ def critic_input(obs: Array, critic: str) -> Array:
     if not critic.startswith("all_drones"):
         return obs
     return jnp.concatenate([jnp.roll(obs, -i, axis=-2) for i in range(obs.shape[-2])], axis=-1)
+
+
+def check_factors(config: Any, state: EnvState) -> None:
+    """Check that the reward of an environment has the terms of which ``rewards`` of a ``Config`` has factors."""
+    terms, names = terms_of(state.info), dict(config.rewards)
+    expect(names.keys() <= terms.keys(), f"rewards of terms among {', '.join(terms)}", list(names))
+
+
+def estimate_advantages(sequence: tuple[Array, Array, Array], last_value: Array, config: Any) -> tuple[Array, Array]:
+    """Estimate advantages and value targets, backwards in time. (n_steps, n_worlds, n_drones)
+
+    Args:
+        sequence: Rewards, estimates of the values before the steps, and whether episodes end with the steps.
+        last_value: Estimate of the value after the last step.
+        config: ``Config`` with discount and ``gae_lambda``.
+    """
+
+    def accumulate(carry: tuple[Array, Array], sample: tuple[Array, Array, Array]) -> tuple[Any, Array]:
+        advantage, next_value = carry
+        reward, value, done = sample
+        discount = config.discount * ~done
+        advantage = reward + discount * next_value - value + discount * config.gae_lambda * advantage
+        return (advantage, value), advantage
+
+    _, advantages = jax.lax.scan(accumulate, (jnp.zeros_like(last_value), last_value), sequence, reverse=True)
+    return advantages, advantages + sequence[1]
 
 
 def return_std(returns: RunningStats) -> Array:

@@ -18,12 +18,20 @@ from jax import Array
 
 from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, Obs, flatten, terms_of
+from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
-from crazysim.envs.task import sum_terms
 from crazysim.errors import ConfigError, expect, require
 from crazysim.train.convolution import images_of
-from crazysim.train.critic import PRIVILEGED_CRITICS, critic_input, critic_obs, policy_obs, rescale_value, return_std
+from crazysim.train.critic import (
+    PRIVILEGED_CRITICS,
+    check_factors,
+    critic_input,
+    critic_obs,
+    estimate_advantages,
+    policy_obs,
+    rescale_value,
+    return_std,
+)
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.interface import check_policy
 from crazysim.train.mlp_kernel import choose_mlp
@@ -218,8 +226,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     rivals = load_opponents(env, config, env.sim.n_worlds // len(configs)) if config.opponents else ()
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
     state, hidden = env.reset(k_env), config.hidden if network is None else ()
-    terms, names = terms_of(state.info), dict(config.rewards)
-    expect(names.keys() <= terms.keys(), f"rewards of terms among {', '.join(terms)}", list(names))
+    check_factors(config, state)
     obs = policy_obs(state.obs, config.critic)
     images = images_of(env, obs) if config.convolution else ()
     is_privileged = config.critic in PRIVILEGED_CRITICS and network is None
@@ -331,9 +338,7 @@ def record(agent: Agent, config: Config, step: Step, extras: Any) -> tuple[Sampl
     # An episode that was cut off would have gone on: the critic estimates what it would have got.
     final_value, _ = agent.estimate_value(agent.observe(step.final_obs, config)[1], memory, config)
     is_cut_off = (step.truncated & ~step.terminated)[:, None]
-    factors: Any = config.rewards
-    scaled = {name: x * factors[name] if name in factors else x for name, x in step.terms.items()}
-    reward = (sum_terms(scaled) if factors else step.reward)[..., : agent.n_learners]
+    reward = step.scaled_reward(config.rewards)[..., : agent.n_learners]
     reward = reward + config.discount * jnp.where(is_cut_off, final_value, 0.0)
     done = jnp.broadcast_to(step.done[:, None], reward.shape)
     # Means would make the devices communicate in each step.
@@ -359,7 +364,8 @@ def learn(
     samples, raw_obs, outcome = records
     # Advantages, and targets of the critic on the scale of the returns.
     last_value, _ = agent.estimate_value(agent.observe(last_obs, config)[1], last_memory, config)
-    advantages, targets = estimate_advantages(samples, last_value, config)
+    sequence = samples.reward, samples.value, samples.done
+    advantages, targets = estimate_advantages(sequence, last_value, config)
     returns = agent.returns.update(targets[..., None])
     targets = (targets - returns.mean) / return_std(returns)
     parameters = (agent.policy, agent.log_std, rescale_value(agent.value, agent.returns, returns))
@@ -382,21 +388,6 @@ def learn(
         policy=policy, log_std=log_std, value=value, optimizer=optimizer, stats=stats, returns=returns
     )
     return updated, metrics
-
-
-def estimate_advantages(samples: Sample, last_value: Array, config: Config) -> tuple[Array, Array]:
-    """Estimate advantages and value targets, backwards in time. (n_steps, n_worlds, n_drones)"""
-
-    def accumulate(carry: tuple[Array, Array], sample: tuple[Array, Array, Array]) -> tuple[Any, Array]:
-        advantage, next_value = carry
-        reward, value, done = sample
-        discount = config.discount * ~done
-        advantage = reward + discount * next_value - value + discount * config.gae_lambda * advantage
-        return (advantage, value), advantage
-
-    sequence = (samples.reward, samples.value, samples.done)
-    _, advantages = jax.lax.scan(accumulate, (jnp.zeros_like(last_value), last_value), sequence, reverse=True)
-    return advantages, advantages + samples.value
 
 
 def compute_loss(

@@ -17,6 +17,7 @@ from crazysim.engine.sharding import WORLD_AXIS
 from crazysim.envs.env import Env
 from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import EnvState, Obs, terms_of
+from crazysim.envs.task import sum_terms
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
@@ -123,6 +124,11 @@ class Step(PyTree):
     def done(self) -> Array:
         """Whether the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
+
+    def scaled_reward(self, factors: Any) -> Array:
+        """Sum the terms of the reward, multiplied by the factors that some have. (n_worlds, n_drones)"""
+        scaled = {name: x * factors[name] if name in factors else x for name, x in self.terms.items()}
+        return sum_terms(scaled) if factors else self.reward
 
 
 def rollout_seeds(

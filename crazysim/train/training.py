@@ -392,13 +392,12 @@ class _Run:
 
 def wrap_env(env: Env, config: Any) -> Env:
     """Return the training environment of an algorithm with the wrappers that its ``Config`` needs."""
-    if isinstance(config, apg.Config):
-        return env
     if isinstance(config, dagger.Config):
         return AutoReset(dagger.wrap_with_teacher(env, config))
     if config.critic in PRIVILEGED_CRITICS:
         env = PrivilegedObservation(env)
-    return AutoReset(RewardTerms(env) if config.rewards else env)
+    env = RewardTerms(env) if config.rewards else env
+    return env if isinstance(config, apg.Config) else AutoReset(env)
 
 
 def require_no_run(folder: Path) -> None:

@@ -22,16 +22,18 @@ from crazysim.__main__ import main
 from crazysim.engine.pytree import PyTree
 from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.state import flatten
+from crazysim.envs.statistics import RunningStats
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import DamagedFileError, DivergedError
 from crazysim.storage import write_figure
-from crazysim.train import checkpoint, ppo
+from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
-from crazysim.train.critic import rescale_value, return_std
+from crazysim.train.critic import estimate_advantages, rescale_value, return_std
 from crazysim.train.evaluation import describe_outcome, evaluate
-from crazysim.train.networks import Policies
+from crazysim.train.networks import MEMORYLESS_NETWORK, Policies, init_weights
+from crazysim.train.optimizer import build_optimizer
 from crazysim.train.runs import run
 from crazysim.train.seeds import rollout_seeds, stack_configs, take_seed
 from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
@@ -502,6 +504,34 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     assert "of all worlds 100.0% became non-finite" in describe_outcome(lost, "m")
 
 
+def test_a_value_at_the_horizon_is_learnt_from_rewards_until_episodes_end(rng):
+    """Rewards of 1 are worth (1 - 0.9^4) / (1 - 0.9) after three of seven steps of an episode, and nothing at its end.
+
+    Observations are the number of steps until the end, or so many that there is none.
+    """
+    config = apg.Config(n_steps=8, critic_epochs=40, minibatches=1, iterations=400, learning_rate=0.01, discount=0.9)
+    steps = np.arange(8)[:, None, None]
+    left = np.concatenate([np.full((8, 16, 1), 50.0), np.broadcast_to(7.0 - steps, (8, 16, 1))], axis=1)
+    obs = jnp.asarray(left[..., None] / 10, jnp.float32)
+    terminated = jnp.asarray(left[..., 0] == 1.0)
+    rewards = jnp.where(left > 0, 1.0, jnp.asarray(rng.normal(0, 100, size=left.shape), jnp.float32))
+    records, last_obs = (obs, rewards, terminated), obs[-1]
+    value = init_weights(MEMORYLESS_NETWORK, jax.random.key(0), 1, (16, 1), 1.0)
+    optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(value)
+    stats, returns = RunningStats.create(1), RunningStats.create(1)
+    agent = apg.Agent((), (), stats, returns, jax.random.key(1), value, optimizer, 1)
+    learn = jax.jit(lambda agent, i: apg.learn_value(agent, config, records, last_obs, i)[0])
+    for i in range(60):
+        agent = learn(agent, i)
+    estimates = agent.estimate_value(jnp.array([[0.4], [5.0]]), config)
+    np.testing.assert_allclose(estimates, [(1 - 0.9**4) / 0.1, 10.0], rtol=0.1)
+    # The loss counts the value of the worlds that still fly.
+    loss, _ = apg.compute_loss(agent, config, records, jnp.zeros(1), last_obs, apg.STATS_ITERATIONS)
+    flying = agent.estimate_value(last_obs[:1], config).item() * 0.5
+    discounted = np.sum(0.9 ** np.arange(8) * np.asarray(rewards).mean(axis=(1, 2)))
+    assert float(loss) == pytest.approx(-(discounted + 0.9**8 * flying) / 8, rel=1e-5)
+
+
 def test_advantages_are_sums_of_discounted_errors(rng):
     """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
     config = ppo.Config(discount=0.9, gae_lambda=0.7)
@@ -509,8 +539,8 @@ def test_advantages_are_sums_of_discounted_errors(rng):
     last_value = rng.normal(size=(3, 1)).astype(np.float32)
     done = np.zeros((6, 3, 1), bool)
     done[2, 0], done[5, 1] = True, True
-    sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, done)
-    advantages, returns = jax.jit(ppo.estimate_advantages, static_argnums=2)(sample, last_value, config)
+    estimate = jax.jit(estimate_advantages, static_argnums=2)
+    advantages, returns = estimate((reward, value, done), last_value, config)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + 0.9 * next_value * ~done - value
     expected = np.zeros_like(delta)
