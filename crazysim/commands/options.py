@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,6 +107,19 @@ def require_screen(remedy: str) -> None:
     require(has_screen(), f"expected a screen for --window, got none. Use {remedy}.")
 
 
+def parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
+    """Return the values of ``NAME=VALUE`` by name, as JSON or, if they are none, as text."""
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        require(equals, f"expected NAME=VALUE, got {text!r}; write for example seconds=5", ValueError)
+        try:
+            pairs[name] = json.loads(value)
+        except ValueError:
+            pairs[name] = value
+    return pairs
+
+
 def load_policy_and_env(
     folder: Path,
     device: str | None,
@@ -113,6 +127,7 @@ def load_policy_and_env(
     task: str | None = None,
     drone: str | None = None,
     policies: Sequence[Path] = (),
+    settings: Mapping[str, Any] = {},
 ) -> tuple[Any, TrainConfig, Env]:
     """Return the policy of a run, its configuration, and an environment with the observations of the policy.
 
@@ -123,22 +138,24 @@ def load_policy_and_env(
         task: Reference of the task, if it has moved since training; None for the reference in the run.
         drone: Airframe that a policy for any flies; None for airframes that are drawn.
         policies: Folders of runs whose policies fly the drones of a world, in their order; empty for one policy.
+        settings: Options of ``crazysim.envs.make`` that differ from those of the training.
     """
     from crazysim.train.config import TrainConfig
     from crazysim.train.export import find_weights, raptor_policy
-    from crazysim.train.interface import check_policy
+    from crazysim.train.interface import at_any_rate, check_policy
     from crazysim.train.policies import MultiPolicy
     from crazysim.train.training import load_policy
 
     if policies:
-        config = TrainConfig.create(str(folder)).with_device(device)
+        config = TrainConfig.create(str(folder), options=dict(settings)).with_device(device)
         return MultiPolicy.of([load_policy(x)[0] for x in policies]), config, config.make_env(n_worlds)
     if (weights := find_weights(folder)) is not None:
         config = TrainConfig.create("any", options={} if drone is None else {"drone": drone, "drawn": False})
-        env = config.with_device(device).make_env(n_worlds)
+        env = config.with_options(**settings).with_device(device).make_env(n_worlds)
         return raptor_policy(weights, env.sim.airframes[0]), config, env
     require(drone is None, f"expected any, or a checkpoint (.tar), for --drone, got {str(folder)!r}", ValueError)
     policy, config, _ = load_policy(folder, task)
-    env = config.with_device(device).make_env(n_worlds)
+    policy = at_any_rate(policy) if "freq" in settings else policy
+    env = config.with_options(**settings).with_device(device).make_env(n_worlds)
     check_policy(policy, env)
     return policy, config, env

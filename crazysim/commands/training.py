@@ -6,7 +6,6 @@ A recipe is the settings that are known to solve a task (``crazysim.train.config
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 from collections.abc import Sequence
 from functools import partial
@@ -14,7 +13,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands import hosts
-from crazysim.commands.options import DefaultsFormatter, load_policy_and_env, number, seed, size, specified_options
+from crazysim.commands.options import (
+    DefaultsFormatter,
+    load_policy_and_env,
+    number,
+    parse_pairs,
+    seed,
+    size,
+    specified_options,
+)
 from crazysim.errors import ConfigError, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
@@ -55,9 +62,16 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     devices_help = "devices to distribute the worlds over: all, their number, or their indices such as 0,2,3"
     add("--devices", metavar="all|N|I,J", help=devices_help)
     hosts.add_options(add)
-    add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
+    add(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="options of the task and the simulation",
+    )
     config_help = "hyperparameters of the algorithm, but not of a recipe's teacher"
-    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help=config_help)
+    add("--config", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=config_help)
     add("--no-film", action="store_true", help="write no film")
     check_help = "fly the task without training and for ten iterations, say what is wrong with it, and write nothing"
     add("--check", action="store_true", help=check_help)
@@ -116,6 +130,8 @@ def _add_task_and_device(add: Any) -> None:
     drone_help = "airframe that a policy for any flies; by default another one in every world"
     add("--drone", "--airframe", metavar="NAME|FILE", help=drone_help)
     add("--device", help="device: cpu, gpu; by default the training's")
+    set_help = "options of the task and the simulation that differ from the training's"
+    add("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=set_help)
     policies_help = "folders of runs whose policies fly the drones of a world together; the last one flies the rest"
     add("--policies", nargs="+", type=Path, default=[], metavar="FOLDER", help=policies_help)
 
@@ -151,18 +167,6 @@ def _parse_sweep(texts: Sequence[str]) -> dict[str, list[float]]:
     return sweep
 
 
-def _parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
-    pairs = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        require(equals, f"expected NAME=VALUE, got {text!r}; write for example seconds=5", ValueError)
-        try:
-            pairs[name] = json.loads(value)
-        except ValueError:
-            pairs[name] = value
-    return pairs
-
-
 def train(options: argparse.Namespace) -> int | None:
     """Train a policy, on this host or on several, or print the names of all tasks."""
     from crazysim.envs.registry import TASKS
@@ -191,8 +195,8 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
         "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
         "devices": options.devices or devices,
-        "options": _parse_pairs(options.set) | specified_options(options, "device"),
-        "config": _parse_pairs(options.config) | specified_options(options, "iterations", "teacher"),
+        "options": parse_pairs(options.set) | specified_options(options, "device"),
+        "config": parse_pairs(options.config) | specified_options(options, "iterations", "teacher"),
     }
     if options.check:
         from crazysim.train.check import check_task
@@ -245,7 +249,7 @@ def _exit(*_: object) -> NoReturn:
 
 def _load(options: argparse.Namespace) -> tuple[Any, ...]:
     names = ("folder", "device", "worlds", "task", "drone", "policies")
-    return load_policy_and_env(*[getattr(options, name) for name in names])
+    return load_policy_and_env(*[getattr(options, name) for name in names], settings=parse_pairs(options.set))
 
 
 def evaluate(options: argparse.Namespace) -> None:

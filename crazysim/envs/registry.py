@@ -101,7 +101,7 @@ def make(
     actions: Actions | None = None,
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
-    randomize: str | None = None,
+    randomize: str | float | None = None,
     camera: ImageSensor | Sequence[ImageSensor] | None = None,
     depth_image: Sequence[int] | None = None,
     sim_freq: int = 500,
@@ -117,8 +117,9 @@ def make(
             it observes the true states, or the estimated states with the setting ``estimator`` of ``Sim``.
         effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. If plugins are added later
             by ``env.sim.add``, ``reset`` raises an error.
-        randomize: Name of ready-made ranges of ``Randomize`` from which the parameters of the drones are drawn in every
-            episode: ``"crazyflie"`` or ``"generic"``. None for the parameters of the airframe.
+        randomize: Ranges of ``Randomize`` from which the parameters of the drones are drawn in every episode:
+            ``"crazyflie"``, ``"generic"``, or a fraction for ``Randomize.within``. None for the parameters of the
+            airframe.
         camera: One or several cameras or lidars; their images are additional observations, see ``CameraImages``. None
             for the camera of the task if it has one, with images named by their output, such as ``"depth"``; ``()`` for
             no images.
@@ -145,14 +146,16 @@ def make(
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     # Plugins, with ready-made ranges if they are requested.
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
-    if randomize is not None:
+    if isinstance(randomize, float) and 0 < randomize < 1:
+        plugins.append(Randomize.within(randomize))
+    elif randomize is not None:
         expect(
             isinstance(randomize, str) and randomize in RANDOMIZATIONS,
-            f"randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}",
+            f"randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, or a fraction between 0 and 1",
             randomize,
             "Use effects=[Randomize(...)] for other ranges.",
         )
-        plugins.append(RANDOMIZATIONS[randomize]())
+        plugins.append(RANDOMIZATIONS[str(randomize)]())
     # Simulation, task, plugins, in this order.
     sim = Sim(n_worlds=n_worlds, freq=sim_freq, **settings)
     repeated_name = next((plugin.name for plugin in plugins if plugin.name in sim.plugins), None)

@@ -326,7 +326,11 @@ class TrainConfig:
 
     def with_device(self, device: str | None) -> TrainConfig:
         """Return the same configuration on another device, such as ``"cpu"``; None keeps the device."""
-        return self if device is None else dataclasses.replace(self, options=self.options | {"device": device})
+        return self if device is None else self.with_options(device=device)
+
+    def with_options(self, **options: Any) -> TrainConfig:
+        """Return the same configuration with other options of ``crazysim.envs.make``."""
+        return dataclasses.replace(self, options=self.options | options)
 
     def practice_options(self) -> dict[str, Any]:
         """Return the options of the training environment that the recipe of the task adds."""

@@ -149,6 +149,11 @@ def check_policy(policy: Any, env: Env) -> None:
         interface.require(other, "an environment")
 
 
+def at_any_rate(policy: Any) -> Any:
+    """Return a trained policy that may also act at another rate than in its training."""
+    return policy.replace(interface=dataclasses.replace(policy.interface, freq=None))
+
+
 def check_callable(policy: Any, env: Env) -> None:
     require_type(env, Env, "Use crazysim.envs.make('hover', n_worlds).")
     expect(

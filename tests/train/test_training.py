@@ -642,6 +642,8 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys, monkeyp
         r"hover, 8 starts \(error below .*\): success .*, mean return \S+ \(action_rate .*, proximity \d",
         capsys.readouterr().out,
     )
+    assert main(["evaluate", folder, "--worlds", "8", "--set", "hold=0.1", "--set", "tolerance=0.5", "freq=25"]) == 0
+    assert "8 starts (error below 0.5 m for the last 0.1 s)" in capsys.readouterr().out
     assert main(["evaluate", folder, "--worlds", "8", "--plot", str(tmp_path / "terms.png")]) == 0
     assert (tmp_path / "terms.png").stat().st_size > 5000
     capsys.readouterr()
@@ -654,6 +656,7 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys, monkeyp
         (["export", folder, "--c", "policy.txt"], "ends with .h, got 'policy.txt'"),
         (["export", folder, "--onnx", "policy.h"], "ends with .onnx, got 'policy.h'"),
         (["evaluate", f"{folder}/policy.npz"], f"got the file '{folder}/policy.npz'. Use '{folder}'."),
+        (["evaluate", folder, "--set", "secnds=1"], "did you mean seconds?"),
         (["evaluate", folder, "--task", str(task_file)], "no vel 3, height 1 in addition. Use"),
     ):
         assert main(arguments) == 2

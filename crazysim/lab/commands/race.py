@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crazysim.commands.options import DefaultsFormatter, number, size
+from crazysim.commands.options import DefaultsFormatter, number, parse_pairs, size
 from crazysim.errors import expect, require
 from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
 
@@ -41,11 +41,13 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
     add("--penalty", type=number(0.0, 1e3, 2.0, float), metavar="S", help=penalty_help)
     battery_help = "state of charge at the start, up to 1, of a battery that sags, for a policy; by default none"
     add("--battery", type=number(0.05, 1.0, 0.9, float), metavar="C", help=battery_help)
+    set_help = "options of the task and the simulation of a policy that differ from the training's"
+    add("--set", nargs="+", action="extend", metavar="NAME=VALUE", help=set_help)
     add("--drone", help="airframe of a plan: a name or the path of a TOML file; by default uzh_cpc")
     rates_help = "largest roll, pitch and yaw rate of a plan, rad/s; by default 15 15 3"
     add("--body-rate", type=size(15), nargs=3, metavar=("P", "Q", "R"), help=rates_help)
     add("--floor", type=number(-1e3, 1e3, 0.5, float), help="smallest height of a plan, m; by default none")
-    add("--dt", type=size(0.04), default=0.04, help="time between changes of the thrusts of a plan, s")
+    add("--dt", type=size(0.04), help="time between changes of the thrusts of a plan, s; by default 0.04")
     add("--rotor-lag", action="store_true", help="plan with the lag of the airframe's rotors")
     add("--plot", type=Path, metavar="FILE", help="plot to write, .png")
     add("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
@@ -96,7 +98,7 @@ def _rank(options: argparse.Namespace) -> tuple[RaceFlight | None, int]:
     from crazysim.lab.racing import ranking
     from crazysim.lab.racing.controllers import Run
 
-    settings = ("track", "policy", "penalty", "battery", "drone", "body_rate", "floor")
+    settings = ("track", "policy", "penalty", "battery", "drone", "body_rate", "floor", "dt", "set")
     given = [name for name in settings if getattr(options, name) is not None]
     require(
         not given, f"expected none of the settings of plans with --controller, got {', '.join(given)}. Leave it out."
@@ -120,7 +122,7 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
     from crazysim.lab.racing.flight import flight_of_plan
     from crazysim.lab.racing.time_optimal import fly_open_loop, plan_race
 
-    given = [f"--{name}" for name in ("penalty", "battery") if getattr(options, name) is not None]
+    given = [f"--{name}" for name in ("penalty", "battery", "set") if getattr(options, name) is not None]
     require(not given, f"expected {' and '.join(given)} with --policy, got a plan. Leave it out.")
     track = load_track(options.track)
     plan = plan_race(
@@ -129,7 +131,7 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
         laps=options.laps,
         body_rate=options.body_rate or (15.0, 15.0, 3.0),
         floor=options.floor,
-        dt=options.dt,
+        dt=options.dt or 0.04,
         rotor_lag=options.rotor_lag,
     )
     deviation = np.linalg.norm(fly_open_loop(plan)[:, :3] - plan.pos, axis=-1).max()
@@ -140,23 +142,25 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
 
 
 def _fly_policy(options: argparse.Namespace) -> RaceFlight:
-    import dataclasses
-
     from crazysim.envs.tasks.race import Race
     from crazysim.lab.racing.flight import flight_of_policy
     from crazysim.plugins.effects.battery import Battery
-    from crazysim.train.interface import check_policy
+    from crazysim.train.interface import at_any_rate, check_policy
     from crazysim.train.training import load_policy
 
     given = [
-        name for name in ("drone", "body_rate", "floor", "rotor_lag") if getattr(options, name) not in (None, False)
+        name
+        for name in ("drone", "body_rate", "floor", "dt", "rotor_lag")
+        if getattr(options, name) not in (None, False)
     ]
     require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
     policy, config, _ = load_policy(options.policy)
+    settings = parse_pairs(options.set or ())
+    policy = at_any_rate(policy) if "freq" in settings else policy
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
     course |= {} if options.penalty is None else {"penalty": options.penalty}
     effects = [] if options.battery is None else [Battery(charge=options.battery)]
-    env = dataclasses.replace(config, options=config.options | course).make_env(1, effects=effects)
+    env = config.with_options(**course | settings).make_env(1, effects=effects)
     expect(isinstance(env.task, Race), "a policy of the task race", config.task)
     check_policy(policy, env)
     return flight_of_policy(env, policy)

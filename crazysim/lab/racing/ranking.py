@@ -117,7 +117,7 @@ def rank(
 
 def _policy_times(folder: Path, level: int, n_runs: int, seed: int) -> list[float | None]:
     policy, config, _ = load_policy(folder)
-    env = dataclasses.replace(config, options=config.options | {"level": level, "device": "cpu"}).make_env(n_runs)
+    env = config.with_options(level=level, device="cpu").make_env(n_runs)
     expect(isinstance(env.task, Race), "a policy of the task race", config.task)
     check_policy(policy, env)
     flight = fly_episodes(env, policy, jax.random.key(seed))

@@ -61,7 +61,8 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
     is short for (1 - r, 1 + r). A number is drawn uniformly for every drone at every reset, or in the first step of a
     simulation that was not reset. Two equal numbers give a fixed number; None changes nothing. The number drawn for a
     path or a setting does not depend on the others.
-    ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges from the literature.
+    ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges from the literature; ``Randomize.within(0.05)``
+    changes everything by up to 5%.
     """
 
     paths: Mapping[str, ArrayLike] | None = None
@@ -143,6 +144,16 @@ class Randomize(MovingAir, Plugin, requires=_needs_rotors):
         """
         ranges: dict[str, Any] = dict.fromkeys((*FACTOR_SETTINGS, "thrust"), (0.7, 1.3))
         return cls._preset(ranges | {"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)}, changes)
+
+    @classmethod
+    def within(cls, fraction: float, **changes: ArrayLike | None) -> Randomize:
+        """Return a plugin with factors of mass, inertia, thrust, torque, lag and drag that differ from 1 by a fraction.
+
+        Args:
+            fraction: Largest relative difference, such as 0.05 for 5%.
+            changes: Other settings, by name.
+        """
+        return cls._preset(dict.fromkeys((*FACTOR_SETTINGS, "thrust"), fraction), changes)
 
     @classmethod
     def _preset(cls, ranges: dict[str, Any], changes: dict[str, Any]) -> Randomize:

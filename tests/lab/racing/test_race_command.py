@@ -95,6 +95,14 @@ def test_law_09_options_of_policies_are_refused_for_plans(path, capsys):
     assert "expected --penalty and --battery with --policy" in capsys.readouterr().err
 
 
+def test_a_policy_flies_with_other_settings_than_in_its_training(hovering, capsys):
+    arguments = ["race", "split_s_gates", "--policy", str(hovering), "--set", "seconds=0.2", "--set", "freq=100"]
+    assert main(arguments) == 1
+    assert "after 0.200 s" in capsys.readouterr().out
+    assert main([*arguments, "--dt", "0.02"]) == 2
+    assert "got dt. Leave them out." in capsys.readouterr().err
+
+
 def test_the_tracks_are_listed(capsys):
     assert main(["race", "list"]) == 0
     assert "split_s_gates" in capsys.readouterr().out

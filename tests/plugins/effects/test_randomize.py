@@ -10,6 +10,7 @@ from sweep import RANGES
 from crazysim import IMU, Battery, ConfigError, Latency, Randomize, Sim, Wind
 from crazysim.core.pipeline import append_fn
 from crazysim.engine.stage import stage
+from crazysim.envs import make
 from crazysim.plugins.effects.battery import open_circuit_voltage
 from crazysim.plugins.effects.moving_air import drag_factor
 from crazysim.plugins.estimators import ESKF
@@ -112,6 +113,14 @@ def test_presets_fly_and_accept_changes():
         assert np.ptp(plugin.read(sim.data).factors[..., 0]) > 0.05
         assert set(sim.plugins.observations(sim.data)) >= {"randomize.factors", "randomize.thrust_factors"}
     assert Randomize.crazyflie(mass=(1.0, 1.1)).mass == (1.0, 1.1)
+
+
+def test_a_fraction_draws_every_number_of_a_task_within_it():
+    env = make("hover", 200, randomize=0.05, engine="interpret")
+    drawn = env.reset(jax.random.key(0)).data.plugins["randomize"]
+    factors = np.concatenate([np.asarray(drawn.factors)[:, 0], np.asarray(drawn.thrust_factors)[:, 0]], axis=-1)
+    assert np.all(np.abs(factors - 1) <= 0.05 + 1e-6)
+    assert np.all(np.ptp(factors, axis=0) > 0.09)
 
 
 def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
