@@ -61,6 +61,8 @@ class DroneCamera:
     """Roll, pitch and yaw of the frame of the camera in the body frame, rad. (3,)"""
     baseline: float = 0.0
     """Distance to the second imager of a stereo camera, on the right, m; 0 without one."""
+    row_times: np.ndarray | None = None
+    """Time at which each row is read, from the time of the image, s; None for all rows at once. (height,)"""
 
     @property
     def rot(self) -> np.ndarray:
@@ -187,6 +189,7 @@ def build_depth_fn(
     kernels: RayKernels,
     baseline: float = 0.0,
     appearance: Appearance | None = None,
+    row_times: np.ndarray | None = None,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None, before=None) -> Hits``; see ``Scene.depth_fn``.
 
@@ -202,6 +205,7 @@ def build_depth_fn(
         kernels: Kernels that cast the rays if possible.
         baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
         appearance: The scene's materials and lights, for ``Hits.color``; None for no colours.
+        row_times: As in ``DroneCamera``.
     """
     require(
         isinstance(along, str) and along in ("axis", "ray"),
@@ -210,7 +214,7 @@ def build_depth_fn(
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     # Pixels in square tiles: neighbouring rays meet the same geoms.
     height, width = rays[0].shape[:2]
-    tile_height, tile_width = (math.gcd(n, TILE_SIDE) for n in (height, width))
+    tile_height, tile_width = (math.gcd(n, TILE_SIDE if row_times is None else 1) for n in (height, width))
     tile_shape = height // tile_height, tile_height, width // tile_width, tile_width
     tile_order = np.arange(height * width).reshape(tile_shape).swapaxes(1, 2).reshape(-1)
     # Unit direction of each pixel, tile by tile, and index of the drone that its ray passes through.
@@ -222,9 +226,19 @@ def build_depth_fn(
     pixel_angle = _pixel_angle(rays[0])
 
     ignored_drones = directions[..., 3].reshape(-1).astype(int)
+    # Rows that are read one after the other are views of their own.
+    n_rows = 1 if row_times is None else height
+    n_pixels = height * width // n_rows
+    directions = directions.reshape(-1, n_pixels, 4)
 
     def views(data: SimData) -> Array:
-        # Position and axes of each camera, as in ``Tables.camera_poses``. (..., n_cameras, 12)
+        # Position and axes of each view, as in ``Tables.camera_poses``. (..., n_views, 12)
+        if row_times is None:
+            return views_at_once(data)
+        poses = jax.vmap(lambda time: views_at_once(extrapolate(data, time)), out_axes=-2)(jnp.asarray(row_times))
+        return poses.reshape(*poses.shape[:-3], -1, 12)
+
+    def views_at_once(data: SimData) -> Array:
         poses = []
         for camera in cameras:
             pos, rot = camera_pose(camera, data)
@@ -236,7 +250,7 @@ def build_depth_fn(
         # Origins and directions, world frame, of views that are shifted to the right, m. (..., n_rays, 3) each
         right = poses[..., 3::3]
         origin = poses[..., :3] + shift * right if shift else poses[..., :3]
-        return jnp.repeat(origin, height * width, axis=-2), _rotate_directions(poses, directions)
+        return jnp.repeat(origin, n_pixels, axis=-2), _rotate_directions(poses, directions)
 
     def cast_in_worlds(data: SimData, kernels: RayKernels, before: SimData | None = None) -> Hits:
         poses = views(data)
@@ -252,7 +266,8 @@ def build_depth_fn(
             hits = hits.replace(is_hidden=is_hidden & jnp.isfinite(hits.distance))
         if before is not None:
             hits = trace_back(data, before, kernels, rays_of(poses)[1], hits)
-        return untile_results(hits)
+        axes = poses[..., 3:].reshape(*poses.shape[:-2], len(cameras), n_rows, 1, 3, 3)
+        return untile_results(hits).replace(camera_axes=axes)
 
     def find_hidden(data: SimData, kernels: RayKernels, origin: Array, point: Array) -> Array:
         origin, point = jax.lax.stop_gradient((origin, point))
@@ -271,7 +286,7 @@ def build_depth_fn(
         earlier_views = views(before)
         origin = rays_of(earlier_views)[0]
         point = jnp.where(jnp.isfinite(hits.distance)[..., None], point, origin + FAR_AWAY * direction)
-        axes = jnp.repeat(earlier_views[..., 3:], height * width, axis=-2)
+        axes = jnp.repeat(earlier_views[..., 3:], n_pixels, axis=-2)
         return hits.replace(
             earlier_point=jnp.concatenate([rotation.dot(axes[..., k::3], point - origin) for k in range(3)], axis=-1),
             was_hidden=find_hidden(before, kernels, origin, point),
@@ -298,6 +313,7 @@ def build_depth_fn(
             was_hidden=None if hits.was_hidden is None else untile(hits.was_hidden, 0),
         )
 
+    state_names = ("pos", "quat") if row_times is None else ("pos", "quat", "vel", "ang_vel")
     # Poses of mocap bodies become part of the data before the rays are cast.
     model_without_mocap = model.without_mocap_bodies()
 
@@ -305,7 +321,7 @@ def build_depth_fn(
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
 
         def with_all_poses(data: SimData) -> SimData:
-            require_states(data, ("pos", "quat"), batched=False)
+            require_states(data, state_names, batched=False)
             require(
                 data.states.pos.ndim != 1,
                 "expected data of all worlds or of one world for images, got data of one drone",
@@ -334,13 +350,13 @@ def build_depth_fn(
 
         def poses_of(data: SimData) -> tuple[Any, ...]:
             objects = None if data.objects is None else data.objects.replace(mocap_ids=None, map_ids=None)
-            return data.states.pos, data.states.quat, objects
+            return {name: getattr(data.states, name) for name in state_names}, objects
 
         def cast_in_world(parts: Any) -> Hits:
             keys, *poses = jax.tree.map(lambda x: x[None], parts)
             world_data = [
-                data.replace(states=data.states.replace(pos=pos, quat=quat), objects=objects, core=core.replace(**keys))
-                for pos, quat, objects in poses
+                data.replace(states=data.states.replace(**states), objects=objects, core=core.replace(**keys))
+                for states, objects in poses
             ]
             return jax.tree.map(lambda x: x[0], cast_in_worlds(world_data[0], kernels, *world_data[1:]))
 
@@ -365,6 +381,20 @@ def _rotate_directions(poses: Array, rays: np.ndarray) -> Array:
     # By components: a GPU may round matrix products to 10 bits.
     x, y, z = (poses[..., None, 3 + k :: 3] * jnp.asarray(rays[..., k, None], poses.dtype) for k in range(3))
     return (x + y + z).reshape(*poses.shape[:-2], -1, 3)
+
+
+def extrapolate(data: SimData, time: Array | float) -> SimData:
+    """Return the data with poses at another time, by constant velocities of drones and objects.
+
+    Args:
+        time: Time from now, s; drones turn by at most half a turn in it. ()
+    """
+    states, objects = data.states, data.objects
+    quat = rotation.integrate_attitude(states.quat, time * states.ang_vel, 1.0)
+    states = states.replace(pos=states.pos + time * states.vel, quat=quat)
+    if objects is not None and objects.vel is not None:
+        objects = objects.replace(pos=objects.pos + time * objects.vel)
+    return data.replace(states=states, objects=objects)
 
 
 def body_poses(model: CollisionModel, data: SimData) -> tuple[Array, Array]:

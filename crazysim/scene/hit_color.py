@@ -188,7 +188,9 @@ def color_at_hit(
                 du, dv = _dot(u_rates, step) * u_scale * width, _dot(v_rates, step) * v_scale * height
                 squared_rate = jnp.maximum(squared_rate, du * du + dv * dv)
             level = sum(jnp.where(squared_rate > 2 ** (2 * k + 1), jnp.int32(1), 0) for k in range(MAX_LEVELS - 1))
-            level = first_level + jnp.minimum(level, n_levels - 1)
+            level = first_level + jnp.maximum(
+                jnp.minimum(level, n_levels - 1), 0
+            )  # a row, in lanes without texture, too
             texel = _interpolate(paint, level, u * u_scale - shift, v * v_scale - shift)
             return tuple(c * k for c, k in zip(color, texel, strict=True))  # type: ignore[return-value]
 

@@ -86,6 +86,9 @@ class Hits(PyTree):
     nothing, its direction in this frame. None without an earlier time. (..., 3)"""
     was_hidden: Array | None = None
     """Whether a nearer surface hid the point from the camera at the earlier time; None without one. (...)"""
+    camera_axes: Array | None = None
+    """Axes of the camera in images as columns, right, up and back, world frame; one for each row with a rolling
+    shutter. (..., n_cameras, height or 1, 1, 3, 3)"""
 
 
 def raise_to_floor(model: CollisionModel, pos: Array) -> Array:

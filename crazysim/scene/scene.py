@@ -393,6 +393,7 @@ class Scene:
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
             camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
             Appearance(self.mj_model, shadows, random_colors) if color else None,
+            camera.row_times if isinstance(camera, depth.DroneCamera) else None,
         )  # fmt: skip
 
     def splat_fn(

@@ -3,8 +3,8 @@
 The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           noise=None, distortion=None, shadows=True, random_colors=None, drones=True, freq=None, latency=0.0,
-           name="camera")
+           noise=None, distortion=None, shadows=True, random_colors=None, exposure=0.0, blur_samples=8, readout=0.0,
+           drones=True, freq=None, latency=0.0, name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
@@ -27,6 +27,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.settings import setting
+from crazysim.errors import require
 from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
 from crazysim.plugins.sensors.image_sensor import ImageSensor
 from crazysim.scene.appearance import RandomColors
@@ -34,6 +35,8 @@ from crazysim.scene.depth import pixel_directions
 
 MIN_COSINE = 1e-3
 """Cosine of the largest angle to the axis under which a point has a place in the image."""
+MAX_EXPOSURE = 0.2
+"""Longest exposure and readout, s, within which a drone turns by less than half a turn."""
 FIELD_MARGIN = 1.1
 """Largest squared tangent of this angle with a distorting lens, divided by that of the corners of the image."""
 
@@ -61,7 +64,32 @@ class Camera(ImageSensor):
     """Whether lights cast shadows in colours, by a second ray of each pixel."""
     random_colors: RandomColors | None = None
     """Changes of colours and lights in every world and episode, such as ``RandomColors()``; None for none."""
+    exposure: float = setting(default=0.0, low=0.0, high=MAX_EXPOSURE)
+    """Time over which colours are averaged, s, which ends at the time of the image, or with a rolling shutter of the
+    row; 0 for sharp images. Meanwhile drones, with their cameras, move by their velocities, and objects by theirs
+    (``Handle.set_pose``). Colours have no gamma, so the mean is that of their values, as in MuJoCo's antialiasing."""
+    blur_samples: int = setting(default=8, low=1)
+    """Number of images that are averaged over the exposure."""
+    readout: float = setting(default=0.0, low=0.0, high=MAX_EXPOSURE)
+    """Time from the first row to the last one of a rolling shutter, s, which ends at the time of the image; 0 for a
+    global shutter. The camera moves by the drone's velocity meanwhile, and other things stay as they are then."""
     name: str = "camera"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            not (self.readout and self.compares_images),
+            f"expected flow from a global shutter, got readout={self.readout} of {self.name!r}. Use readout=0.",
+        )
+
+    @property
+    def exposure_times(self) -> np.ndarray:
+        n = self.blur_samples if self.exposure else 0
+        return -self.exposure * (np.arange(n, dtype=np.float32) + 0.5) / max(n, 1)
+
+    @property
+    def row_times(self) -> np.ndarray | None:
+        return np.linspace(-self.readout, 0, self.height, dtype=np.float32) if self.readout else None
 
     @property
     def rays(self) -> np.ndarray:
@@ -119,7 +147,8 @@ class Camera(ImageSensor):
     @property
     def optics(self) -> dict[str, Any]:
         distortion = {} if self.distortion is None else {"distortion": dataclasses.asdict(self.distortion)}
-        return {"fovy": float(self.fovy)} | distortion
+        times = {name: float(x) for name in ("exposure", "readout") if (x := getattr(self, name))}
+        return {"fovy": float(self.fovy)} | distortion | times
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -18,7 +18,6 @@ from jax import Array
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
-from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.random import drone_keys, episode_keys
@@ -28,7 +27,7 @@ from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, require, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
-from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory
+from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory, extrapolate
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import body_names
 
@@ -170,6 +169,16 @@ class ImageSensor(Plugin):
         return {}
 
     @property
+    def exposure_times(self) -> np.ndarray:
+        """Times from the time of the image at which colours are averaged, s; empty for none. (n,)"""
+        return np.zeros(0)
+
+    @property
+    def row_times(self) -> np.ndarray | None:
+        """Time at which each row is read, from the time of the image, s; None for all rows at once. (height,)"""
+        return None
+
+    @property
     def compares_images(self) -> bool:
         """Whether images need the poses of the image before."""
         return not {*FLOWS}.isdisjoint(self.outputs)
@@ -259,13 +268,25 @@ class ImageSensor(Plugin):
         self.check(sim)
         rays, far, camera = self.rays, self.far, self.drone_camera(sim)
         color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
-        cast_rays = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
-        rot, (height, width) = camera.rot, self.image_size
+        cast_rays: Any = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
+        height, width = self.image_size
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+
+        def mean_color(data: SimData, hits: Any) -> Array:
+            if not len(self.exposure_times):
+                return hits.color
+
+            def add_color(total: Array, time: Array) -> tuple[Array, None]:
+                return total + cast_rays(extrapolate(data, time)).color, None
+
+            total, _ = jax.lax.scan(
+                add_color, jnp.zeros(hits.color.shape, np.float32), jnp.asarray(self.exposure_times)
+            )
+            return jnp.round(total / len(self.exposure_times)).astype(np.uint8)
 
         def take_images(data: SimData, before: SimData | None = None) -> Images:
             before = before if self.compares_images else None
-            hits, quat = cast_rays(data, before=before), data.states.quat[..., None, None, :]
+            hits = cast_rays(data, before=before)
             cosine = jnp.asarray(rays[..., 0], hits.distance.dtype)
             distance = hits.distance
             if self.has_errors:
@@ -273,7 +294,8 @@ class ImageSensor(Plugin):
                 distance = jax.vmap(jax.vmap(self.measure))(
                     jnp.minimum(distance, far * self.far_ratio), hits.is_hidden, keys
                 )
-            images = {}
+            images: dict[str, Any] = {}
+            color: Any = mean_color(data, hits) if color_settings else None
             for name in self.outputs:
                 if name == "depth":
                     # Exactly ``far`` where nothing is nearer.
@@ -281,12 +303,12 @@ class ImageSensor(Plugin):
                 elif name == "distance":
                     images[name] = jnp.minimum(distance, far)
                 elif name == "normal":
-                    normal = rotation.rotate_inverse(quat, hits.normal)
-                    # By components: a GPU may round matrix products to 10 bits.
-                    parts = [sum(float(rot[i, k]) * normal[..., i] for i in range(3)) for k in range(3)]
-                    images[name] = jnp.stack(parts, axis=-1)  # type: ignore[arg-type]
+                    right, up, back = jnp.moveaxis(jnp.sum(hits.camera_axes * hits.normal[..., None], axis=-2), -1, 0)
+                    images[name] = jnp.stack([-back, -right, up], axis=-1)
+                elif name == "rgb":
+                    images[name] = color
                 elif name == "gray":
-                    parts = [weight * hits.color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
+                    parts = [weight * color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
                     images[name] = jnp.round(sum(parts)).astype(np.uint8)
                 elif name in FLOWS and before is None:
                     output = OUTPUTS[name]
@@ -295,7 +317,7 @@ class ImageSensor(Plugin):
                     place, is_in_view = self.project(hits.earlier_point)
                     images[name] = pixels - place if name == "flow" else is_in_view & ~hits.was_hidden
                 else:
-                    images[name] = hits.color if name == "rgb" else hits.body_index
+                    images[name] = hits.body_index
             return images
 
         return take_images
@@ -413,7 +435,7 @@ class ImageSensor(Plugin):
         """Return the camera for ``Scene.depth_fn``: directions of its rays, and its mounting on each drone."""
         fpv_pos = [body_shape(airframe)["fpv_camera"] for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
-        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline)
+        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline, self.row_times)
 
     def _latency_range(self, freq: int) -> tuple[int, int]:
         low, high = np.broadcast_to(np.asarray(self.latency, np.float64), 2).tolist()
