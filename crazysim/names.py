@@ -101,6 +101,7 @@ NAMES: dict[str, dict[str, str]] = {
         "crazysim.plugins.sensors.sensor": "Samples Sensor",
         "crazysim.plugins.sensors.triad": "Triad",
         "crazysim.scene.appearance": "RandomColors",
+        "crazysim.scene.depth": "RandomPose",
     },
     "crazysim.plugins.vehicles": {
         "crazysim.lab.vehicles.car_params": "CarParams",

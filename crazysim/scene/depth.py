@@ -16,6 +16,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.arguments import check_flag, require_memory
 from crazysim.core.data import SimData, require_states
+from crazysim.core.random import episode_keys, uniform
+from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.scene.appearance import Appearance
 from crazysim.scene.collision import CollisionModel, body_name
@@ -49,6 +51,31 @@ BYTES_PER_RAY = 16
 bytes each."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RandomPose:
+    """Mounting of a camera or lidar that differs on every drone, in every world and episode."""
+
+    pos: float = setting(default=0.005, low=0.0, high=1.0)
+    """Largest change of the position along each axis of the body frame, m."""
+    angle: float = setting(default=3.0, low=0.0, high=90.0)
+    """Largest change of roll, pitch and yaw of the sensor about the axes of the body frame, degrees."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+    def draw(self, data: SimData, name: str) -> tuple[Array, Array]:
+        """Return changes of positions, body frame, m (n_worlds, n_drones, 3), and turns, xyzw (n_worlds, n_drones, 4).
+
+        Args:
+            data: Data of all worlds, for their random keys.
+            name: Name of the sensor.
+        """
+        n_drones, dtype = data.states.pos.shape[1], data.states.pos.dtype
+        draw = jax.vmap(lambda key: 2 * uniform(key, (n_drones, 6), dtype) - 1)
+        numbers = draw(episode_keys(data, f"pose of {name}"))
+        return self.pos * numbers[..., :3], rotation.from_rpy(np.radians(self.angle) * numbers[..., 3:])
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class DroneCamera:
     """A camera that every drone carries: directions of its pixels, and mounting on each drone."""
@@ -63,6 +90,10 @@ class DroneCamera:
     """Distance to the second imager of a stereo camera, on the right, m; 0 without one."""
     row_times: np.ndarray | None = None
     """Time at which each row is read, from the time of the image, s; None for all rows at once. (height,)"""
+    random_pose: RandomPose | None = None
+    """Changes of the mounting in every world and episode; None for none."""
+    name: str = "camera"
+    """Name of the sensor, on which its random numbers depend."""
 
     @property
     def rot(self) -> np.ndarray:
@@ -187,9 +218,8 @@ def build_depth_fn(
     along: Along,
     plugins: ListPlugins,
     kernels: RayKernels,
-    baseline: float = 0.0,
+    drone_camera: DroneCamera | None = None,
     appearance: Appearance | None = None,
-    row_times: np.ndarray | None = None,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None, before=None) -> Hits``; see ``Scene.depth_fn``.
 
@@ -203,10 +233,12 @@ def build_depth_fn(
         along: Direction of distances; see ``Along``.
         plugins: Function that returns the plugins of the simulation.
         kernels: Kernels that cast the rays if possible.
-        baseline: Distance to the second imager of each camera, on the right, m; 0 without one.
+        drone_camera: The camera, if all drones carry it.
         appearance: The scene's materials and lights, for ``Hits.color``; None for no colours.
-        row_times: As in ``DroneCamera``.
     """
+    baseline, row_times, random_pose = 0.0, None, None
+    if drone_camera is not None:
+        baseline, row_times, random_pose = drone_camera.baseline, drone_camera.row_times, drone_camera.random_pose
     require(
         isinstance(along, str) and along in ("axis", "ray"),
         f"expected along='axis' of the camera or along='ray', got {along!r}",
@@ -233,15 +265,19 @@ def build_depth_fn(
 
     def views(data: SimData) -> Array:
         # Position and axes of each view, as in ``Tables.camera_poses``. (..., n_views, 12)
+        change = None
+        if random_pose is not None:
+            require(data.states.pos.ndim == 3, "expected data of all worlds for random poses, got data of one world")
+            change = random_pose.draw(data, drone_camera.name)  # type: ignore[union-attr]
         if row_times is None:
-            return views_at_once(data)
-        poses = jax.vmap(lambda time: views_at_once(extrapolate(data, time)), out_axes=-2)(jnp.asarray(row_times))
+            return views_at_once(data, change)
+        poses = jax.vmap(lambda t: views_at_once(extrapolate(data, t), change), out_axes=-2)(jnp.asarray(row_times))
         return poses.reshape(*poses.shape[:-3], -1, 12)
 
-    def views_at_once(data: SimData) -> Array:
+    def views_at_once(data: SimData, change: tuple[Array, Array] | None) -> Array:
         poses = []
         for camera in cameras:
-            pos, rot = camera_pose(camera, data)
+            pos, rot = camera_pose(camera, data, None if change is None else [x[:, camera.row] for x in change])
             pos = pos if camera.carrier == "world" else raise_to_floor(model, pos)
             poses.append(jnp.concatenate([pos, rot.reshape(*rot.shape[:-2], 9)], axis=-1))
         return jnp.stack(poses, axis=-2)
@@ -344,8 +380,12 @@ def build_depth_fn(
         if n_worlds <= worlds_per_batch:
             return cast_in_worlds(data, kernels, before)
         core = data.core
-        # Colours may differ by world and episode.
-        keyed_fields = () if appearance is None else ("world_id", "episode", "steps", "drone_id", "rng_key")
+        # Colours and mountings may differ by world and episode.
+        keyed_fields = (
+            ()
+            if appearance is None and random_pose is None
+            else ("world_id", "episode", "steps", "drone_id", "rng_key")
+        )
         keys = {name: getattr(core, name) for name in keyed_fields if name != "rng_key" or core.rng_key.ndim}
 
         def poses_of(data: SimData) -> tuple[Any, ...]:
@@ -414,8 +454,12 @@ def body_poses(model: CollisionModel, data: SimData) -> tuple[Array, Array]:
     return pos, quat
 
 
-def camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
-    """Return the camera's position, m (..., 3), and axes as columns (..., 3, 3), world frame, in all worlds or one."""
+def camera_pose(camera: CarriedCamera, data: SimData, change: Sequence[Array] | None = None) -> tuple[Array, Array]:
+    """Return the camera's position, m (..., 3), and axes as columns (..., 3, 3), world frame, in all worlds or one.
+
+    Args:
+        change: Change of its position, m (..., 3), and turn, xyzw (..., 4), in the frame of the body; None for none.
+    """
     states = data.states
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))
     leading = states.pos.shape[:-2]
@@ -430,7 +474,9 @@ def camera_pose(camera: CarriedCamera, data: SimData) -> tuple[Array, Array]:
     camera_pos, quat = (x[..., camera.row, :] for x in poses)
     if not camera.follows_rotation:
         return camera_pos + pos, jnp.broadcast_to(rot, (*leading, 3, 3))
+    if change is not None:
+        pos = pos + change[0]
+    camera_pos = camera_pos + rotation.rotate(quat, pos)
+    quat = quat if change is None else rotation.multiply(quat, change[1])
     # By components: a GPU may round matrix products to 10 bits.
-    return camera_pos + rotation.rotate(quat, pos), jnp.stack(
-        [rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1
-    )
+    return camera_pos, jnp.stack([rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1)

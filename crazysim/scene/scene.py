@@ -391,9 +391,8 @@ class Scene:
             rays = [depth.pixel_directions(c.fovy, width, height) for c in cameras]
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
-            camera.baseline if isinstance(camera, depth.DroneCamera) else 0.0,
+            camera if isinstance(camera, depth.DroneCamera) else None,
             Appearance(self.mj_model, shadows, random_colors) if color else None,
-            camera.row_times if isinstance(camera, depth.DroneCamera) else None,
         )  # fmt: skip
 
     def splat_fn(

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.sensor import Samples, Sensor
     from crazysim.plugins.sensors.triad import Triad
     from crazysim.scene.appearance import RandomColors
+    from crazysim.scene.depth import RandomPose
 
 __all__ = [
     "GPS",
@@ -45,6 +46,7 @@ __all__ = [
     "OpticalFlow",
     "Radar",
     "RandomColors",
+    "RandomPose",
     "RangeFinder",
     "RotorSpeeds",
     "Rounded",

@@ -3,8 +3,8 @@
 The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           noise=None, distortion=None, shadows=True, random_colors=None, exposure=0.0, blur_samples=8, readout=0.0,
-           drones=True, freq=None, latency=0.0, name="camera")
+           noise=None, distortion=None, shadows=True, random_colors=None, random_pose=None, exposure=0.0,
+           blur_samples=8, readout=0.0, drones=True, freq=None, latency=0.0, name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m

@@ -27,7 +27,7 @@ from crazysim.engine.pytree import PyTree, device_array, leaf
 from crazysim.engine.stage import Stage
 from crazysim.errors import ConfigError, require, short_repr
 from crazysim.plugins.sensors.sensor import MAX_DELAY, MAX_ROWS, age_at, rate_in
-from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, check_image_memory, extrapolate
+from crazysim.scene.depth import BYTES_PER_RAY, CarriedCamera, DroneCamera, RandomPose, check_image_memory, extrapolate
 from crazysim.scene.object_poses import moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import body_names
 
@@ -120,6 +120,9 @@ class ImageSensor(Plugin):
     its place in the image before, the negative of Kubric's ``backward_flow``) and ``"flow_valid"`` (whether the image
     before shows this point, bool; False in the first image of an episode, whose flow is zero). A lidar has no depths
     along an axis, colours and flow."""
+    random_pose: RandomPose | None = None
+    """Changes of position and attitude on every drone in every world and episode, such as ``RandomPose()``; None for
+    none. ``describe`` gives the mounting without them."""
     drones: bool = True
     """True for other drones to be visible; a drone never sees itself."""
     freq: int | None = None
@@ -435,7 +438,8 @@ class ImageSensor(Plugin):
         """Return the camera for ``Scene.depth_fn``: directions of its rays, and its mounting on each drone."""
         fpv_pos = [body_shape(airframe)["fpv_camera"] for airframe in sim.airframes]
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
-        return DroneCamera(self.rays, pos, np.asarray(self.rpy, np.float64), self.baseline, self.row_times)
+        rpy, random_pose = np.asarray(self.rpy, np.float64), self.random_pose
+        return DroneCamera(self.rays, pos, rpy, self.baseline, self.row_times, random_pose, self.name)
 
     def _latency_range(self, freq: int) -> tuple[int, int]:
         low, high = np.broadcast_to(np.asarray(self.latency, np.float64), 2).tolist()

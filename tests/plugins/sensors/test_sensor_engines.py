@@ -25,6 +25,7 @@ def test_all_sensors_are_tested():
         "Lidar",
         "Radar",
         "RandomColors",
+        "RandomPose",
         "RangeFinder",
         "Samples",
         "Sensor",
