@@ -9,8 +9,11 @@ With ``--range-finder``, drones at random positions measure six distances up to 
 
 With ``--colors``, images of a ``Camera`` per second: depth, and colours with and without shadows.
 
+With ``--maps``, depth images, and contact reports of rooms, among rooms of 16 to 64 boxes: of one room for all worlds,
+the mean of eight rooms, and of numbers of rooms from which each world has drawn one.
+
     python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
-                               [--colors]
+                               [--colors] [--maps 200]
 """
 
 from __future__ import annotations
@@ -22,14 +25,20 @@ from functools import partial
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 from jax import Array
 from measure import engine_name, medians, report, round_digits, seconds
 
-from crazysim import Camera, RangeFinder, Sim, __version__
+from crazysim import Camera, Maps, RangeFinder, Sim, __version__
+from crazysim.scene.first_hit import Targets
 
 HALF_WIDTH = 10.0
 """Half the side of the square in which the poles stand, m."""
+ROOM_WIDTH = 8.0
+"""Length of the walls of a room, m."""
+N_SINGLE_ROOMS = 8
+"""Number of rooms that are measured one by one."""
 
 
 def main() -> None:
@@ -41,7 +50,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--range-finder", action="store_true", help="time a step with a range finder, not images")
     parser.add_argument("--colors", action="store_true", help="compare images in colour with depth images")
+    parser.add_argument("--maps", type=int, nargs="+", help="numbers of rooms; compare them with one room")
     args = parser.parse_args()
+    if args.maps:
+        report_maps(args)
+        return
     for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
         sim = make_scene(args.worlds, n_poles, movable, args.device)
         if args.range_finder or args.colors:
@@ -79,6 +92,67 @@ def report_colors(sim: Any, n_poles: int, movable: bool, args: argparse.Namespac
             args.device, benchmark="colors", images=name, n_poles=n_poles, movable=movable, n_worlds=args.worlds,
             width=args.size[0], height=args.size[1], **rate, crazysim=__version__,
         )  # fmt: skip
+
+
+def report_maps(args: argparse.Namespace) -> None:
+    rng, n, size = np.random.default_rng(0), args.worlds, tuple(args.size)
+    rooms = [random_room(rng) for _ in range(max(N_SINGLE_ROOMS, *args.maps))]
+    pos, yaw = rng.uniform([-3, -3, 0.3], [3, 3, 2], (n, 1, 3)), rng.uniform(-np.pi, np.pi, (n, 1))
+    quat = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)
+    poses = {"pos": np.float32(pos), "quat": np.float32(quat)}
+    for n_maps in (1, *args.maps):
+        cases = [[room] for room in rooms[:N_SINGLE_ROOMS]] if n_maps == 1 else [rooms[:n_maps]]
+        numbers = [measure_rooms(case, poses, size, args) for case in cases]
+        means = {name: round_digits(float(np.mean([x[name] for x in numbers]))) for name in numbers[0]}
+        report(
+            args.device, benchmark="maps", n_maps=n_maps, n_worlds=n, width=size[0], height=size[1], **means,
+            crazysim=__version__,
+        )  # fmt: skip
+
+
+def measure_rooms(
+    rooms: list[mujoco.MjSpec], poses: dict[str, np.ndarray], size: tuple[int, int], args: argparse.Namespace
+) -> dict[str, float]:
+    """Return rates of depth images and contact reports, the time of their first calls, and the bytes of the tables."""
+    sim = Sim(args.worlds, control="attitude", device=args.device)
+    if len(rooms) == 1:
+        sim.scene.add(rooms[0], "room", mocap=False)
+    else:
+        sim.add(Maps(rooms))
+        sim.reset()
+    sim.data = sim.data.replace(states=sim.data.states.replace(**poses))
+    calls = {
+        "images": partial(sim.depth, "fpv_cam", *size, drones=False),
+        "contacts": partial(sim.contact_report, floor=False, drones=False),
+    }
+    start_time = time.perf_counter()
+    jax.block_until_ready([call() for call in calls.values()])
+    result = {"first_s": time.perf_counter() - start_time}
+    times = medians({name: partial(seconds, call) for name, call in calls.items()}, args.repeats)
+    for name, call in calls.items():
+        result[f"{name}_per_s"] = args.worlds / times[name]
+        if args.device == "cpu":
+            result[f"{name}_per_processor_s"] = args.worlds / min(processor_seconds(call) for _ in range(args.repeats))
+    tables = Targets(sim.scene.visual_model, 1, drones=False).build_fixed_hierarchy(np.float32)
+    return result | {"table_bytes": sum(x.nbytes for x in tables)}
+
+
+def random_room(rng: np.random.Generator) -> mujoco.MjSpec:
+    """Return a room of 8 x 8 m with 4 walls, and boxes on its floor, 16 to 64 together."""
+    room, half = mujoco.MjSpec(), ROOM_WIDTH / 2
+    for k in range(4):
+        side, angle = 1 - 2 * (k % 2), np.pi / 2 * (k // 2)
+        wall = [side * half * np.cos(angle), side * half * np.sin(angle), 1.25]
+        room.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, pos=wall, size=[0.05, half, 1.25], euler=[0, 0, np.degrees(angle)]
+        )
+    for _ in range(rng.integers(12, 61)):
+        half_sizes = rng.uniform(0.1, 0.4, 3) * [1, 1, 2]
+        pos = [*rng.uniform(-half, half, 2), half_sizes[2]]
+        room.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, pos=pos, size=half_sizes, euler=[0, 0, rng.uniform(0, 360)]
+        )
+    return room
 
 
 def report_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:

@@ -180,12 +180,16 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old_values |= {"body_pos": objects.pos, "body_quat": objects.quat}
         new_values |= {name: poses[name][:, None, columns] for name in ("body_pos", "body_quat")}
+        if objects.map_ids is not None:  # the others are far below
+            heights = poses["body_pos"][:, np.searchsorted(flight.body_ids, np.asarray(objects.map_ids)), 2]
+            old_values["map_index"], new_values["map_index"] = objects.map_index, np.argmax(heights, axis=1)[:, None]
     updated_values = _replace_in_worlds(old_values, worlds, new_values)
     states = data.states.replace(pos=updated_values["pos"], quat=updated_values["quat"])
     core = data.core.replace(steps=updated_values["steps"])
     if objects is not None:
         recorded = any(plugin.moves_objects for plugin in sim.plugins.values())
         objects = objects.replace(pos=updated_values["body_pos"], quat=updated_values["body_quat"], recorded=recorded)
+        objects = objects.replace(map_index=updated_values.get("map_index"))
     data = data.replace(states=states, core=core, objects=objects)
     if "setpoint" in updated_values:
         command, (_, *feedforward_leaves) = updated_values["setpoint"], staged_leaves(data)

@@ -474,6 +474,7 @@ def first_fixed_hit(
     best: BestHit,
     n_nodes: Array | int,
     map_range: Sequence[Array | int],
+    is_packet: bool = True,
 ) -> BestHit:
     """Return the best hit so far, or a nearer hit of a fixed geom.
 
@@ -482,6 +483,7 @@ def first_fixed_hit(
         tables: The fixed geoms.
         n_nodes: Number of nodes in one order of all hierarchies.
         map_range: First node, and number of nodes, of the hierarchy of the ray's world.
+        is_packet: Whether rays that are computed together mostly meet the same boxes, as neighbours in an image.
     """
     first_node, n_nodes_of_map = map_range
 
@@ -493,7 +495,7 @@ def first_fixed_hit(
         code, _ = table_rows(tables.codes, geom)
         return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, is_crossing, best)
 
-    return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes, first_node, n_nodes_of_map)
+    return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes, first_node, n_nodes_of_map, is_packet)
 
 
 def _walk_hierarchy(
@@ -504,22 +506,27 @@ def _walk_hierarchy(
     nodes_per_order: Array | int,
     first_node: Array | int,
     n_nodes: Array | int,
+    is_packet: bool = True,
 ) -> BestHit:
+    meets_any = any_lane if is_packet else lambda condition: condition
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
-    are_negative = [any_lane(d < 0) for d in ray.direction]
+    are_negative = [meets_any(d < 0) for d in ray.direction]
     order = sum(jnp.where(is_negative, jnp.int32(1 << k), 0) for k, is_negative in enumerate(are_negative))
     first_node = order * nodes_per_order + first_node
 
     def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         node, best = carry
-        box, next_node, geom = read_node(first_node + node)
+        # Lanes that have ended, or are at no leaf, read rows, too, which must exist.
+        box, next_node, geom = read_node(_minimum(first_node + node, hierarchy.N_ORDERS * nodes_per_order - 1))
         meets_box = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
-        def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
-            return node + 1, compute_where(geom >= 0, lambda best: hit_geom(geom, meets_box, best), carry[1])
+        leaf_geom = _maximum(geom, jnp.int32(0))
 
-        return compute_where(any_lane(meets_box), descend, (next_node, best))
+        def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+            return node + 1, compute_where(geom >= 0, lambda best: hit_geom(leaf_geom, meets_box, best), carry[1])
+
+        return compute_where(meets_any(meets_box), descend, (next_node, best))
 
     return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, (jnp.int32(0), best))[1]
 

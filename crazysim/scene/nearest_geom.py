@@ -44,18 +44,20 @@ def nearest_geom(
 
     def check_node(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
         node, best = carry
-        (next_node, geom), box = table_rows(links, first_node + node), table_rows(boxes, first_node + node)
+        row = jnp.minimum(first_node + node, len(links) - 1)  # lanes that have ended read a row, too, which must exist
+        (next_node, geom), box = table_rows(links, row), table_rows(boxes, row)
         is_near = _box_distance(box[:3], box[3:], point) - reach < best[0]
 
         def compare_geom(best: tuple[Array, Array]) -> tuple[Array, Array]:
-            gap = lax.stop_gradient(distance(geom))
+            gap = lax.stop_gradient(distance(jnp.maximum(geom, 0)))
             is_nearer = gap < best[0]
             return jnp.where(is_nearer, gap, best[0]), jnp.where(is_nearer, geom, best[1])
 
         def descend(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
             return node + 1, compute_where(geom >= 0, compare_geom, carry[1])
 
-        return compute_where(any_lane(is_near), descend, (next_node, best))
+        # Lanes that search the same group visit the same nodes, and read them once.
+        return compute_where(is_near if len(groups) > 1 else any_lane(is_near), descend, (next_node, best))
 
     start = jnp.int32(0), (jnp.full_like(point[0], jnp.inf), jnp.int32(-1))
     return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, start)[1][1]

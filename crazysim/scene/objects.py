@@ -226,6 +226,11 @@ class SceneObjects:
         handle = self.add(spec, list(sources), name, len(sources), origin, IDENTITY_QUAT, False, {})
         for body in (spec.body(x) for x in handle.bodies):
             body.mocap = True
+            require(
+                not body.find_all("light"),
+                f"expected maps without lights, which would shine in all worlds, got one in {body.name!r}. Use "
+                f"Sim(xml_path=...) for lights.",
+            )
             for geom in body.find_all("geom"):
                 # MJX would check all pairs of geoms of two maps.
                 touches_drones = DRONE_BITS[0] & geom.conaffinity or DRONE_BITS[1] & geom.contype

@@ -250,15 +250,14 @@ def _hit_fixed_geoms(
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
     n_nodes = len(tables.boxes) // N_ORDERS
     map_range = (0, n_nodes) if map_index is None else table_rows(tables.ranges, map_index)
+    settings = initial, n_nodes, map_range, map_index is None
 
     def first_geoms(origins: Array, directions: Array) -> Array:
         def cast_next(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, geom_index = carry
             ray = Ray(components(origins[k]), components(directions[k]), jnp.int32(IGNORES_NONE))
-            return (
-                k + 1,
-                geom_index.at[k].set(first_fixed_hit(surfaces, tables, ray, initial, n_nodes, map_range)[1]),
-            ), None
+            _, geom = first_fixed_hit(surfaces, tables, ray, *settings)
+            return (k + 1, geom_index.at[k].set(geom)), None
 
         initial_carry = jnp.int32(0), jnp.full(len(origins), -1, jnp.int32)
         return jax.lax.scan(cast_next, initial_carry, length=len(origins))[0][1]

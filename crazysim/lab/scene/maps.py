@@ -33,12 +33,12 @@ MAX_BOXES = 10_000
 
 def map_spec(
     source: MapSource,
-    resolution: float,
-    pos: ArrayLike,
-    quat: ArrayLike,
-    scale: float | None,
-    min_points: int,
-    rgba: ArrayLike,
+    resolution: float = 0.1,
+    pos: ArrayLike = (0.0, 0.0, 0.0),
+    quat: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    scale: float | None = None,
+    min_points: int = 1,
+    rgba: ArrayLike = (0.62, 0.60, 0.57, 1.0),
 ) -> mujoco.MjSpec:
     """Return a spec with the boxes of a map in its world body; see ``Scene.add_map``."""
     resolution = read_number("resolution", resolution, LENGTH)

@@ -11,6 +11,8 @@ from cases import with_states
 
 from crazysim import ConfigError, ContactLog, ContactResponse, Maps, RangeFinder, Sim
 from crazysim.envs import AutoReset, make
+from crazysim.media import Recorder
+from crazysim.media.flight_recorder import show_flight_at
 
 KINDS = ("box", "sphere", "cylinder", "capsule")
 INDEX = [2, 0, 1, 2, 1, 0]
@@ -187,11 +189,29 @@ def test_episodes_of_a_task_draw_maps():
     assert 1 <= changes.sum() <= 3  # at the starts of episodes of 5 steps
 
 
+def test_a_recorded_flight_is_shown_with_its_maps():
+    sim, maps = all_maps()
+    recorder = Recorder(sim, worlds=[2, 0])
+    for index in (INDEX, [0, 0, 1, 0, 0, 0]):
+        sim.data = maps.select(sim.data, index)
+        core = sim.data.core
+        sim.data = sim.data.replace(core=core.replace(steps=core.steps + sim.freq))
+        recorder.add()
+    flight = recorder.flight()
+    shown, other_maps = build(index=[1] * 6)
+    show_flight_at(shown, flight, flight.time[0])
+    np.testing.assert_array_equal(other_maps.index(shown.data), [2, 1, 1, 1, 1, 1])
+    show_flight_at(shown, flight, flight.time[1])
+    np.testing.assert_array_equal(other_maps.index(shown.data), [0, 1, 1, 1, 1, 1])
+    sim.data = maps.select(sim.data, INDEX)
+
+
 WRONG = [
     (lambda: Maps([]), "1 to"),
     (lambda: Maps(SPECS[0]), r"Maps\(\[spec"),
     (lambda: Sim().add(Maps(["none.xml"])), "an MJCF file"),
     (lambda: Sim().add(Maps([3])), "a body of one"),
+    (lambda: Sim().add(Maps(["<mujoco><worldbody><light/></worldbody></mujoco>"])), "Sim.xml_path"),
     (lambda: Maps(SPECS).index(Sim().data), "sim.add"),
     (lambda: all_maps()[1].select(all_maps()[0].data, 3), "index"),
     (lambda: all_maps()[1].select(all_maps()[0].data, [0, 1]), "index of shape"),
