@@ -24,10 +24,12 @@ from crazysim.envs import flying
 from crazysim.media import View
 from crazysim.plugins import sensors
 from crazysim.plugins.sensors.imu import RAD_PER_DEGREE, STANDARD_GRAVITY
+from crazysim.scene.depth import extrapolate
 from crazysim.trajectories import figure_eight
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.colors import hsv_to_rgb
 
 FOLDER = Path(__file__).parent / "pictures"
 COLOURS = np.array(
@@ -174,7 +176,7 @@ def camera_scene(n_drones: int = 1) -> Sim:
     sim.scene.add(
         "pole", count=3, pos=[[1.3, -0.5, 0], [2.6, -0.9, 0], [3.0, 1.4, 0]], height=2.0, radius=0.06, mocap=False
     )
-    sim.scene.add("sphere", pos=[1.6, -0.1, 0.55], radius=0.2, mocap=False)
+    sim.scene.add("sphere", pos=[1.6, -0.1, 0.55], radius=0.2)
     sim.scene.add("box", count=2, pos=[[2.2, -0.45, 0.2], [-1.5, 1.5, 0.4]], size=(0.4, 0.4, 0.8), mocap=False)
     sim.scene.add("wall", count=2, pos=[[4.5, 0, 0], [-3.0, 0, 0]], length=7.0, height=2.6, mocap=False)
     sim.data = flying(sim.data, np.array([[0.0, 0.0, 0.9]]))
@@ -182,14 +184,33 @@ def camera_scene(n_drones: int = 1) -> Sim:
 
 
 def cameras() -> None:
-    """What a camera in one scene sees: in colour, each output, stereo noise, and a lens."""
+    """What a camera in one scene sees: each output, noise, a lens, and the motion of the drone and of the ball."""
     sim, size = camera_scene(), (160, 120)
     clean = Camera(*size, outputs=("rgb", "gray", "depth", "normal", "segmentation"), max_depth=6.0)
     images = jax.jit(clean.image_fn(sim))(sim.data)
     stereo = Camera(*size, max_depth=6.0, noise=sensors.StereoNoise())
     lens = Camera(*size, max_depth=6.0, distortion=sensors.Distortion(k1=-0.25, k2=0.05))
     noisy, bent = (jax.jit(camera.image_fn(sim))(sim.data)["depth"][0, 0] for camera in (stereo, lens))
-    figure, axes = plt.subplots(2, 4, figsize=(11.2, 4.4), layout="constrained")
+    # The drone flies ahead and turns to the left; the ball moves to the right.
+    moving = sim.data.replace(
+        states=sim.data.states.replace(
+            vel=np.full((1, 1, 3), np.float32([3, 0, 0])), ang_vel=np.full((1, 1, 3), np.float32([0, 0, 1.2]))
+        ),
+        objects=sim.data.objects.replace(vel=np.full((1, 1, 1, 3), np.float32([0, -4, 0]))),
+    )
+    flow_camera = Camera(*size, outputs=("flow", "flow_valid"))
+    motion = jax.jit(flow_camera.image_fn(sim))(moving, extrapolate(moving, -0.05))
+    u, v = np.moveaxis(np.asarray(motion["flow"][0, 0]), -1, 0)
+    speed = np.hypot(u, v)
+    hue = np.stack([np.arctan2(v, u) / (2 * np.pi) % 1, np.clip(speed / 8, 0, 1), np.ones_like(u)], axis=-1)
+    blurred, rolling = (
+        jax.jit(camera.image_fn(sim))(moving)["rgb"][0, 0]
+        for camera in (
+            Camera(*size, outputs=("rgb",), exposure=0.05, blur_samples=32),
+            Camera(*size, outputs=("rgb",), readout=0.1),
+        )
+    )
+    figure, axes = plt.subplots(3, 4, figsize=(11.2, 6.6), layout="constrained")
     depths = {"vmin": 0, "vmax": 6, "cmap": "viridis_r"}
     segments = np.asarray(images["segmentation"][0, 0])
     panels = [
@@ -201,6 +222,10 @@ def cameras() -> None:
         ('"segmentation"', np.ma.masked_less(segments, 0), {"cmap": "tab10", "interpolation": "nearest"}),
         ("depth with StereoNoise(), holes white", np.ma.masked_equal(noisy, 0), depths),
         ("depth through a lens, k1=-0.25", bent, depths),
+        ('"flow": hue by direction, paler if slow', hsv_to_rgb(hue), {}),
+        ('"flow_valid", in white', motion["flow_valid"][0, 0], {"cmap": "gray"}),
+        ('"rgb" with exposure=0.05', blurred, {}),
+        ('"rgb" with readout=0.1', rolling, {}),
     ]
     for axis, (title, image, options) in zip(axes.ravel(), panels, strict=True):
         shown = axis.imshow(image, **options)
