@@ -6,7 +6,7 @@ policy learning with parallel differentiable simulation").
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -75,7 +75,9 @@ class Config:
     shape: str = "default"
     """Shape of the policy, as in PPO."""
     convolution: tuple[int, ...] = ()
-    """Channels of the layers of a convolution over each image, as in PPO. The gradient passes through the image."""
+    """Channels of the layers of a convolution over each image, as in PPO."""
+    image_gradients: bool = True
+    """Whether the gradient passes through images, as it does through other observations, or takes them as constants."""
     critic_epochs: int = 0
     """Passes over the samples of a rollout by which a value function learns the return after the horizon; 0 for none.
     The policy then also learns from ends of episodes, which have no gradient themselves."""
@@ -167,13 +169,13 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         configs: Hyperparameters of each seed; only ``SWEEPABLE`` ones may differ between seeds.
         keys: Random keys of the seeds. (n_seeds,)
     """
-    constant = [name for name, x in env.image_formats().items() if OUTPUTS[x["output"]].dtype is not None]
+    config, formats = configs[0], env.image_formats()
+    constant = [name for name, x in formats.items() if OUTPUTS[x["output"]].dtype is not None]
     require(
-        not constant,
+        not (constant and config.image_gradients),
         f"expected images whose gradients are not zero, got {', '.join(constant)}. Use outputs=('depth',) of the "
-        f"camera, or algorithm='ppo'.",
+        f"camera, or image_gradients=False.",
     )
-    config = configs[0]
     if config.critic_epochs:
         check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
     k_policy, k_env, k_agent = split_keys(keys, 3)
@@ -219,6 +221,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     initial_memory = agents.network.make_memory(*learner.env.reward.shape)
     restart = partial(select_worlds, learner.env.done)
     initial_memory = jax.tree.map(restart, initial_memory, learner.memory)
+    act_fn = partial(act, constant=() if configs[0].image_gradients else tuple(env.image_formats()))
     # On several devices each has a copy of the policy for its worlds. They sum the gradients of the copies once, after
     # all steps; with a single policy they would sum its gradients in every step.
     n_copies = 1 if mesh is None or are_seeds_divided(n_seeds, mesh) else mesh.size
@@ -232,7 +235,7 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     def loss(weights: Weights) -> tuple[Array, Any]:
         seeds = agents.replace(stats=copy(agents.stats)).as_policy(weights), copy(config)
         state, memory, records = rollout_seeds(
-            env, initial_state, act, record, seeds, copy(agents.key), configs[0].n_steps, initial_memory
+            env, initial_state, act_fn, record, seeds, copy(agents.key), configs[0].n_steps, initial_memory
         )
         records = jax.tree.map(lambda x: x.reshape(x.shape[0], n_seeds, -1, *x.shape[3:]), records)
         errors, last_obs = split_blocks((state.info["error"], critic_obs(state.obs, configs[0].critic)), n_seeds)
@@ -248,9 +251,12 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     return Learner(agents, state, memory, learner.iteration + 1), metrics | update_metrics
 
 
-def act(policy: Policy, config: Config, obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Array]:
+def act(
+    policy: Policy, config: Config, obs: Obs, memory: Any, key: Array, constant: Collection[str] = ()
+) -> tuple[Array, Any, Array]:
     """Return the action of the policy; the observations are kept for the statistics and the value function."""
     del key
+    obs = {name: jax.lax.stop_gradient(x) if name in constant else x for name, x in obs.items()}
     return *policy.act(policy_obs(obs, config.critic), memory), critic_obs(obs, config.critic)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from crazysim.arguments import check_flag
 from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError, require
@@ -54,6 +55,8 @@ def check_hyperparameters(config: Any) -> None:
             value = _check_choice(field.name, value, CHOICES_BY_NAME[field.name])
         elif isinstance(default, str):
             value = _check_text(field.name, value)
+        elif isinstance(default, bool):
+            value = check_flag(field.name, value)
         elif isinstance(default, int):
             is_count = field.name in COUNT_NAMES
             value = _check_count(field.name, value) if is_count else positive_integer(field.name, value, MAX_COUNT)

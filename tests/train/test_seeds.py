@@ -29,7 +29,10 @@ PPO_CONFIGS = [
     ppo.Config(iterations=3, n_steps=12, minibatches=2, epochs=2, hidden=(8,), learning_rate=rate, discount=discount)
     for rate, discount in ((1e-3, 0.98), (5e-3, 0.9))
 ]
-APG_CONFIGS = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for rate in (1e-3, 5e-3)]
+APG_CONFIGS = [
+    apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate, critic_epochs=1, minibatches=2)
+    for rate in (1e-3, 5e-3)
+]
 
 
 def block_observations(state, i):
