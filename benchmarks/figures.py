@@ -274,6 +274,7 @@ FIGURES: dict[str, Figure] = {
     "depth": Figure("depth.py --poles 30 1000", "depth.py --worlds 16384"),
     "depth-small": Figure(gpu="depth.py --worlds 4096 --size 16 12 --poles 30"),
     "colors": Figure("depth.py --colors --poles 30 --repeats 25", "depth.py --colors --poles 30 --worlds 16384"),
+    "maps": Figure("depth.py --maps 200 --worlds 4096 --repeats 7", "depth.py --maps 200 --worlds 16384"),
     "sight": Figure(gpu="sight.py"),
     "range-finder": Figure(
         "depth.py --range-finder --worlds 1024 --poles 0 4 30 100 1000",

@@ -238,6 +238,19 @@ def colors(lines: list[Line]) -> str:
     )
 
 
+maps = columns(
+    Rooms=lambda x: (
+        "one for all worlds, mean of eight" if x["n_maps"] == 1 else f"{x['n_maps']}, one drawn by each world"
+    ),
+    Machine=lambda x: f"{'one core' if 'images_per_processor_s' in x else x['machine']}, {worlds_text(x)} worlds",
+    Depth_images_per_second=lambda x: si_text(x.get("images_per_processor_s", x["images_per_s"])),
+    Contact_reports_per_second=lambda x: si_text(x.get("contacts_per_processor_s", x["contacts_per_s"])),
+    Tables_of_rays=lambda x: f"{si_text(x['table_bytes'])}B",
+    First_calls=lambda x: duration_text(x["first_s"]),
+)
+"""Rates among rooms that differ, and among equal ones; of a CPU per second of one core."""
+
+
 def costs(lines: list[Line]) -> str:
     """Return the times of cases divided by the times of their references, rates of the cases, and first calls."""
     return pivot(
@@ -629,6 +642,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "envs": (("envs", "envs-training", "envs-depth", "randomize"), env_rates),
     "depth": (("depth", "range-finder"), depths),
     "colors": (("colors",), colors),
+    "maps": (("maps",), maps),
     "costs": (("plugins", "loads", "follow"), ratios),
     "plugins": (("plugins",), costs),
     "loads": (("loads",), costs),
