@@ -39,11 +39,15 @@ class RandomColors:
     """Largest change of the brightness of each light, a share of it."""
     tilt: float = setting(default=20.0, low=0.0, high=80.0)
     """Largest angle by which the directions of lights change, degrees."""
+    textures: bool = False
+    """Whether each body draws one of all two-dimensional textures of the scene for its textured surfaces."""
 
     def __post_init__(self) -> None:
         check_settings(self)
 
-    def apply(self, paint: Paint, data: SimData, body_index: Sequence[int], n_lights: int) -> Paint:
+    def apply(
+        self, paint: Paint, data: SimData, body_index: Sequence[int], n_lights: int, textures: np.ndarray
+    ) -> Paint:
         """Return tables with rows for each world; see ``color_at_hit``.
 
         Args:
@@ -51,6 +55,7 @@ class RandomColors:
             data: Data of all worlds, for their random keys.
             body_index: ``Target.body_index`` of each geom.
             n_lights: Number of lights.
+            textures: Textures to choose from, as in ``Paint.textures``. (n_textures, 2)
         """
         n_bodies, dtype = max(body_index, default=0) + 1, paint.looks.dtype
         draw = jax.vmap(lambda key: uniform(key, (n_bodies * 3 + n_lights * 4,), dtype))
@@ -59,6 +64,11 @@ class RandomColors:
         by_light = numbers[:, n_bodies * 3 :].reshape(len(numbers), n_lights, 4)
         looks = jnp.broadcast_to(paint.looks[: len(body_index)], (*by_body.shape[:2], paint.looks.shape[1]))
         looks = looks.at[..., :3].multiply(1 + self.surfaces * by_body)
+        rows = jnp.broadcast_to(paint.textures[: len(body_index)], (*by_body.shape[:2], 2))
+        if self.textures and len(textures):
+            pick = jax.vmap(lambda key: jax.random.randint(key, (n_bodies,), 0, len(textures)))
+            choice = jnp.asarray(textures)[pick(episode_keys(data, "textures"))[:, np.asarray(body_index, int)]]
+            rows = jnp.where(rows[..., 1:] > 0, choice, rows)
         # A direction tilts by a part of the unit ball that is perpendicular to it.
         pos, direction, colors, rest = jnp.split(paint.lights[:n_lights], (3, 6, 15), axis=-1)
         shift = by_light[..., :3] / jnp.maximum(jnp.linalg.norm(by_light[..., :3], axis=-1, keepdims=True), 1)
@@ -68,10 +78,8 @@ class RandomColors:
         colors = colors * (1 + self.lights * by_light[..., 3:])
         pos, rest = (jnp.broadcast_to(x, (*by_light.shape[:2], x.shape[-1])) for x in (pos, rest))
         lights = jnp.concatenate([pos, direction, colors, rest], axis=-1)
-        tables = (
-            x.reshape(-1, x.shape[-1]) if x.size else y for x, y in ((looks, paint.looks), (lights, paint.lights))
-        )
-        return paint._replace(**dict(zip(("looks", "lights"), tables, strict=True)))
+        changed = {"looks": looks, "lights": lights, "textures": rows}
+        return paint._replace(**{name: x.reshape(-1, x.shape[-1]) for name, x in changed.items() if x.size})
 
 
 class Appearance:
@@ -123,6 +131,20 @@ class Appearance:
         images = [sides if len(sides) == 6 else np.repeat(sides, 6, axis=0)]
         looks, textures, levels = np.zeros((len(targets), 9)), np.zeros((len(targets), 2), np.int32), [[0, 1, 1]]
         rows_of_texture: dict[int, tuple[int, int]] = {}
+        flat = int(mujoco.mjtTexture.mjTEXTURE_2D)
+
+        def load(texture: int) -> tuple[int, int]:
+            if texture not in rows_of_texture:
+                reduced = _reduced_images(_read_texture(model, texture))
+                rows_of_texture[texture] = len(levels), len(reduced)
+                for image in reduced:
+                    levels.append([sum(x.size for x in images) // 3, image.shape[1], image.shape[0]])
+                    images.append(image)
+            return rows_of_texture[texture]
+
+        if self._random_colors is not None and self._random_colors.textures:
+            for texture in np.flatnonzero(model.tex_type == flat):
+                load(int(texture))
         for target, look, rows in zip(targets, looks, textures, strict=True):
             geom, material, texture = target.geom.index, int(model.geom_matid[target.geom.index]), -1
             rgba, shine, repeat, half = model.geom_rgba[geom], DEFAULT_SHINE, np.ones(2), model.geom_size[geom, :2]
@@ -138,17 +160,11 @@ class Appearance:
                 repeat = repeat / half
                 kind = "coordinates" if kind == "mesh" and model.mesh_texcoordadr[mesh] >= 0 else kind
             look[:] = *rgba[:3], *shine[:2], SHININESS_SCALE * shine[2], *repeat, shift
-            is_flat = texture >= 0 and int(model.tex_type[texture]) == int(mujoco.mjtTexture.mjTEXTURE_2D)
+            is_flat = texture >= 0 and int(model.tex_type[texture]) == flat
             if texture >= 0 and not (is_flat and kind in TEXTURED_KINDS):
                 look[:3] *= _read_texture(model, texture).mean(axis=(0, 1))
             elif texture >= 0:
-                if texture not in rows_of_texture:
-                    reduced = _reduced_images(_read_texture(model, texture))
-                    rows_of_texture[texture] = len(levels), len(reduced)
-                    for image in reduced:
-                        levels.append([sum(x.size for x in images) // 3, image.shape[1], image.shape[0]])
-                        images.append(image)
-                rows[:] = rows_of_texture[texture]
+                rows[:] = load(texture)
         texels = np.concatenate([np.rint(255 * x).reshape(-1, 3) for x in images]).astype(np.int32)
         tables = (
             looks,
@@ -162,10 +178,10 @@ class Appearance:
         arrays = [x if len(x) else np.zeros((1, x.shape[1]), x.dtype) for x in map(np.asarray, tables)]
         dtype = data.states.pos.dtype
         paint = Paint(*(jnp.asarray(x, np.int32 if x.dtype.kind == "i" else dtype) for x in arrays))
-        bodies = [target.body_index for target in targets]
-        return (
-            paint if self._random_colors is None else self._random_colors.apply(paint, data, bodies, len(self.flags[0]))
-        )
+        if self._random_colors is None:
+            return paint
+        bodies, choices = [target.body_index for target in targets], np.array([*rows_of_texture.values()], np.int32)
+        return self._random_colors.apply(paint, data, bodies, len(self.flags[0]), choices)
 
     def _view(self, pixel_angle: float) -> View:
         vis, far = self._model.vis, self._model.vis.map.zfar * self._model.stat.extent

@@ -125,7 +125,7 @@ def color_at_hit(
         lights: Lights in the order of ``Paint.lights``.
         has_sky: Whether rays that meet nothing have the colour of the sky; they are black otherwise.
         has_haze: Whether a plane disappears in haze at the horizon.
-        is_per_world: Whether ``Paint.looks`` and ``Paint.lights`` have rows for each world, one world after the other.
+        is_per_world: Whether looks, textures and lights have rows for each world, one world after the other.
         surfaces: ``Targets.surfaces``.
         n_pixels: Number of rays of a camera.
         n_cameras: Number of cameras of a world.
@@ -175,7 +175,7 @@ def color_at_hit(
             else:
                 color = [a + b for a, b in zip(color, part, strict=True)]
         color = [jnp.minimum(a, 1.0) + b for a, b in zip(color, shaded_color, strict=True)]
-        first_level, n_levels = table_rows(paint.textures, row)
+        first_level, n_levels = table_rows(paint.textures, look)
 
         def draw_texture(color: Components) -> Components:
             # The image whose texels are nearest to the distance between neighbouring pixels on the surface.

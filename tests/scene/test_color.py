@@ -197,3 +197,35 @@ def test_random_colors_differ_by_world_and_episode_and_stay_during_an_episode(mo
         for x in (RandomColors(0, 0, 0), None)
     )
     np.testing.assert_allclose(unchanged, plain, atol=0.1)
+
+
+def test_random_textures_are_those_of_the_scene_in_every_world_and_episode(tmp_path):
+    colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    path = tmp_path / "scene.xml"
+    textures = "".join(
+        f'<texture name="{k}" type="2d" builtin="flat" rgb1="{text(color)}" width="8" height="{8 + k}"/>'
+        for k, color in enumerate(colors)
+    )
+    path.write_text(f"""<mujoco><visual><headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/></visual>
+        <asset>{textures}<material name="floor" texture="0"/></asset>
+        <worldbody><geom type="plane" size="0 0 .05" material="floor"/>
+        <geom type="sphere" size="0.2" pos="0 0 0.3" rgba="1 1 1 1"/>
+        <camera name="eye" pos="0 0 2" fovy="60"/></worldbody></mujoco>""")
+    sim = Sim(12, xml_path=path)
+
+    def floor_and_ball(data, textures):
+        random_colors = RandomColors(0, 0, 0, textures=textures)
+        image = sim.scene.depth_fn("eye", 9, 9, drones=False, color=True, random_colors=random_colors)
+        image = np.asarray(jax.jit(image)(data).color)[:, 0] / 255
+        assert np.ptp(image[:, 0], axis=1).max() < 0.02
+        return image[:, 0, 0], image[:, 4, 4]
+
+    floor, ball = floor_and_ball(sim.data, True)
+    index = np.argmax(floor, axis=1)
+    np.testing.assert_allclose(floor, colors[index], atol=0.02)
+    assert set(index) == {0, 1, 2}, "twelve worlds miss one of three textures with a probability of 2 %"
+    np.testing.assert_allclose(ball, 1, atol=0.02)
+    next_episode = sim.data.replace(core=sim.data.core.replace(episode=sim.data.core.episode + 1))
+    assert (np.argmax(floor_and_ball(next_episode, True)[0], axis=1) != index).sum() > 2
+    floor, _ = floor_and_ball(sim.data, False)
+    np.testing.assert_allclose(floor, np.broadcast_to(colors[0], floor.shape), atol=0.02)
