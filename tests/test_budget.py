@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 17738,
     "media": 1091,
     "plugins": 5067,
-    "scene": 3140,
+    "scene": 3154,
     "sim": 914,
     "train": 2709,
     "trajectories": 497,
