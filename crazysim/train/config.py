@@ -106,8 +106,8 @@ RECIPES: dict[str, Recipe] = {
     ),
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "forest": Recipe(
-        n_worlds=4096,
-        config={**_CAMERA_POLICY, "iterations": 400, "minibatches": 64},
+        n_worlds=512,
+        config={**_CAMERA_POLICY, "iterations": 160, "minibatches": 8},
         practice={"difficulty": (0.0, 1.0)},
     ),
     "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
