@@ -319,6 +319,7 @@ FIGURES: dict[str, Figure] = {
     "validation-filter": Figure("validation.py filter"),
     "validation-any": Figure("validation.py any"),
     "validation-sim2sim": Figure("validation.py sim2sim"),
+    "validation-sight": Figure("validation.py sight"),
 }
 
 

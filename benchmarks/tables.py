@@ -511,6 +511,31 @@ def policies_for_any_airframe(lines: list[Line]) -> str:
     )
 
 
+def flights_by_sight(lines: list[Line]) -> str:
+    """Return shares of forests crossed by policy, physics, images and noise, at each rate and latency."""
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for line in lines:
+        images, rate, late, noise = line["quantity"].split(", ", 3)
+        policy, simulator = line["reference"].split(", ")
+        row = f"`{policy}`; {simulator}; {images.removeprefix('images of ')}; {noise.removeprefix('noise: ')}"
+        cells.setdefault((row, rate), {})[late.removesuffix(" late")] = f"{line['figure']:.3g}"
+
+    def cell_text(shares: dict[str, str]) -> str:
+        return (
+            ", ".join(shares.values()) + " %"
+            if len(shares) == 4
+            else ", ".join(f"{share} % ({late})" for late, share in shares.items())
+        )
+
+    return pivot(
+        [{"row": row, "column": rate, "cell": shares} for (row, rate), shares in cells.items()],
+        lambda x: x["row"],
+        lambda x: x["column"],
+        lambda x: cell_text(x["cell"]),
+        "Policy; physics; images; noise",
+    )
+
+
 def transfers(lines: list[Line]) -> str:
     """Return the success of policies by simulator."""
     return pivot(
@@ -662,6 +687,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[[list[Line]], str]]] = {
     "validation-sim2sim": (("validation-sim2sim",), transfers),
     **{f"validation-{name}": ((f"validation-{name}",), validation) for name in SECTIONS if name != "idsia"},
     "validation-firmware": (("validation-firmware",), firmware),
+    "validation-sight": (("validation-sight",), flights_by_sight),
     "validation-any": (("validation-any",), policies_for_any_airframe),
 }
 """Figures of each table, and the function that makes it of their lines.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crazysim.errors import ConfigError, require
 from crazysim.lab.validate.any_airframe import load_network
-from crazysim.lab.validate.by_sight import sees_forest
+from crazysim.lab.validate.by_sight import load_pilot, sees_forest
 from crazysim.lab.validate.rows import Row, measure_sections
 from crazysim.lab.validate.sections import NAMES, sections
 
@@ -38,5 +38,7 @@ def validate(
     )
     source = None if policy is None else Path(policy)
     if source is not None and not sees_forest(source):
-        load_network(source)  # wrong files are refused before the work
+        (load_pilot if "sight" in only and "any" not in only else load_network)(
+            source
+        )  # wrong files are refused before the work
     return measure_sections([section for section in sections(folder, source) if section.name in only])

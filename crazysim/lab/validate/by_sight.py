@@ -290,7 +290,7 @@ def between(before: States, after: States, fraction: float) -> States:
     return mean | {"quat": quat / np.linalg.norm(quat, axis=-1, keepdims=True)}
 
 
-def fly_forest(pilot: Pilot, condition: Condition, n: int = N_FORESTS) -> tuple[float, float]:
+def fly_forest(pilot: Pilot, condition: Condition, n: int) -> tuple[float, float]:
     """Fly through held-out forests; return the shares that are crossed, and that end by a touch or outside."""
     env, data, judge, observe = make_forests(n)
     (act, initial_memory, camera), flying = pilot, np.ones(n, bool)
@@ -349,7 +349,7 @@ def checks(folders: Sequence[Path]) -> Sequence[Callable[[], Iterable[Row]]]:
 def measure_flight(folder: Path, condition: Condition) -> Iterable[Row]:
     """Yield the success of a policy in one condition."""
     simulator, images, freq, latency, noise = condition
-    crossed, failed = fly_forest(load_pilot(folder), condition)
+    crossed, failed = fly_forest(load_pilot(folder), condition, N_FORESTS)
     quantity = f"images of {images}, {freq} Hz, {latency} ms late, noise: {noise}"
     remark = f"{100 * failed:.3g} % touched or left"
     yield Row(quantity, f"{folder.name}, {simulator}", 100 * crossed, "%", None, remark)

@@ -1,15 +1,26 @@
 """Flights by sight in C MuJoCo: its images agree with ours, and are as slow and late as they should be."""
 
+import dataclasses
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim import Camera
+from crazysim.__main__ import main
+from crazysim.envs import make
+from crazysim.envs.statistics import RunningStats
 from crazysim.lab.validate import by_sight
 from crazysim.lab.validate.by_sight import Condition, Pilot, add_errors, fill_holes, fly_forest, image_source
 from crazysim.lab.validate.simulators import COMMAND_PERIOD, MujocoWithDrag, Simulator
 from crazysim.plugins.sensors import StereoNoise
+from crazysim.train import checkpoint
+from crazysim.train.config import TrainConfig
+from crazysim.train.export import describe
+from crazysim.train.networks import Policy
+from crazysim.train.training import POLICY_FILE
 
 N = 4
 CAMERA = Camera(16, 12, noise=StereoNoise())
@@ -86,6 +97,29 @@ def test_images_are_slow_and_late(freq, latency):
 
 def test_drones_on_the_floor_have_failed():
     assert watch(Condition("sinking", "crazysim"))[1] == (0, 1)
+
+
+def test_the_command_flies_a_run_of_forest(tmp_path, monkeypatch, capsys):
+    """Drones that sink touch the ground whatever the policy of zeros commands; the run of another task is left out."""
+    config = TrainConfig.create("forest", config={"hidden": [], "convolution": []})
+    env = make("forest")
+    policy = Policy(RunningStats.create(n := sum(env.observation_sizes.values())), [(jnp.zeros((n, 4)), jnp.zeros(4))])
+    for run, task in ((tmp_path / "policies" / "a", "forest"), (tmp_path / "policies" / "b", "hover")):
+        meta = describe(env) | {"settings": dataclasses.asdict(config), "task": task}
+        run.mkdir(parents=True)
+        checkpoint.save(run / POLICY_FILE, policy, meta)
+    monkeypatch.setattr(by_sight, "N_FORESTS", N)
+    monkeypatch.setattr(by_sight, "CONDITIONS", (Condition("sinking", "crazysim", 30, 20, "stereo, filled"),))
+    out = str(tmp_path / "page.md")
+    assert main(["validate", "--only", "sight", "--out", out]) == 0
+    assert "left out sight: give `--policy`" in capsys.readouterr().out
+    for options in (["--data", str(tmp_path)], ["--policy", str(tmp_path / "policies" / "a")]):
+        assert main(["validate", "--only", "sight", *options, "--out", out]) == 0
+        (row,) = (line for line in Path(out).read_text().splitlines() if "30 Hz" in line)
+        assert "20 ms late, noise: stereo, filled | a, sinking | 0 %" in row
+        assert "100 % touched or left" in row
+    assert main(["validate", "--only", "sight", "--policy", str(tmp_path / "policies" / "b"), "--out", out]) == 2
+    assert "expected a policy of forest that commands attitudes at 50 Hz" in capsys.readouterr().err
 
 
 def test_holes_are_filled_with_the_largest_depth_beside_them():
