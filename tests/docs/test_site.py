@@ -49,6 +49,10 @@ def test_links_lead_to_files_and_headings(page):
         assert not anchor or anchor in heading_anchors(file), f"{target}#{anchor}"
 
 
+def test_no_page_has_marks_of_a_merge():
+    assert not [page for page in PAGES if re.search(r"^(<{7}|>{7}) ", page.read_text(), re.MULTILINE)]
+
+
 def test_there_are_links_and_anchors_to_check():
     links = [link for page in PAGES for link in LINK.findall(read_prose(page))]
     assert len(links) > 50
