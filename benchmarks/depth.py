@@ -99,7 +99,7 @@ def report_maps(args: argparse.Namespace) -> None:
     rooms = [random_room(rng) for _ in range(max(N_SINGLE_ROOMS, *args.maps))]
     pos, yaw = rng.uniform([-3, -3, 0.3], [3, 3, 2], (n, 1, 3)), rng.uniform(-np.pi, np.pi, (n, 1))
     quat = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)
-    poses = {"pos": np.float32(pos), "quat": np.float32(quat)}
+    poses = {"pos": pos.astype(np.float32), "quat": quat.astype(np.float32)}
     for n_maps in (1, *args.maps):
         cases = [[room] for room in rooms[:N_SINGLE_ROOMS]] if n_maps == 1 else [rooms[:n_maps]]
         numbers = [measure_rooms(case, poses, size, args) for case in cases]

@@ -180,7 +180,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old_values |= {"body_pos": objects.pos, "body_quat": objects.quat}
         new_values |= {name: poses[name][:, None, columns] for name in ("body_pos", "body_quat")}
-        if objects.map_ids is not None:  # the others are far below
+        if objects.map_index is not None:  # the others are far below
             heights = poses["body_pos"][:, np.searchsorted(flight.body_ids, np.asarray(objects.map_ids)), 2]
             old_values["map_index"], new_values["map_index"] = objects.map_index, np.argmax(heights, axis=1)[:, None]
     updated_values = _replace_in_worlds(old_values, worlds, new_values)

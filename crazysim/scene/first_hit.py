@@ -535,7 +535,7 @@ def _maximum(a: Array, b: Array) -> Array:
     return jnp.where(a < b, b, a)
 
 
-def _minimum(a: Array, b: Array) -> Array:
+def _minimum(a: Array, b: Array | int) -> Array:
     return jnp.where(a > b, b, a)
 
 

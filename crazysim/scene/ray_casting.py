@@ -256,7 +256,7 @@ def _hit_fixed_geoms(
         def cast_next(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, geom_index = carry
             ray = Ray(components(origins[k]), components(directions[k]), jnp.int32(IGNORES_NONE))
-            _, geom = first_fixed_hit(surfaces, tables, ray, *settings)
+            geom = first_fixed_hit(surfaces, tables, ray, *settings)[1]
             return (k + 1, geom_index.at[k].set(geom)), None
 
         initial_carry = jnp.int32(0), jnp.full(len(origins), -1, jnp.int32)
