@@ -78,8 +78,8 @@ class Handle:
                 n, 3)
             quat: Attitudes, body to world, xyzw; they are normalised. None keeps the attitudes. (4,), (n, 4) or
                 (n_worlds, n, 4)
-            vel: Velocities for contact response, world frame, m/s; they do not move the objects. None sets them to
-                zero if ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
+            vel: Velocities for contact response and blur, world frame, m/s; they do not move the objects. None sets
+                them to zero if ``pos`` is passed, and keeps them otherwise. Shapes as ``pos``
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         objects = self._objects(data)

@@ -94,6 +94,7 @@ class Scene:
         self.ray_kernels = ray_kernels
         self.splats = None
         self.revision = self._compiled_revision = self.n_reads = 0
+        self._map_sources: list[Source] = []
         self.environment = None
         self._compile()
 
@@ -188,16 +189,16 @@ class Scene:
 
     def add_maps(self, sources: Sequence[Source], name: str) -> None:
         """Add maps of which each world has one, ``data.objects.map_index``; see ``Maps``."""
-        maps = self.added_objects.maps
-        names = tuple(f"{name}:{k}" for k in range(len(sources)))
+        maps, sources = self.added_objects.maps, list(sources)
         require(
-            maps in ((), names),
-            f"expected the {len(maps)} maps that the scene already has, got {len(names)} {name!r}. A scene has one "
-            f"list of maps. Use a new simulation.",
+            not maps or sources == self._map_sources,
+            f"expected the list of {len(maps)} maps that the scene already has, got another one for {name!r}. A scene "
+            f"has one list of maps. Use a new simulation.",
         )
         if not maps:
             with self.restore_on_error():
                 self.added_objects.add_maps(self.spec, sources, name)
+            self._map_sources = sources
             self.revision += 1
 
     def add_once(self, source: Source, name: str, count: int, **options: Any) -> None:

@@ -221,7 +221,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     initial_memory = agents.network.make_memory(*learner.env.reward.shape)
     restart = partial(select_worlds, learner.env.done)
     initial_memory = jax.tree.map(restart, initial_memory, learner.memory)
-    act_fn = partial(act, constant=() if configs[0].image_gradients else tuple(env.image_formats()))
+    constant = () if configs[0].image_gradients else tuple(env.image_formats())
+    act_fn = partial(act, constant=constant)
     # On several devices each has a copy of the policy for its worlds. They sum the gradients of the copies once, after
     # all steps; with a single policy they would sum its gradients in every step.
     n_copies = 1 if mesh is None or are_seeds_divided(n_seeds, mesh) else mesh.size
@@ -238,7 +239,8 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
             env, initial_state, act_fn, record, seeds, copy(agents.key), configs[0].n_steps, initial_memory
         )
         records = jax.tree.map(lambda x: x.reshape(x.shape[0], n_seeds, -1, *x.shape[3:]), records)
-        errors, last_obs = split_blocks((state.info["error"], critic_obs(state.obs, configs[0].critic)), n_seeds)
+        last_obs = critic_obs(hold(state.obs, constant), configs[0].critic)
+        errors, last_obs = split_blocks((state.info["error"], last_obs), n_seeds)
         args = agents, config, records, errors, last_obs, iterations
         losses, metrics = for_each_seed(compute_loss, *args, axes=(0, 0, 1, 0, 0, 0))
         return losses.sum(), (losses, metrics, state, memory, records, last_obs)
@@ -251,12 +253,17 @@ def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Le
     return Learner(agents, state, memory, learner.iteration + 1), metrics | update_metrics
 
 
+def hold(obs: Obs, names: Collection[str]) -> Obs:
+    """Return observations of which those with these names have no derivative."""
+    return {name: jax.lax.stop_gradient(x) if name in names else x for name, x in obs.items()}
+
+
 def act(
     policy: Policy, config: Config, obs: Obs, memory: Any, key: Array, constant: Collection[str] = ()
 ) -> tuple[Array, Any, Array]:
     """Return the action of the policy; the observations are kept for the statistics and the value function."""
     del key
-    obs = {name: jax.lax.stop_gradient(x) if name in constant else x for name, x in obs.items()}
+    obs = hold(obs, constant)
     return *policy.act(policy_obs(obs, config.critic), memory), critic_obs(obs, config.critic)
 
 
@@ -285,7 +292,7 @@ def compute_loss(
 def learn(
     agent: Agent, config: Config, loss: Array, grads: Any, records: Any, last_obs: Array, iteration: Array
 ) -> tuple[Agent, dict[str, Array]]:
-    """Update the agent, or keep its weights and its optimiser state if the gradient is not finite."""
+    """Update the agent, or keep the policy and its optimiser's state if its gradient is not finite."""
     grad_norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
     transform = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations)
     updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)

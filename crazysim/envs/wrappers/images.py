@@ -55,7 +55,7 @@ class CameraImages(Wrapper):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of an image by the name of its observation: (height, width), and 3 for normals and colours."""
+        """Shapes by the name of the observation: (height, width), and 3 for normals and colours, 2 for flow."""
         return {name: self.camera.image_size + OUTPUTS[output].shape for output, name in self.names.items()}
 
     def describe_images(self) -> dict[str, dict[str, Any]]:

@@ -88,7 +88,8 @@ class TimeTrial(Race):
     seconds: float = 30.0
     """Length of an episode, s."""
     margin: float = setting(default=0.1, low=0.0)
-    """Distance that the plan keeps from the edges of the gates, and the drone from the floor, m."""
+    """Distance that the plan keeps from the edges of the gates, and the drone from the floor unless the start or a gate
+    is lower, m."""
     width: float = setting(default=1.0, positive=True)
     """Largest distance from the plan, m."""
     slack: float = setting(default=0.05, low=0.0)

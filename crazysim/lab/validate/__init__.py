@@ -37,8 +37,6 @@ def validate(
         f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it.",
     )
     source = None if policy is None else Path(policy)
-    if source is not None and not sees_forest(source):
-        (load_pilot if "sight" in only and "any" not in only else load_network)(
-            source
-        )  # wrong files are refused before the work
+    if source is not None:  # wrong files are refused before the work
+        (load_pilot if "sight" in only and (sees_forest(source) or "any" not in only) else load_network)(source)
     return measure_sections([section for section in sections(folder, source) if section.name in only])

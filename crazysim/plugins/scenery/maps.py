@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from crazysim.core.data import SimData, require_data
 from crazysim.core.plugin import Plugin, Simulation, state
 from crazysim.core.random import uniform, world_key
 from crazysim.core.settings import as_mask, setting
+from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.errors import expect, require
 from crazysim.geometry import Shape
@@ -105,9 +106,17 @@ class Maps(Plugin):
             data: Data of all worlds, one world, or one drone.
             pos: Points, world frame, m: (n_worlds, n, 3), without n_worlds in one world, or (3,) for one drone.
         """
+        return self._distance(pos, map_index_of(data))
+
+    @functools.cached_property
+    def _distance(self) -> Callable[[Array, Array], Array]:
         ball = CollisionGeom(Shape("sphere", (BALL_RADIUS,)), (0.0, 0.0, 0.0), None)
-        gap = map_distance([(ball, pos, None)], None, self.body, map_index_of(data))
-        return gap + BALL_RADIUS
+
+        @jit_eager_calls()
+        def distance(pos: Array, index: Array) -> Array:
+            return map_distance([(ball, pos, None)], None, self.body, index) + BALL_RADIUS
+
+        return distance
 
     def reset_episode(self, data: SimData) -> SimData:
         chosen = self.read(data).chosen

@@ -36,7 +36,7 @@ from crazysim.scene.depth import pixel_directions
 MIN_COSINE = 1e-3
 """Cosine of the largest angle to the axis under which a point has a place in the image."""
 MAX_EXPOSURE = 0.2
-"""Longest exposure and readout, s, within which a drone turns by less than half a turn."""
+"""Longest exposure and readout, s; poses within are extrapolated, which is meant for less than half a turn."""
 FIELD_MARGIN = 1.1
 """Largest squared tangent of this angle with a distorting lens, divided by that of the corners of the image."""
 

@@ -94,9 +94,10 @@ class ImageData(PyTree):
     """The last images of each output that were taken, newest first; empty without latency. (n_worlds, n_drones, n_rows,
     height, width), for normals and colours (n_worlds, n_drones, n_rows, height, width, 3), for flow (..., 2)"""
     drone_poses: dict[str, Array] = leaf("drone", 1)
-    """``pos`` and ``quat`` of the drones at the last image that was taken; empty without flow."""
+    """``pos``, m, (n_worlds, n_drones, 3), and ``quat``, xyzw, (..., 4), world frame, of the drones at the last image
+    that was taken, zero before; empty without flow."""
     object_poses: dict[str, Array] = leaf("world", 2)
-    """``pos`` and ``quat`` of the objects at the last image that was taken; empty without flow or objects."""
+    """The same of the objects, (n_worlds, 1, n_objects, 3 or 4); empty without flow or objects."""
 
 
 class ImageSensor(Plugin):
@@ -366,11 +367,10 @@ class ImageSensor(Plugin):
         def capture_images(record: ImageData) -> ImageData:
             before = {name: getattr(record, name) for name in ("drone_poses", "object_poses")}
             images, poses = capture(data, before)
-            # An episode has no image before its first one.
+            # An episode, and a sensor that was added in flight, have no image before their first one.
             for name in {*FLOWS} & {*images}:
-                images[name] = jnp.where(
-                    _over(steps < period, images[name]), jnp.zeros_like(images[name]), images[name]
-                )
+                has_before = jnp.any(before["drone_poses"]["quat"] != 0, axis=(1, 2))[:, None] & (steps >= period)
+                images[name] = jnp.where(_over(has_before, images[name]), images[name], jnp.zeros_like(images[name]))
             record = record.replace(**jax.tree.map(select_due, poses, before))
             if not record.transit:
                 return record.replace(images=jax.tree.map(select_due, images, record.images))
@@ -413,7 +413,7 @@ class ImageSensor(Plugin):
         return ImageData(images, device_array(np.full((shape[0], 1), -1), np.int32), transit, **poses)
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        period, latency = sim.data.core.freq // rate_in(self, sim.data.core.freq), self._latency_steps(sim.data)
+        period = sim.data.core.freq // rate_in(self, sim.data.core.freq)
         capture = self.capture_fn(sim)
 
         def update_record(data: SimData) -> SimData:
@@ -421,7 +421,7 @@ class ImageSensor(Plugin):
                 return self.write(data, self.update(capture, data, self.read(data), period))
 
             steps = data.core.steps
-            is_due = (steps % period == 0) | ((steps - latency) % period == 0)
+            is_due = (steps % period == 0) | ((steps - self._latency_steps(data)) % period == 0)
             return update(data) if period == 1 else jax.lax.cond(jnp.any(is_due), update, lambda data: data, data)
 
         stage = Stage(update_record, "batch", name=self.name, unfused_reason=UNFUSED_REASON)

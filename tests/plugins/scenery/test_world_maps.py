@@ -206,6 +206,24 @@ def test_a_recorded_flight_is_shown_with_its_maps():
     sim.data = maps.select(sim.data, INDEX)
 
 
+def replaced(specs):
+    sim = Sim()
+    sim.add(Maps(SPECS))
+    sim.remove("maps")
+    return sim.add(Maps(specs))
+
+
+def test_maps_return_and_calls_of_clearance_are_traced_once(monkeypatch):
+    maps, calls = replaced(SPECS), []
+    body = type(maps).body
+    monkeypatch.setattr(type(maps), "body", property(lambda self: calls.append(1) or body.func(self)))
+    sim, maps = all_maps()
+    fresh = Maps(SPECS)
+    for x in range(3):
+        fresh.clearance(sim.data, jnp.full((len(INDEX), 1, 3), 0.1 * x))
+    assert len(calls) == 1
+
+
 WRONG = [
     (lambda: Maps([]), "1 to"),
     (lambda: Maps(SPECS[0]), r"Maps\(\[spec"),
@@ -217,6 +235,7 @@ WRONG = [
     (lambda: all_maps()[1].select(all_maps()[0].data, [0, 1]), "index of shape"),
     (lambda: all_maps()[0].add(Maps(SPECS[:2]), "more"), "one list of maps"),
     (lambda: all_maps()[0].add(ContactResponse()), "objects="),
+    (lambda: replaced(SPECS[::-1]), "one list of maps"),
 ]
 
 

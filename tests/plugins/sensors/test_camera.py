@@ -62,6 +62,25 @@ def test_a_range_of_latency_is_drawn_in_every_world_and_episode():
         Camera(1, 1, latency=(0.06, 0.02))
 
 
+def test_law_10_an_image_arrives_after_the_latency_of_the_episode_whatever_other_worlds_drew():
+    """Images of 10 Hz in 100 steps/s, 0 to 9 steps late: image 10 is held from step 10 plus the latency on."""
+    arrivals = {}
+    for n in (1, 12):
+        sim = Sim(n, control="attitude", freq=100, rng_key=3)
+        camera = sim.add(Camera(1, 1, freq=10, latency=(0.0, 0.09)))
+        arrivals[n] = []
+        for _ in range(4):
+            sim.reset()
+            taken = []
+            for _ in range(20):
+                sim.step()
+                taken.append(np.asarray(camera.read(sim.data).taken_step)[0, 0])
+            arrivals[n].append(int(np.argmax(np.array(taken) == 10)))
+    assert arrivals[1] == arrivals[12]
+    assert all(10 <= step <= 19 for step in arrivals[1])
+    assert len(set(arrivals[1])) > 1
+
+
 def test_outputs_agree_with_rays_of_c_mujoco_in_the_frame_of_the_camera(flight):
     sim, camera, images_of_steps, _ = flight
     images, names = images_of_steps[-1], camera.segment_names(sim)

@@ -198,6 +198,17 @@ def test_images_of_a_flight_are_compared_with_the_image_before():
     assert valid[1].any()
 
 
+def test_a_camera_that_is_added_in_flight_has_no_image_before():
+    sim = Sim(1, control="attitude", freq=100, engine="interpret")
+    sim.step(20)
+    camera = sim.add(view())
+    sim.step()
+    assert not np.asarray(camera.read(sim.data).images["flow_valid"]).any()
+    assert not np.asarray(camera.read(sim.data).images["flow"]).any()
+    sim.step()
+    assert np.asarray(camera.read(sim.data).images["flow_valid"]).any()
+
+
 def test_flow_is_observed():
     env = CameraImages(make("avoid", 2, n_boxes=1, n_poles=3, engine="interpret"), view())
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(3))
