@@ -108,7 +108,7 @@ def require_screen(remedy: str) -> None:
 
 
 def parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
-    """Return the values of ``NAME=VALUE`` by name, as JSON or, if they are none, as text."""
+    """Return the values of ``NAME=VALUE`` by name, as JSON, as Python's True, False and None, or as text."""
     pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -116,7 +116,7 @@ def parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
         try:
             pairs[name] = json.loads(value)
         except ValueError:
-            pairs[name] = value
+            pairs[name] = {"True": True, "False": False, "None": None}.get(value, value)
     return pairs
 
 

@@ -263,7 +263,7 @@ def evaluate(options: argparse.Namespace) -> None:
         check_writable(options.plot, PICTURE_SUFFIXES)
     policy, config, env = _load(options)
     key = None if options.seed is None else jax.random.key(options.seed)
-    title = f"{config.title}, {options.worlds:,} starts ({env.task.criterion})"
+    title = ", ".join([config.title, *options.set, f"{options.worlds:,} starts ({env.task.criterion})"])
     if options.policies:
         for folder, metrics in zip(options.policies, evaluate_each(env, policy, key), strict=True):
             reward = metrics.pop("reward")

@@ -146,12 +146,12 @@ def make(
     task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     # Plugins, with ready-made ranges if they are requested.
     plugins = [*check_plugin_list("effects", effects), *check_plugin_list("sensors", sensors)]
-    if isinstance(randomize, float) and 0 < randomize < 1:
+    if isinstance(randomize, float) and 0 <= randomize < 1:
         plugins.append(Randomize.within(randomize))
     elif randomize is not None:
         expect(
             isinstance(randomize, str) and randomize in RANDOMIZATIONS,
-            f"randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, or a fraction between 0 and 1",
+            f"randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, or a fraction from 0 to 1",
             randomize,
             "Use effects=[Randomize(...)] for other ranges.",
         )

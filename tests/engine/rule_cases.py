@@ -200,6 +200,16 @@ def while_loops(g):
 
 
 @case
+def batches_of_while_loops(g):
+    def shrink(x):
+        return jax.lax.while_loop(
+            lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (x, 0)
+        )
+
+    return jnp.concatenate(jax.vmap(shrink)(g.x))
+
+
+@case
 def computed_indices(g):
     k = g.i[0]
     clipped = jnp.clip(k, 0, 5)

@@ -16,6 +16,7 @@ REFUSED_CASES = {
     "integers": "'and' on int32",
     "unsigned_integers": "'shift_left' on uint32",
     "while_loops": "until a condition fails",
+    "batches_of_while_loops": "until a condition fails",
     "uniform_loop": "until a condition fails",
 }
 UNCOMPARED_CASES = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}

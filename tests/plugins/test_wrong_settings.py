@@ -189,7 +189,7 @@ EFFECTS = [
     (lambda: randomized(Randomize(drag=(0.5, 1.5)), drone="bumblebee"), "Use sim.add(RotorAerodynamics"),
     (lambda: make("hover", effects=[Randomize(charge=(0.1, 0.5))]), "Use sim.add(Battery())"),
     (lambda: make("hover", randomize="crazyfly"), "got 'crazyfly'. Use effects="),
-    (lambda: make("hover", randomize=5.0), "a fraction between 0 and 1, got 5"),
+    (lambda: make("hover", randomize=5.0), "a fraction from 0 to 1, got 5"),
     (lambda: randomized(Randomize({"params.drag": 0.2})), "Near are params.drag_matrix"),
     (lambda: randomized(Randomize({"states.pos": 0.2})), "got 'states.pos', which is a state"),
     (lambda: randomized(Randomize({"core.steps": 0.2})), "which is a state, a whole number"),

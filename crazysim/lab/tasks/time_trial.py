@@ -27,6 +27,7 @@ from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tasks.goals import pick_entry
 from crazysim.envs.tasks.race import Race
 from crazysim.envs.tracks import Track, gates_of_track
+from crazysim.errors import expect
 from crazysim.lab.racing.flight import flight_of_plan
 from crazysim.lab.racing.time_optimal import plan_race
 from crazysim.sim.sim import Sim
@@ -235,6 +236,8 @@ class Reference:
         openings = [
             float(x.opening) - margin if x.is_ball else np.asarray(x.opening) * (1 - 2 * margin / x.size) for x in gates
         ]
+        half = min(float(np.min(x.size)) for x in gates) / 2
+        expect(margin < half, f"a margin below {half:g} m, half of the smallest opening", margin)
         inner = dataclasses.replace(track, openings=openings)
         plan = plan_race(inner, airframe, laps=laps, body_rate=MAX_BODY_RATES, floor=floor)
         flight = flight_of_plan(plan, track, laps)

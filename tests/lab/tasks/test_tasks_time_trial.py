@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import rotation
+from crazysim import ConfigError, rotation
 from crazysim.drones.body import body_shape
 from crazysim.envs import Track, make
 from crazysim.lab.tasks.time_trial import AHEAD, MISSED, START_PHASE, STEP, Reference
@@ -144,3 +144,8 @@ def test_a_plan_keeps_the_drone_above_the_floor():
 def test_a_track_may_end_where_it_starts():
     closed = dataclasses.replace(TRACK, finish=TRACK.start)
     assert make("time_trial", 1, track=closed, engine="interpret").task.course.n_gates == N_GATES
+
+
+def test_law_09_a_margin_that_leaves_no_opening_is_an_error():
+    with pytest.raises(ConfigError, match=r"a margin below 0\.3 m"):
+        make("time_trial", 1, track=TRACK, margin=0.31, engine="interpret")

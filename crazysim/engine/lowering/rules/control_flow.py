@@ -10,7 +10,7 @@ import numpy as np
 
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Element, constant, is_constant
-from crazysim.engine.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, expand_primitive
+from crazysim.engine.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, expand_primitive, jaxpr_as_fun
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
     ElementArray,
@@ -151,6 +151,10 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Elemen
 def _while(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[ElementArray]:
     params = eqn.params
     n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
+    if params["cond_jaxpr"].jaxpr.outvars[0].aval.shape:
+        # A batch of loops runs until the last one ends.
+        avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+        return ctx.lower(jax.make_jaxpr(functools.partial(_run_batch, params))(*avals), args)
     cond_consts, body_consts, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
     cond, body = ctx.make_inner(), ctx.make_inner()
     cond_args = [*cond_consts, *(_add_inputs(cond, x) for x in carry)]
@@ -158,6 +162,20 @@ def _while(ctx: Lowering, eqn: JaxprEqn, args: list[ElementArray]) -> list[Eleme
     body_args = [*body_consts, *(_add_inputs(body, x) for x in carry)]
     body_block = body.finish(body.lower(close_jaxpr(params["body_jaxpr"]), body_args))
     return _add_operation(ctx, "while", eqn, scalars(*carry), (cond_block, body_block))
+
+
+def _run_batch(params: dict[str, Any], *operands: Any) -> list[Any]:
+    n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
+    consts, carry = operands[: n_cond + n_body], operands[n_cond + n_body :]
+    test, body = (jaxpr_as_fun(close_jaxpr(params[name])) for name in ("cond_jaxpr", "body_jaxpr"))
+
+    def step(carry: Any) -> Any:
+        (runs,) = test(*consts[:n_cond], *carry)
+        new = body(*consts[n_cond:], *carry)
+        flags = [runs.reshape(runs.shape + (1,) * (x.ndim - runs.ndim)) for x in carry]
+        return tuple(jax.numpy.where(*x) for x in zip(flags, new, carry, strict=True))
+
+    return list(jax.lax.while_loop(lambda carry: test(*consts[:n_cond], *carry)[0].any(), step, carry))
 
 
 @rule("any_lane")
