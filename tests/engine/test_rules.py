@@ -54,7 +54,16 @@ def test_a_case_gives_the_results_of_jax(name, expected_by_case):
 @pytest.mark.parametrize("engine", COMPILED_ENGINES)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     """Run the cases whose operations run blocks or have several results; test_targets has all other operations."""
-    names = ["cond", "loops", "while_loops", "batches_of_while_loops", "uniform_loop", "nested_calls", "gradient", *RANDOM_CASES]
+    names = [
+        "cond",
+        "loops",
+        "while_loops",
+        "batches_of_while_loops",
+        "uniform_loop",
+        "nested_calls",
+        "gradient",
+        *RANDOM_CASES,
+    ]
 
     def run_all(g):
         return [case_function(name)(g) for name in names]
