@@ -18,6 +18,7 @@ from pictures import read_frames
 from crazysim import Sim, errors
 from crazysim.__main__ import EXTRAS, main
 from crazysim.commands import airframe, demo, demo_flight, info, replay, training
+from crazysim.commands.options import parse_pairs
 from crazysim.lab.commands import identify, live, show, validate
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
@@ -201,3 +202,8 @@ def test_the_extras_of_the_table_bring_their_packages():
     for package, extra in EXTRAS.items():
         needed = "viser" if package == "websockets" else package  # viser depends on it
         assert any(line.replace("-", "_").startswith(needed) for line in extras[extra]), package
+
+
+def test_values_of_settings_are_json_or_python_or_text():
+    values = parse_pairs(["a=True", "b=false", "c=None", "d=[1, 2.5]", "e=crazyflie", "f=x=y"])
+    assert values == {"a": True, "b": False, "c": None, "d": [1, 2.5], "e": "crazyflie", "f": "x=y"}
