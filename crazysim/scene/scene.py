@@ -407,8 +407,9 @@ class Scene:
     ) -> SplatFn:
         """Return ``splats(data, gaussians, mocap=None) -> SplatImage``, pure: images of Gaussian splats in all worlds.
 
-        The Gaussians are ``SplatScene.gaussians``. Images have gradients with respect to them and to the poses in
-        ``data``. Bodies of the scene are not drawn.
+        The Gaussians are ``SplatScene.gaussians``, or a list of them with one entry for each map of ``Maps``, of which
+        every world sees that of its map. Images have gradients with respect to them and to the poses in ``data``.
+        Bodies of the scene are not drawn.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones, or names or ids of cameras.

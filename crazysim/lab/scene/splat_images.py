@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib.util
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ from crazysim.lab.scene.splats import Gaussians, spherical_harmonics
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import CarriedCamera, camera_pose
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
-from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
+from crazysim.scene.object_poses import ListPlugins, map_index_of, moving_plugins, with_moved_objects
 from crazysim.tables import range_between, read_number, read_numbers
 
 MIN_DEPTH = 0.01
@@ -63,6 +64,8 @@ class SplatImage(PyTree):
 
 SplatFn = Callable[..., SplatImage]
 """``splats(data, gaussians, mocap=None) -> SplatImage``."""
+PADDING = {"log_scale": 0.0, "quat": 1.0, "logit_opacity": -np.inf}
+"""Values of Gaussians that are not drawn, which make scenes equally long; other values are zero."""
 
 
 def build_splat_fn(
@@ -89,8 +92,9 @@ def build_splat_fn(
     )
     batch_size = max(1, MAX_ALPHAS // (width * height * BLOCK_SIZE))
     bodies = [camera.body for camera in cameras]
+    n_maps = max((body.n_maps for body in model.objects), default=0)
 
-    def splats(data: SimData, gaussians: Gaussians, mocap: MocapPoses = None) -> SplatImage:
+    def splats(data: SimData, gaussians: Gaussians | Sequence[Gaussians], mocap: MocapPoses = None) -> SplatImage:
         require(
             data.states.pos.ndim != 1, "expected data of all worlds or of one world for images, got data of one drone"
         )
@@ -100,7 +104,16 @@ def build_splat_fn(
         pos, rot = (jnp.stack(x, axis=data.states.pos.ndim - 2) for x in zip(*poses, strict=True))
         leading = pos.shape[:-1]
         camera_poses = pos.reshape(-1, 3), rot.reshape(-1, 3, 3)
-        images = draw(gaussians, camera_poses, batch_size=batch_size)
+        scene_index = None
+        if not isinstance(gaussians, Gaussians):
+            require(
+                len(gaussians) == n_maps > 0,
+                f"expected Gaussians of one scene, or a list with those of each of {n_maps} maps, got a list of "
+                f"{len(gaussians)}. Add Maps with as many maps.",
+            )
+            index, gaussians = map_index_of(data), _stack_scenes(gaussians)
+            scene_index = jnp.broadcast_to(index, leading).reshape(-1)
+        images = draw(gaussians, camera_poses, scene_index, batch_size=batch_size)
         color, depth, coverage = (x.reshape(*leading, *x.shape[1:]) for x in images)
         return SplatImage(color, jnp.where(coverage < min_coverage, jnp.inf, depth), coverage)
 
@@ -139,6 +152,20 @@ def import_splax() -> ModuleType:
     return splax
 
 
+def _stack_scenes(scenes: Sequence[Gaussians]) -> Gaussians:
+    # Scenes as long as the longest, with spherical harmonics up to the highest degree, along a new first axis.
+    n, n_colors = (max(x.color.shape[k] for x in scenes) for k in (0, 1))
+
+    def padded(name: str, x: Array) -> Array:
+        more_colors = n_colors - x.shape[1] if name == "color" else 0
+        x = jnp.pad(x, ((0, 0), (0, more_colors), (0, 0))) if more_colors else x
+        widths = ((0, n - len(x)), *[(0, 0)] * (x.ndim - 1))
+        return jnp.pad(x, widths, constant_values=PADDING.get(name, 0.0))
+
+    names = [field.name for field in dataclasses.fields(Gaussians)]
+    return Gaussians(**{name: jnp.stack([padded(name, getattr(x, name)) for x in scenes]) for name in names})
+
+
 CameraPoses = tuple[Array, Array]
 """Positions of cameras, m (n, 3), and axes as columns, right, up and back (n, 3, 3)."""
 
@@ -147,6 +174,7 @@ def _draw_with_splax(
     splax: ModuleType,
     gaussians: Gaussians,
     camera_poses: CameraPoses,
+    scene_index: Array | None,
     focal: float,
     width: int,
     height: int,
@@ -159,9 +187,9 @@ def _draw_with_splax(
         gaussians.color, gaussians.logit_opacity,
     )  # fmt: skip
 
-    def draw(view: Array) -> tuple[Array, Array]:
+    def draw(view: Array, index: Array | None = None) -> tuple[Array, Array]:
         return splax.render(
-            *parameters,
+            *(parameters if index is None else [x[index] for x in parameters]),
             viewmat=view,
             background=jnp.asarray(background, jnp.float32),
             img_shape=(height, width),
@@ -170,7 +198,11 @@ def _draw_with_splax(
             render_depth=True,
         )
 
-    image, coverage = jax.vmap(draw)(view_matrices(*camera_poses))
+    views = view_matrices(*camera_poses)
+    if scene_index is None:
+        image, coverage = jax.vmap(draw)(views)
+    else:
+        image, coverage = jax.lax.map(lambda x: draw(*x), (views, scene_index))
     return jnp.clip(image[..., :3], 0.0, 1.0), image[..., 3], coverage
 
 
@@ -190,14 +222,19 @@ def view_matrices(pos: Array, rot: Array) -> Array:
 def _draw_with_jax(
     gaussians: Gaussians,
     camera_poses: CameraPoses,
+    scene_index: Array | None,
     focal: float,
     width: int,
     height: int,
     background: np.ndarray,
     batch_size: int,
 ) -> tuple[Array, Array, Array]:
-    draw = functools.partial(_draw_image, gaussians, focal=focal, width=width, height=height, background=background)
-    return jax.lax.map(draw, camera_poses, batch_size=min(batch_size, len(camera_poses[0])))
+    def draw(camera_pose: CameraPoses, index: Array | None) -> tuple[Array, Array, Array]:
+        scene = gaussians if index is None else jax.tree.map(lambda x: x[index], gaussians)
+        return _draw_image(scene, camera_pose, focal, width, height, background)
+
+    batch_size = min(batch_size, len(camera_poses[0]))
+    return jax.lax.map(lambda x: draw(*x), (camera_poses, scene_index), batch_size=batch_size)
 
 
 def _draw_image(

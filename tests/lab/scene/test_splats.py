@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from splat_files import make_splat, spot_alpha, write_splats
 
-from crazysim import Sim
+from crazysim import Maps, Sim
+from crazysim.errors import ConfigError
 from crazysim.lab.scene import splat_images
 from crazysim.lab.scene.splats import Gaussians, SplatScene
 
@@ -122,6 +123,24 @@ def test_law_07_splats_of_any_size_have_finite_images_and_gradients(sim):
         assert np.all(np.asarray(coverage) <= 1)
         for x in jax.tree.leaves((color, coverage, slopes)):
             assert np.isfinite(x).all(), log_scale
+
+
+def test_each_world_sees_the_splats_of_its_map(tmp_path):
+    """Scenes of other lengths and degrees: an image equals that of its scene alone, also in one world."""
+    scenes = [gaussians_of(write_splats(tmp_path / "a.ply", n=n, n_colors=k)) for n, k in ((40, 1), (70, 4), (5, 9))]
+    sim = Sim(n_worlds=4)
+    maps = sim.add(Maps([mujoco.MjSpec() for _ in scenes]))
+    data = maps.select(sim.data, [2, 0, 1, 0])
+    draw = jax.jit(sim.scene.splat_fn(width=12, height=8))
+    images = draw(data, scenes)
+    for k, worlds in enumerate(([1, 3], [2], [0])):
+        # Rounding only: the same Gaussians in the same order.
+        alone, chosen = (jax.tree.map(lambda x: x[np.array(worlds)], x) for x in (draw(data, scenes[k]), images))
+        assert alone.coverage.max() > 0.1
+        np.testing.assert_allclose(chosen.color, alone.color, atol=1e-5)
+        np.testing.assert_allclose(chosen.coverage, alone.coverage, atol=1e-5)
+    with pytest.raises(ConfigError, match="each of 3 maps, got a list of 2"):
+        draw(data, scenes[:2])
 
 
 def sim_camera(sim, world, drone):
