@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6794,
     "envs": 3768,
     "geometry": 940,
-    "lab": 17741,
+    "lab": 17764,
     "media": 1091,
     "plugins": 5072,
     "scene": 3155,
