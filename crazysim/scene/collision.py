@@ -112,6 +112,11 @@ class CollisionModel:
         return dataclasses.replace(self, mocap_bodies=(), mocap_ids=())
 
 
+def touches_drones(contype: int, conaffinity: int) -> bool:
+    """Return whether drones collide with a geom that has these bits."""
+    return bool(DRONE_BITS[0] & conaffinity or DRONE_BITS[1] & contype)
+
+
 def collision_model(
     model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,), maps: Sequence[str] = ()
 ) -> CollisionModel:
@@ -124,7 +129,7 @@ def collision_model(
     """
 
     def can_touch(geom: int) -> bool:
-        return bool(DRONE_BITS[0] & model.geom_conaffinity[geom] or DRONE_BITS[1] & model.geom_contype[geom])
+        return touches_drones(model.geom_contype[geom], model.geom_conaffinity[geom])
 
     def can_collide(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])

@@ -267,7 +267,10 @@ def build_depth_fn(
         # Position and axes of each view, as in ``Tables.camera_poses``. (..., n_views, 12)
         change = None
         if random_pose is not None:
-            require(data.states.pos.ndim == 3, "expected data of all worlds for random poses, got data of one world")
+            require(
+                data.states.pos.ndim == 3,
+                "expected data of all worlds for random poses, got data of one world. Call it outside of stages.",
+            )
             change = random_pose.draw(data, drone_camera.name)  # type: ignore[union-attr]
         if row_times is None:
             return views_at_once(data, change)
@@ -291,7 +294,10 @@ def build_depth_fn(
     def cast_in_worlds(data: SimData, kernels: RayKernels, before: SimData | None = None) -> Hits:
         poses = views(data)
         if data.states.pos.ndim == 2:
-            require(appearance is None, "expected data of all worlds for colours, got data of one world")
+            require(
+                appearance is None,
+                "expected data of all worlds for colours, got data of one world. Call it outside of stages.",
+            )
             hits = cast_rays(model_without_mocap, data, *rays_of(poses), ignored_drones, drones)
         else:
             hits = cast_rays_in_worlds(

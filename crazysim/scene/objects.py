@@ -20,7 +20,7 @@ from crazysim.core.settings import as_mask, positive_integer
 from crazysim.eager import jit_eager_calls
 from crazysim.engine.pytree import device_array, select_worlds
 from crazysim.errors import ConfigError, UnknownNameError, expect, require, short_repr
-from crazysim.scene.collision import DRONE_BITS
+from crazysim.scene.collision import touches_drones
 from crazysim.scene.primitives import DRONE_TOUCH_BITS, PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000
@@ -233,8 +233,8 @@ class SceneObjects:
             )
             for geom in body.find_all("geom"):
                 # MJX would check all pairs of geoms of two maps.
-                touches_drones = DRONE_BITS[0] & geom.conaffinity or DRONE_BITS[1] & geom.contype
-                geom.contype, geom.conaffinity = 0, DRONE_TOUCH_BITS["conaffinity"] if touches_drones else 0
+                bits = DRONE_TOUCH_BITS if touches_drones(geom.contype, geom.conaffinity) else {"conaffinity": 0}
+                geom.contype, geom.conaffinity = 0, bits["conaffinity"]
         self.maps = handle.bodies
 
     def repeated(self, n: int) -> SceneObjects:

@@ -149,9 +149,11 @@ def check_policy(policy: Any, env: Env) -> None:
         interface.require(other, "an environment")
 
 
-def at_any_rate(policy: Any) -> Any:
-    """Return a trained policy that may also act at another rate than in its training."""
-    return policy.replace(interface=dataclasses.replace(policy.interface, freq=None))
+def with_settings(policy: Any, settings: Mapping[str, Any]) -> Any:
+    """Return a trained policy that may act at another rate than in its training if the settings of ``make`` have one."""
+    return (
+        policy if "freq" not in settings else policy.replace(interface=dataclasses.replace(policy.interface, freq=None))
+    )
 
 
 def check_callable(policy: Any, env: Env) -> None:

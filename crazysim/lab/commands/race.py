@@ -145,7 +145,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     from crazysim.envs.tasks.race import Race
     from crazysim.lab.racing.flight import flight_of_policy
     from crazysim.plugins.effects.battery import Battery
-    from crazysim.train.interface import at_any_rate, check_policy
+    from crazysim.train.interface import check_policy, with_settings
     from crazysim.train.training import load_policy
 
     given = [
@@ -156,7 +156,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
     policy, config, _ = load_policy(options.policy)
     settings = parse_pairs(options.set or ())
-    policy = at_any_rate(policy) if "freq" in settings else policy
+    policy = with_settings(policy, settings)
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
     course |= {} if options.penalty is None else {"penalty": options.penalty}
     effects = [] if options.battery is None else [Battery(charge=options.battery)]

@@ -231,13 +231,17 @@ def plot(flight: RaceFlight, path: str | Path) -> None:
     )
     dots = above.scatter(flight.pos[:, 0], flight.pos[:, 1], c=speed, s=6)
     figure.colorbar(dots, ax=above, label="speed, m/s")
-    for gate in gates_of_track(flight.track):
+    for number, gate in enumerate(gates_of_track(flight.track), start=1):
+        above.annotate(str(number), gate.pos[:2], xytext=(4, 4), textcoords="offset points")
         if gate.is_ball:
             above.add_patch(plt.Circle((gate.pos[0], gate.pos[1]), float(gate.opening), fill=False))
             continue
         for x in {-gate.length / 2, gate.length / 2}:
             corners = gate.pos + np.insert(np.asarray(gate.frame), 0, x, axis=-1) @ gate.rot.T
             above.plot(*corners[[*range(len(corners)), 0], :2].T, color="black")
+    for k, marker, label in ((0, "^", "start"), (-1, "s", "end")):
+        above.plot(*flight.pos[k, :2], marker, color="red", label=label)
+    above.legend()
     above.set(xlabel="x, m", ylabel="y, m")
     above.set_aspect("equal", adjustable="datalim")
     passes = np.asarray(flight.clock.times)

@@ -144,7 +144,8 @@ class ImageSensor(Plugin):
             )
         require(
             bool(np.all(np.diff(np.atleast_1d(self.latency)) >= 0)),
-            f"expected a range of latency of {self.name!r}, the shortest first, got {self.latency!r}.",
+            f"expected a range of latency of {self.name!r}, the shortest first, got {self.latency!r}. Use "
+            f"latency=(0.02, 0.06), for example.",
         )
 
     @property
