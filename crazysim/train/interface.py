@@ -150,10 +150,9 @@ def check_policy(policy: Any, env: Env) -> None:
 
 
 def with_settings(policy: Any, settings: Mapping[str, Any]) -> Any:
-    """Return a trained policy that may act at another rate than in its training if the settings of ``make`` have one."""
-    return (
-        policy if "freq" not in settings else policy.replace(interface=dataclasses.replace(policy.interface, freq=None))
-    )
+    """Return a trained policy that may also act at another rate if the settings of ``make`` have one."""
+    interface = dataclasses.replace(policy.interface, freq=None) if "freq" in settings else policy.interface
+    return policy.replace(interface=interface)
 
 
 def check_callable(policy: Any, env: Env) -> None:

@@ -232,7 +232,7 @@ def plot(flight: RaceFlight, path: str | Path) -> None:
     dots = above.scatter(flight.pos[:, 0], flight.pos[:, 1], c=speed, s=6)
     figure.colorbar(dots, ax=above, label="speed, m/s")
     for number, gate in enumerate(gates_of_track(flight.track), start=1):
-        above.annotate(str(number), gate.pos[:2], xytext=(4, 4), textcoords="offset points")
+        above.annotate(str(number), gate.pos[:2], xytext=(4, 4 if number % 2 else -12), textcoords="offset points")
         if gate.is_ball:
             above.add_patch(plt.Circle((gate.pos[0], gate.pos[1]), float(gate.opening), fill=False))
             continue
