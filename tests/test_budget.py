@@ -19,12 +19,12 @@ BUDGET = {
     "engine": 6794,
     "envs": 3768,
     "geometry": 940,
-    "lab": 17764,
+    "lab": 17768,
     "media": 1091,
     "plugins": 5072,
-    "scene": 3155,
+    "scene": 3157,
     "sim": 914,
-    "train": 2713,
+    "train": 2714,
     "trajectories": 497,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
