@@ -31,8 +31,8 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     """Cast rays at a shape; return the distance to its surface, and its outward normal at the hit.
 
     The conventions follow MuJoCo's ``mj_ray``: a ray from inside a solid hits the surface where it leaves, and
-    the normal still points outward; a plane is hit only from above; a height field is also hit at z = 0, where the box
-    below its surface ends.
+    the normal still points outward; a plane or rectangle is hit only from above; a height field is also hit at z = 0,
+    where the box below its surface ends.
 
     Args:
         origin: Origin of each ray, in the frame of the shape, m. (..., 3)
@@ -60,9 +60,11 @@ def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Comp
         origin: Components of the origins of rays, in the frame of the shape, m. (...) each
         direction: Components of the unit directions of rays, in the frame of the shape. (...) each
     """
-    if shape.kind != "plane":
+    if shape.kind not in ("plane", "rectangle"):
         return first_distance(LINE_INTERVALS[shape.kind](shape, origin, direction))
     t, is_hit = _plane_distance(origin, direction)
+    for o, d, half in zip(origin, direction, shape.size, strict=False):
+        is_hit &= jnp.abs(o + t * d) <= half
     return first_distance((t, t, is_hit))
 
 
@@ -248,6 +250,7 @@ def _mesh_normal(shape: Shape, point: Array) -> Array:
 
 SURFACE_NORMALS = {
     "plane": _plane_normal,
+    "rectangle": _plane_normal,
     "sphere": _sphere_normal,
     "capsule": _capsule_normal,
     "box": _box_normal,

@@ -12,7 +12,8 @@ from crazysim.arguments import check_arguments
 from crazysim.errors import ConfigError, require
 from crazysim.tables import MAX_NUMBER, read_floats
 
-N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
+N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4,
+           "rectangle": 2}  # fmt: skip
 """Number of entries of ``Shape.size`` for each kind."""
 MAX_HULL_VERTICES = 64
 """Largest number of vertices for which ``hull`` computes the convex hull; it tries every triangle."""
@@ -27,6 +28,7 @@ class Shape:
     Sizes follow MuJoCo, half lengths in m:
 
     - ``plane``: none; the half space below z = 0.
+    - ``rectangle``: half lengths along x and y, of a part of the plane z = 0, for rays only.
     - ``sphere``: radius.
     - ``capsule``, ``cylinder``: radius, half length along the axis z, which excludes the caps of a capsule.
     - ``box``: half lengths along x, y and z.
@@ -166,6 +168,8 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
             return (low + high) / 2, (high - low) / 2
         case "plane":
             half = [UNBOUNDED_LENGTH] * 3
+        case "rectangle":
+            half = [*size, 0.0]
         case "sphere":
             half = [size[0]] * 3
         case "capsule":

@@ -25,7 +25,7 @@ AMBIENT_WITHOUT_LIGHTS = 0.3
 """MuJoCo's ambient light in scenes without lights."""
 SKY_RADIUS = 0.7
 """Distance at which MuJoCo draws the sky, divided by ``zfar``."""
-TEXTURED_KINDS = ("plane", "box", "hfield", "mesh")
+TEXTURED_KINDS = ("plane", "rectangle", "box", "hfield", "mesh")
 """Kinds of geoms on which textures are drawn; round ones, and meshes with coordinates, have the mean colour."""
 
 

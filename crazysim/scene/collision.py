@@ -13,6 +13,7 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, hfield, hull
+from crazysim.geometry.shapes import UNBOUNDED_LENGTH
 
 GEOM_KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
          ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")}  # fmt: skip
@@ -134,13 +135,15 @@ def collision_model(
     def can_collide(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _build_model(model, handles, drone_groups, maps, can_touch, can_collide)
+    return _build_model(model, handles, drone_groups, maps, can_touch, can_collide, _read_shape)
 
 
 def visual_model(
     model: mujoco.MjModel, handles: Sequence[str], drone_groups: DroneGroups = (None,), maps: Sequence[str] = ()
 ) -> CollisionModel:
     """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
+
+    Planes are as large as they are drawn, as for MuJoCo's rays; drones touch their infinite extension.
 
     For the arguments see ``collision_model``.
     """
@@ -150,7 +153,13 @@ def visual_model(
         alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
         return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= MIN_ALPHA
 
-    return _build_model(model, handles, drone_groups, maps, is_seen, is_seen)
+    def read_shape(model: mujoco.MjModel, geom: int) -> Shape:
+        shape, size = _read_shape(model, geom), model.geom_size[geom, :2]
+        if shape.kind != "plane" or not size.any():
+            return shape
+        return Shape("rectangle", tuple(float(x) if x > 0 else UNBOUNDED_LENGTH for x in size))
+
+    return _build_model(model, handles, drone_groups, maps, is_seen, is_seen, read_shape)
 
 
 def _build_model(
@@ -160,9 +169,11 @@ def _build_model(
     maps: Sequence[str],
     is_included: Callable[[int], bool],
     is_drone_geom: Callable[[int], bool],
+    read_shape: Callable[[mujoco.MjModel, int], Shape],
 ) -> CollisionModel:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    read_geom = functools.partial(_read_geom, model, data, read_shape)
     # Geoms by their carrier: floor, drones, other bodies.
     floor = []
     drone_geoms: dict[str, list[CollisionGeom]] = {f"drone:{group[0] if group else 0}": [] for group in drone_groups}
@@ -172,7 +183,7 @@ def _build_model(
         name = body_name(model, root)
         if name.startswith("drone:"):
             if name in drone_geoms and is_drone_geom(geom):
-                drone_geoms[name].append(_read_geom(model, data, geom, root))
+                drone_geoms[name].append(read_geom(geom, root))
             continue
         if not is_included(geom):
             continue
@@ -183,7 +194,7 @@ def _build_model(
                 f"{int(model.geom_type[geom])}. Give it contype='0' conaffinity='0', or another type."
             )
         if root == 0 and kind in ("plane", "hfield"):
-            floor.append(_read_geom(model, data, geom, None))
+            floor.append(read_geom(geom, None))
         else:
             geoms_by_root.setdefault(root, []).append(geom)
     # Rows of movable bodies: first those with handles.
@@ -200,7 +211,7 @@ def _build_model(
     objects, map_geoms, map_indices = [], [], []
     for root, geoms in geoms_by_root.items():
         if body_name(model, root) in maps:
-            map_geoms += [_read_geom(model, data, geom, None) for geom in geoms]
+            map_geoms += [read_geom(geom, None) for geom in geoms]
             map_indices += [maps.index(body_name(model, root))] * len(geoms)
             continue
         row = rows.get(body_name(model, root))
@@ -209,7 +220,7 @@ def _build_model(
             CollisionBody(
                 body_name(model, root),
                 row,
-                tuple(_read_geom(model, data, geom, frame) for geom in geoms),
+                tuple(read_geom(geom, frame) for geom in geoms),
                 tuple(map(float, data.xpos[root])),
             )
         )
@@ -227,7 +238,13 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
     return model.body(body).name or f"body {body}"
 
 
-def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
+def _read_geom(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    read_shape: Callable[[mujoco.MjModel, int], Shape],
+    geom: int,
+    body: int | None,
+) -> CollisionGeom:
     pos, rot = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     if body is not None:
         to_body = data.xmat[body].reshape(3, 3).T
@@ -236,7 +253,7 @@ def _read_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int 
     # The compiler stores attitudes as quaternions; their rounding would rotate axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
-    return CollisionGeom(_read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name, geom)  # type: ignore[arg-type]
+    return CollisionGeom(read_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name, geom)  # type: ignore[arg-type]
 
 
 def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:

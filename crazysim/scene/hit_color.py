@@ -222,7 +222,7 @@ def _normal_and_texture(
     # or a plane, once; of infinite planes, terrain and meshes it covers 2 m.
     normal = normal_in_frame(surface, row, origin, direction, distance)
     texture = [jnp.zeros_like(distance)] * 8
-    if surface in ("plane", "box") or isinstance(surface, Shape):
+    if surface in ("plane", "rectangle", "box") or isinstance(surface, Shape):
         point, half = [o + distance * d for o, d in zip(origin, direction, strict=True)], row[13:16]
         axes: list[list[Any]] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         if surface == "box":

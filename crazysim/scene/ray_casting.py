@@ -103,6 +103,8 @@ def raise_to_floor(model: CollisionModel, pos: Array) -> Array:
             gap, normal = field_gap(geom.shape, local_pos)
         else:
             gap, normal = local_pos[..., 2], jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], pos.dtype), pos.shape)
+            for k, half in enumerate(geom.shape.size):
+                gap = jnp.where(jnp.abs(local_pos[..., k]) <= half, gap, jnp.inf)
         rise = jnp.where((gap < 0) & (gap > -MAX_DEPTH_BELOW_FLOOR), FLOOR_CLEARANCE - gap, 0.0)
         pos = pos + rise[..., None] * _constant_product(rot, normal)
     return pos

@@ -49,7 +49,8 @@ def random_scene(rng, has_textures, has_shadows):
         materials += """<mesh name="wedge" vertex="0 0 0 .9 0 0 0 .8 0 0 0 .7"/>
             <hfield name="hill" nrow="3" ncol="3" elevation="0 0 0 0 1 0 0 0 0" size="1.5 1.5 .6 .1"/>"""
         geoms += """<geom type="mesh" mesh="wedge" pos="2 .8 1.2" quat=".5 .5 -.5 .6" material="tiles"/>
-            <geom type="hfield" hfield="hill" pos="4 -1 0" material="tiles"/>"""
+            <geom type="hfield" hfield="hill" pos="4 -1 0" material="tiles"/>
+            <geom type="plane" size=".9 .6 .1" pos="3 -1 2" euler="20 -70 10" material="tiles"/>"""
     floor = 'texture="checker" texrepeat="1 1" texuniform="true"' if has_textures else ""
     axes = 0.15 * rng.normal(size=(2, 3)) + [[0, -1, 0], [0.1, 0, 1]]
     return f"""<mujoco><statistic center="0 0 1" extent="3"/>

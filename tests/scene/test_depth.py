@@ -13,7 +13,7 @@ from cases import with_states
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.engine.backends import native
 from crazysim.errors import EngineWarning
-from crazysim.scene.ray_casting import MIN_COSINE
+from crazysim.scene.ray_casting import FLOOR_CLEARANCE, MIN_COSINE, raise_to_floor
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
 HIT_FIELDS = ("body_index", "distance", "normal", "point")
@@ -221,7 +221,8 @@ ALL_KINDS = """<mujoco><asset>
 <worldbody><geom type="sphere" size=".15" pos="0 0 .6"/><geom type="box" size=".1 .2 .3" euler="20 0 40" pos=".6 0 0"/>
 <geom type="capsule" size=".1 .3" pos="-.5 .1 .2"/><geom type="cylinder" size=".12 .2" euler="0 30 0" pos="0 .6 .1"/>
 <geom type="ellipsoid" size=".1 .2 .3" pos="0 -.6 .1"/><geom type="mesh" mesh="wedge" pos="-.2 -.2 -.5"/>
-<geom type="hfield" hfield="hill" pos=".2 .2 -.6"/></worldbody></mujoco>"""
+<geom type="hfield" hfield="hill" pos=".2 .2 -.6"/>
+<geom type="plane" size=".4 .3 .1" pos=".5 .3 .9" euler="160 10 0" contype="0" conaffinity="0"/></worldbody></mujoco>"""
 
 
 @pytest.fixture(scope="module")
@@ -350,6 +351,15 @@ def test_rays_hit_geoms_of_every_kind_where_rays_of_c_mujoco_do(mixed_scene, rng
     has_other_normal = np.abs(hits.normal[1] - normal)[is_comparable].max(axis=-1) > 1e-3
     assert has_other_normal.mean() < 2e-3
     assert len(np.unique(mj_model.geom_type[geoms[is_comparable]])) == 8
+
+
+def test_sensors_are_raised_to_a_finite_floor_where_it_is(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text('<mujoco><worldbody><geom type="plane" size="1 0 .1"/></worldbody></mujoco>')
+    model = Sim(xml_path=path).scene.visual_model
+    pos = jnp.array([[0.9, 50, -0.005], [1.1, 0, -0.005], [0.9, 0, -0.2]])
+    height = raise_to_floor(model, pos)[:, 2]  # to the rounding of the sum
+    np.testing.assert_allclose(height, [FLOOR_CLEARANCE, -0.005, -0.2], rtol=1e-6, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
