@@ -42,6 +42,7 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "default the recipe's teacher, if it has one, which is trained first"
     )
     add("--teacher", metavar="FOLDER", help=teacher_help)
+    add("--start", metavar="FOLDER", help="folder of a run from whose policy the training starts, of the same network")
     add("--seed", type=seed, help="random seed; by default 0")
     seeds_help = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
     add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds_help)
@@ -196,7 +197,7 @@ def _train(options: argparse.Namespace, devices: str | None = None) -> int | Non
         "n_worlds": options.worlds,
         "devices": options.devices or devices,
         "options": parse_pairs(options.set) | specified_options(options, "device"),
-        "config": parse_pairs(options.config) | specified_options(options, "iterations", "teacher"),
+        "config": parse_pairs(options.config) | specified_options(options, "iterations", "teacher", "start"),
     }
     if options.check:
         from crazysim.train.check import check_task

@@ -45,6 +45,7 @@ from crazysim.train.networks import (
     init_weights,
 )
 from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
+from crazysim.train.policies import load_start, start_from
 from crazysim.train.seeds import (
     Step,
     are_seeds_divided,
@@ -78,6 +79,9 @@ class Config:
     """Channels of the layers of a convolution over each image, as in PPO."""
     image_gradients: bool = True
     """Whether the gradient passes through images, as it does through other observations, or takes them as constants."""
+    start: str = ""
+    """Folder of a run, of any algorithm, from whose policy the training starts; empty for a new policy. It must have
+    the same network and observations."""
     critic_epochs: int = 0
     """Passes over the samples of a rollout by which a value function learns the return after the horizon; 0 for none.
     The policy then also learns from ends of episodes, which have no gradient themselves."""
@@ -182,7 +186,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
     state = env.reset(k_env)
     check_factors(config, state)
     obs = policy_obs(state.obs, config.critic)
-    images = images_of(env, obs) if config.convolution else ()
+    images, start = images_of(env, obs) if config.convolution else (), load_start(config.start, env, obs)
     network = choose_network(config.memory, None, config.convolution, images, config.shape)
     critic_network = choose_network(0, None, config.convolution, images)
     hidden = config.hidden if network.is_built_in else ()
@@ -190,6 +194,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
 
     def init_agent(k_policy: Array, key: Array, raw_obs: Array) -> Agent:
         policy: Any = init_weights(network, k_policy, n_obs, (*hidden, env.actions.size), 0.01)
+        stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
+        policy, stats = start_from(start, policy, stats)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations).init(policy)
         value, value_optimizer = (), ()
         if config.critic_epochs:
@@ -197,7 +203,6 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
             sizes = (*config.hidden, 1)
             value: Any = init_weights(critic_network, jax.random.fold_in(k_policy, 2), n_inputs, sizes, 1.0)
             value_optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(value)
-        stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
         networks = network, critic_network
         return Agent(policy, optimizer, stats, returns, key, value, value_optimizer, n_obs, *networks)
 

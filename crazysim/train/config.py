@@ -282,7 +282,8 @@ class TrainConfig:
         for name, value in (("options", options), ("config", config)):
             expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
-        if recipe.algorithm == "ppo" and hasattr(entry.task, "demonstrate") and "demonstrations" not in config:
+        learns_first = hasattr(entry.task, "demonstrate") or config.get("start")
+        if recipe.algorithm == "ppo" and learns_first and "demonstrations" not in config:
             config["demonstrations"] = min(DEMONSTRATIONS, int(config.get("iterations", ppo.Config.iterations)) // 2)
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())

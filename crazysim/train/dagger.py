@@ -80,8 +80,6 @@ class Config:
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
-        if self.teacher:  # so that the run can be resumed from any folder
-            object.__setattr__(self, "teacher", str(Path(self.teacher).resolve()))
 
     @property
     def n_updates(self) -> int:

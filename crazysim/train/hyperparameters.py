@@ -55,6 +55,7 @@ def check_hyperparameters(config: Any) -> None:
             value = _check_choice(field.name, value, CHOICES_BY_NAME[field.name])
         elif isinstance(default, str):
             value = _check_text(field.name, value)
+            value = str(Path(value).resolve()) if value else ""  # so that the run can be resumed from any folder
         elif isinstance(default, bool):
             value = check_flag(field.name, value)
         elif isinstance(default, int):

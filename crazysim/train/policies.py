@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -13,9 +15,10 @@ from jax.typing import ArrayLike
 from crazysim.engine.pytree import PyTree, static
 from crazysim.envs.env import Env
 from crazysim.envs.state import Obs
+from crazysim.envs.statistics import RunningStats
 from crazysim.errors import expect, require
-from crazysim.train.interface import Interface
-from crazysim.train.networks import Policies, Policy
+from crazysim.train.interface import Interface, describe_env, sizes_of
+from crazysim.train.networks import Policies, Policy, Weights
 
 
 class _FunctionPolicy(PyTree):
@@ -26,6 +29,41 @@ class _FunctionPolicy(PyTree):
 
     def __call__(self, obs: Obs) -> Array:
         return self.fn(obs)
+
+
+def load_start(folder: str, env: Env, obs: Obs) -> Policy | None:
+    """Return the policy of a run from which a training with these observations starts; None without a run."""
+    from crazysim.train.training import load_policy
+
+    if not folder:
+        return None
+    policy = load_policy(folder)[0]
+    interface = Interface.read(describe_env(env, sizes_of(obs)))
+    policy.interface.require(dataclasses.replace(interface, freq=None, task=None, task_code=None), "a training")
+    return policy
+
+
+def start_from(policy: Policy | None, weights: Weights, stats: RunningStats) -> tuple[Weights, RunningStats]:
+    """Return weights and statistics of observations with which a training starts.
+
+    Args:
+        policy: From ``load_start``.
+        weights: Untrained weights.
+        stats: Statistics at the start of the training; the policy's observations come first.
+    """
+    if policy is None:
+        return weights, stats
+    start = Weights(policy.layers, policy.body)
+    got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (start, weights))
+    require(
+        got == expected,
+        f"expected start= as a run with the same network, of weights {expected}, got {got}. Use its hidden, memory, "
+        f"shape and convolution.",
+    )
+    n = len(policy.stats.mean)
+    count = policy.stats.count if n == len(stats.mean) else stats.count
+    mean, var = stats.mean.at[:n].set(policy.stats.mean), stats.var.at[:n].set(policy.stats.var)
+    return start, stats.replace(mean=mean, var=var, count=count)
 
 
 class MultiPolicy(PyTree):

@@ -47,7 +47,7 @@ from crazysim.train.networks import (
     unroll,
 )
 from crazysim.train.optimizer import all_finite, build_optimizer, check_minibatches, run_epochs
-from crazysim.train.policies import MultiPolicy, known_obs
+from crazysim.train.policies import MultiPolicy, known_obs, load_start, start_from
 from crazysim.train.seeds import Step, for_each_seed, rollout_seeds, split_blocks, split_keys, stack_configs
 
 LEAST_STD = 0.1
@@ -100,7 +100,10 @@ class Config:
     """Initial standard deviation of the actions."""
     demonstrations: int = 0
     """Iterations at the start in which the policy learns the actions of the task's ``demonstrate`` where it flies
-    itself, and the value function its returns."""
+    itself, and the value function its returns. With ``start`` the policy stays as it is meanwhile."""
+    start: str = ""
+    """Folder of a run, of any algorithm, from whose policy the training starts; empty for a new policy. It must have
+    the same network and observations."""
     opponents: int = 0
     """Drones of each world, its last ones, that earlier versions of the policy or ``rivals`` fly; the policy learns
     from the others. Each version and each rival flies in an equal share of the worlds. 0 if it flies all drones."""
@@ -221,14 +224,14 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     """
     config = configs[0]
     check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
-    if config.demonstrations:
+    if config.demonstrations and not config.start:
         check_demonstration(env)
     rivals = load_opponents(env, config, env.sim.n_worlds // len(configs)) if config.opponents else ()
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
     state, hidden = env.reset(k_env), config.hidden if network is None else ()
     check_factors(config, state)
     obs = policy_obs(state.obs, config.critic)
-    images = images_of(env, obs) if config.convolution else ()
+    images, start = images_of(env, obs) if config.convolution else (), load_start(config.start, env, obs)
     is_privileged = config.critic in PRIVILEGED_CRITICS and network is None
     critic_network = choose_network(0 if is_privileged else config.memory, network, config.convolution, images)
     network = choose_network(config.memory, network, config.convolution, images, config.shape)
@@ -240,12 +243,13 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
 
     def init_agent(k_policy: Array, k_value: Array, key: Array, raw_obs: Array) -> Agent:
         policy = init_weights(network, k_policy, n_obs, (*policy_hidden, n_actions), 0.01)
+        stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
         n_inputs = critic_input(raw_obs, config.critic).shape[-1]
         value = init_weights(critic_network, k_value, n_inputs, (*hidden, 1), 1.0)
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(parameters)
-        stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
+        policy, stats = start_from(start, policy, stats)
         networks = network, critic_network, apply_layers, apply_critic_layers
         agent = Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, *networks)
         if not config.opponents:
@@ -279,7 +283,7 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     key, k_fly, k_learn = split_keys(learner.agents.key, 3)
     agents, n_seeds = learner.agents.replace(key=key), len(learner.agents.key)
     initial_memory = _initial_memory(agents, learner.env)
-    show = env.task.demonstrate if config.demonstrations else None
+    show = env.task.demonstrate if config.demonstrations and not config.start else None
     # Fly the worlds of all seeds as one batch.
     state, memory, records = rollout_seeds(
         env,
@@ -409,8 +413,11 @@ def compute_loss(
         square = jnp.square(sample.shown - mean) + LEAST_STD**2
         likelihood = -(0.5 * square / jnp.exp(2 * log_std) + log_std).sum(axis=-1).mean()
         objective = jnp.where(imitates, likelihood, objective)
+    objective = objective + config.entropy * log_std.sum()
+    if config.start:
+        objective = jnp.where(imitates, 0.0, objective)
     value_loss = 0.5 * jnp.square(values - target).mean()
-    total_loss = -objective + config.value_weight * value_loss - config.entropy * log_std.sum()
+    total_loss = config.value_weight * value_loss - objective
     return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
 
 

@@ -231,6 +231,33 @@ def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path
     assert "nothing is left to train after 6 iterations; continue with more: --iterations 12" in lines
 
 
+@pytest.mark.long("compiles iterations of two algorithms")
+@pytest.mark.parametrize("algorithm", ["ppo", "apg"])
+def test_a_training_starts_from_the_policy_of_a_run(uninterrupted_run, algorithm):
+    """First the value function learns alone, then the policy, too; another network or airframe level is an error."""
+    folder, config = str(uninterrupted_run.folder), SMALL | {"demonstrations": 1, "entropy": 0.1}
+    config = config if algorithm == "ppo" else {"n_steps": 8, "hidden": (16, 16)}
+    module, policy = {"ppo": ppo, "apg": apg}[algorithm], uninterrupted_run.policy
+    env = make("hover", 4, seconds=0.4, engine="plain")
+    env = AutoReset(env) if algorithm == "ppo" else env
+    algorithm_config = (module.Config(**config, start=folder),)
+    learner = module.init(env, algorithm_config, jax.random.key(0)[None])
+    jax.tree.map(np.testing.assert_array_equal, take_seed(learner.as_policy(), 0).layers, policy.layers)
+    np.testing.assert_array_equal(take_seed(learner.as_policy(), 0).stats.var, policy.stats.var)
+    for stays in (True, False) if algorithm == "ppo" else (False,):
+        old, (learner, _) = learner.agents, module.iterate(learner, env, algorithm_config)
+        before, after = (jax.tree.leaves((x.policy, getattr(x, "log_std", 0))) for x in (old, learner.agents))
+        assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True)) == stays
+        assert not stays or not np.array_equal(old.value.layers[0][0], learner.agents.value.layers[0][0])
+    for wrong_env, changes, message in (
+        (env, {"hidden": (8,)}, "start= as a run with the same network"),
+        (make("hover", 4, control="body_rate"), {}, "body_rate commands in place of attitude"),
+        (make("track", 4), {}, "interface of the policy"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            module.init(wrong_env, (module.Config(**config | changes, start=folder),), jax.random.key(0)[None])
+
+
 def test_metrics_of_each_iteration_are_passed_on(uninterrupted_run, tmp_path, monkeypatch):
     """Metrics of evaluations are passed on too, also in interrupted and resumed runs. The run does not change."""
     recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
