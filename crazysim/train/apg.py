@@ -81,7 +81,7 @@ class Config:
     """Whether the gradient passes through images, as it does through other observations, or takes them as constants."""
     start: str = ""
     """Folder of a run, of any algorithm, from whose policy the training starts; empty for a new policy. It must have
-    the same network and observations."""
+    the same network; a dense one without memory may have fewer observations."""
     critic_epochs: int = 0
     """Passes over the samples of a rollout by which a value function learns the return after the horizon; 0 for none.
     The policy then also learns from ends of episodes, which have no gradient themselves."""

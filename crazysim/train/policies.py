@@ -31,39 +31,51 @@ class _FunctionPolicy(PyTree):
         return self.fn(obs)
 
 
-def load_start(folder: str, env: Env, obs: Obs) -> Policy | None:
-    """Return the policy of a run from which a training with these observations starts; None without a run."""
+def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray] | None:
+    """Return the policy of a run from which a training with these observations starts; None without a run.
+
+    Returns:
+        The policy, and the indices of its observations among those of the training. (n_obs,)
+    """
     from crazysim.train.training import load_policy
 
     if not folder:
         return None
-    policy = load_policy(folder)[0]
-    interface = Interface.read(describe_env(env, sizes_of(obs)))
-    policy.interface.require(dataclasses.replace(interface, freq=None, task=None, task_code=None), "a training")
-    return policy
+    policy, sizes = load_policy(folder)[0], sizes_of(obs)
+    known, interface = policy.interface.sizes, Interface.read(describe_env(env, sizes))
+    shared = tuple([x for x in interface.observations if x[0] in known])
+    changes = {"observations": shared, "freq": None, "task": None, "task_code": None}
+    policy.interface.require(dataclasses.replace(interface, **changes), "a training")
+    is_known = np.concatenate([np.full(size, name in known) for name, size in interface.observations])
+    return policy, np.flatnonzero(is_known)
 
 
-def start_from(policy: Policy | None, weights: Weights, stats: RunningStats) -> tuple[Weights, RunningStats]:
-    """Return weights and statistics of observations with which a training starts.
+def start_from(
+    start: tuple[Policy, np.ndarray] | None, weights: Weights, stats: RunningStats
+) -> tuple[Weights, RunningStats]:
+    """Return weights and statistics with which a training starts; observations that are new have no effect at first.
 
     Args:
-        policy: From ``load_start``.
+        start: From ``load_start``.
         weights: Untrained weights.
         stats: Statistics at the start of the training; the policy's observations come first.
     """
-    if policy is None:
+    if start is None:
         return weights, stats
-    start = Weights(policy.layers, policy.body)
-    got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (start, weights))
+    (policy, index), (rows, _) = start, weights.layers[0]
+    (weight, bias), *others = policy.layers
+    if not jax.tree.leaves(policy.body):
+        weight = jnp.zeros((len(rows), weight.shape[1]), weight.dtype).at[index].set(weight)
+    started = Weights([(weight, bias), *others], policy.body)
+    got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (started, weights))
     require(
         got == expected,
         f"expected start= as a run with the same network, of weights {expected}, got {got}. Use its hidden, memory, "
         f"shape and convolution.",
     )
-    n = len(policy.stats.mean)
-    count = policy.stats.count if n == len(stats.mean) else stats.count
-    mean, var = stats.mean.at[:n].set(policy.stats.mean), stats.var.at[:n].set(policy.stats.var)
-    return start, stats.replace(mean=mean, var=var, count=count)
+    stats = RunningStats.create(len(stats.mean), stats.unscaled).replace(count=policy.stats.count)
+    mean, var = stats.mean.at[index].set(policy.stats.mean), stats.var.at[index].set(policy.stats.var)
+    return started, stats.replace(mean=mean, var=var)
 
 
 class MultiPolicy(PyTree):

@@ -103,7 +103,7 @@ class Config:
     itself, and the value function its returns. With ``start`` the policy stays as it is meanwhile."""
     start: str = ""
     """Folder of a run, of any algorithm, from whose policy the training starts; empty for a new policy. It must have
-    the same network and observations."""
+    the same network; a dense one without memory may have fewer observations."""
     opponents: int = 0
     """Drones of each world, its last ones, that earlier versions of the policy or ``rivals`` fly; the policy learns
     from the others. Each version and each rival flies in an equal share of the worlds. 0 if it flies all drones."""

@@ -234,7 +234,7 @@ def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path
 @pytest.mark.long("compiles iterations of two algorithms")
 @pytest.mark.parametrize("algorithm", ["ppo", "apg"])
 def test_a_training_starts_from_the_policy_of_a_run(uninterrupted_run, algorithm):
-    """First the value function learns alone, then the policy, too; another network or airframe level is an error."""
+    """First the value function learns alone, then the policy, too; another network or command level is an error."""
     folder, config = str(uninterrupted_run.folder), SMALL | {"demonstrations": 1, "entropy": 0.1}
     config = config if algorithm == "ppo" else {"n_steps": 8, "hidden": (16, 16)}
     module, policy = {"ppo": ppo, "apg": apg}[algorithm], uninterrupted_run.policy
@@ -249,10 +249,16 @@ def test_a_training_starts_from_the_policy_of_a_run(uninterrupted_run, algorithm
         before, after = (jax.tree.leaves((x.policy, getattr(x, "log_std", 0))) for x in (old, learner.agents))
         assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True)) == stays
         assert not stays or not np.array_equal(old.value.layers[0][0], learner.agents.value.layers[0][0])
+    seeing = make("hover", 4, seconds=0.4, depth_image=(4, 3), engine="plain")
+    seeing = AutoReset(seeing) if algorithm == "ppo" else seeing
+    learner = module.init(seeing, algorithm_config, jax.random.key(0)[None])
+    obs = {name: x for name, x in learner.env.obs.items() if name != "depth"}
+    more = take_seed(learner.as_policy(), 0)(learner.env.obs)
+    np.testing.assert_allclose(more, policy(obs), atol=1e-6, err_msg="an image that is new has no effect yet")
     for wrong_env, changes, message in (
         (env, {"hidden": (8,)}, "start= as a run with the same network"),
         (make("hover", 4, control="body_rate"), {}, "body_rate commands in place of attitude"),
-        (make("track", 4), {}, "interface of the policy"),
+        (make("reach_vel", 4), {}, "interface of the policy"),
     ):
         with pytest.raises(ConfigError, match=message):
             module.init(wrong_env, (module.Config(**config | changes, start=folder),), jax.random.key(0)[None])
