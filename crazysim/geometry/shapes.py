@@ -49,6 +49,8 @@ class Shape:
     """Distinct unit outward normals of the planes of the hull. (n_planes, 3)"""
     offsets: np.ndarray | None = None
     """Distances of these planes from the origin along their normals, m. (n_planes,)"""
+    triangles: np.ndarray | None = None
+    """Triangles of a mesh with a texture that has coordinates: three corners, m, then u and v at each. (n, 15)"""
     heights: np.ndarray | None = None
     """Heights of a height field, rows along y and columns along x, m. (n_rows, n_columns)"""
 
@@ -79,7 +81,7 @@ class Shape:
         return values
 
     def _content(self) -> tuple[object, ...]:
-        arrays = (self.vertices, self.faces, self.normals, self.offsets, self.heights)
+        arrays = (self.vertices, self.faces, self.normals, self.offsets, self.triangles, self.heights)
         return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))
 
     def __eq__(self, other: object) -> bool:

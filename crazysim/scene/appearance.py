@@ -13,6 +13,7 @@ import numpy as np
 from crazysim.core.data import SimData
 from crazysim.core.random import episode_keys, uniform
 from crazysim.core.settings import check_settings, setting
+from crazysim.scene.collision import texture_of
 from crazysim.scene.first_hit import Target
 from crazysim.scene.hit_color import MAX_LEVELS, Light, Paint, View
 from crazysim.scene.visual_geoms import DEFAULT_COLOR
@@ -26,7 +27,7 @@ AMBIENT_WITHOUT_LIGHTS = 0.3
 SKY_RADIUS = 0.7
 """Distance at which MuJoCo draws the sky, divided by ``zfar``."""
 TEXTURED_KINDS = ("plane", "rectangle", "box", "hfield", "mesh")
-"""Kinds of geoms on which textures are drawn; round ones, and meshes with coordinates, have the mean colour."""
+"""Kinds of geoms on which textures are drawn; round ones have the mean colour."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,22 +147,22 @@ class Appearance:
             for texture in np.flatnonzero(model.tex_type == flat):
                 load(int(texture))
         for target, look, rows in zip(targets, looks, textures, strict=True):
-            geom, material, texture = target.geom.index, int(model.geom_matid[target.geom.index]), -1
+            geom, shape = target.geom.index, target.geom.shape
+            material, texture = int(model.geom_matid[geom]), texture_of(model, geom)
             rgba, shine, repeat, half = model.geom_rgba[geom], DEFAULT_SHINE, np.ones(2), model.geom_size[geom, :2]
             if material >= 0:
                 rgba = model.mat_rgba[material] if np.array_equal(rgba, DEFAULT_COLOR) else rgba
                 shine = model.mat_emission[material], model.mat_specular[material], model.mat_shininess[material]
-                texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
                 repeat = np.where(model.mat_texrepeat[material] > 0, model.mat_texrepeat[material], 1.0)
                 repeat = repeat * np.where(model.mat_texuniform[material] & (half > 0), half, 1.0)
-            kind, mesh = target.geom.shape.kind, int(model.geom_dataid[geom])
-            shift = 0.5 * (kind in ("hfield", "mesh") or (kind == "plane" and not half.all()))
-            if kind in ("hfield", "mesh"):
+            has_coordinates = shape.triangles is not None
+            if shape.kind in ("hfield", "mesh") and not has_coordinates:
                 repeat = repeat / half
-                kind = "coordinates" if kind == "mesh" and model.mesh_texcoordadr[mesh] >= 0 else kind
+            is_centred = shape.kind in ("hfield", "mesh") or (shape.kind == "plane" and not half.all())
+            shift = 0.5 * (is_centred and not has_coordinates)
             look[:] = *rgba[:3], *shine[:2], SHININESS_SCALE * shine[2], *repeat, shift
             is_flat = texture >= 0 and int(model.tex_type[texture]) == flat
-            if texture >= 0 and not (is_flat and kind in TEXTURED_KINDS):
+            if texture >= 0 and not (is_flat and shape.kind in TEXTURED_KINDS):
                 look[:3] *= _read_texture(model, texture).mean(axis=(0, 1))
             elif texture >= 0:
                 rows[:] = load(texture)

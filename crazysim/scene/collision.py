@@ -259,7 +259,8 @@ def _read_geom(
 def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
     kind, size = GEOM_KINDS[int(model.geom_type[geom])], model.geom_size[geom]
     if kind == "mesh":
-        return _read_hull(model, int(model.geom_dataid[geom]))
+        mesh = int(model.geom_dataid[geom])
+        return dataclasses.replace(_read_hull(model, mesh), triangles=_read_triangles(model, geom, mesh))
     if kind == "hfield":
         field = int(model.geom_dataid[geom])
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -267,6 +268,26 @@ def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
         heights = model.hfield_data[start : start + rows * columns].reshape(rows, columns)
         return hfield(heights * model.hfield_size[field][2], tuple(map(float, model.hfield_size[field])))
     return Shape(kind, tuple(map(float, size)))
+
+
+def _read_triangles(model: mujoco.MjModel, geom: int, mesh: int) -> np.ndarray | None:
+    texture, first_vertex, first_coordinate = (
+        texture_of(model, geom),
+        model.mesh_vertadr[mesh],
+        model.mesh_texcoordadr[mesh],
+    )
+    if texture < 0 or first_coordinate < 0 or int(model.tex_type[texture]) != int(mujoco.mjtTexture.mjTEXTURE_2D):
+        return None
+    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    corners = model.mesh_vert[first_vertex + model.mesh_face[faces]]
+    coordinates = model.mesh_texcoord[first_coordinate + model.mesh_facetexcoord[faces]]
+    return np.concatenate([x.reshape(len(x), -1) for x in (corners, coordinates)], axis=-1).astype(np.float64)
+
+
+def texture_of(model: mujoco.MjModel, geom: int) -> int:
+    """Return the index of the texture that colours a geom; -1 if it has none."""
+    material = int(model.geom_matid[geom])
+    return int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]) if material >= 0 else -1
 
 
 def _read_hull(model: mujoco.MjModel, mesh: int) -> Shape:

@@ -14,6 +14,7 @@ from jax import Array, lax
 from crazysim.core.branches import compute_where, table_rows
 from crazysim.geometry import Shape
 from crazysim.geometry.points import Components
+from crazysim.geometry.vector import Vector
 from crazysim.rotation import safe_sqrt
 from crazysim.scene.first_hit import (
     Ray,
@@ -26,6 +27,7 @@ from crazysim.scene.first_hit import (
     surface_at_hit,
     world_vector,
 )
+from crazysim.scene.mesh_texture import texture_coordinates
 
 MAX_LEVELS = 12
 """Largest number of images of a texture, each half as wide as the one before."""
@@ -219,11 +221,14 @@ def _normal_and_texture(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> tuple[Array, ...]:
     # World normal; position along both axes of the texture, each with its gradient. The texture covers a side of a box,
-    # or a plane, once; of infinite planes, terrain and meshes it covers 2 m.
+    # or a plane, once; of infinite planes, terrain and meshes without coordinates of their own it covers 2 m.
     normal = normal_in_frame(surface, row, origin, direction, distance)
     texture = [jnp.zeros_like(distance)] * 8
-    if surface in ("plane", "rectangle", "box") or isinstance(surface, Shape):
-        point, half = [o + distance * d for o, d in zip(origin, direction, strict=True)], row[13:16]
+    point, half = [o + distance * d for o, d in zip(origin, direction, strict=True)], row[13:16]
+    if isinstance(surface, Shape) and surface.triangles is not None:
+        coordinates = texture_coordinates(surface.triangles, Vector(*point))
+        texture = [x for start, rate in coordinates for x in (start, *world_vector(row, rate))]
+    elif surface in ("plane", "rectangle", "box") or isinstance(surface, Shape):
         axes: list[list[Any]] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         if surface == "box":
             is_x_side, is_z_side = jnp.abs(normal[0]) > 0.5, jnp.abs(normal[2]) > 0.5

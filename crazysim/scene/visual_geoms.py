@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.scene.collision import VISIBLE_GROUPS
+from crazysim.scene.collision import VISIBLE_GROUPS, texture_of
 
 GEOM_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 """Kinds of geoms, as named in MJCF."""
@@ -86,7 +86,7 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> NDArray:
     if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
         return model.geom_rgba[geom].astype(float)
     color = model.mat_rgba[material].astype(float)
-    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    texture = texture_of(model, geom)
     if texture >= 0:
         channels = int(model.tex_nchannel[texture])
         start, n = model.tex_adr[texture], model.tex_width[texture] * model.tex_height[texture] * channels

@@ -1,5 +1,7 @@
 """Colours of rays against the images of MuJoCo's renderer, in random scenes."""
 
+import itertools
+
 import jax
 import mujoco
 import numpy as np
@@ -28,6 +30,20 @@ def random_light(rng, has_shadows):
         attenuation="{text(1, rng.uniform(0, 0.2), rng.uniform(0, 0.05))}"/>"""
 
 
+def textured_box(rng):
+    """Return a mesh of MJCF in the shape of a box, whose sides have vertices and random coordinates of their own."""
+    sides = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    sides = np.concatenate([sides[sides[:, k] == side][[0, 1, 3, 2]] for k in range(3) for side in (-0.5, 0.5)])
+    faces = []
+    for k in range(0, 24, 4):
+        a, b, c = sides[k : k + 3]
+        order = [0, 1, 2, 0, 2, 3] if np.cross(b - a, c - a) @ a > 0 else [2, 1, 0, 3, 2, 0]
+        faces += [k + i for i in order]
+    corners = np.tile([[0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)) + rng.uniform(-0.1, 0.1, (24, 2))
+    return f"""<mesh name="carton" vertex="{text(sides.ravel())}" texcoord="{text(corners.ravel())}"
+        face="{" ".join(map(str, faces))}"/>"""
+
+
 def random_scene(rng, has_textures, has_shadows):
     """Return MJCF of 20 objects above a floor, with two lights and a camera.
 
@@ -48,7 +64,9 @@ def random_scene(rng, has_textures, has_shadows):
         materials += '<material name="tiles" texture="checker" texrepeat="4 3" texuniform="true"/>'
         materials += """<mesh name="wedge" vertex="0 0 0 .9 0 0 0 .8 0 0 0 .7"/>
             <hfield name="hill" nrow="3" ncol="3" elevation="0 0 0 0 1 0 0 0 0" size="1.5 1.5 .6 .1"/>"""
+        materials += textured_box(np.random.default_rng(7))
         geoms += """<geom type="mesh" mesh="wedge" pos="2 .8 1.2" quat=".5 .5 -.5 .6" material="tiles"/>
+            <geom type="mesh" mesh="carton" pos="1.5 -.3 2" quat=".5 .2 -.5 .6" material="tiles"/>
             <geom type="hfield" hfield="hill" pos="4 -1 0" material="tiles"/>
             <geom type="plane" size=".9 .6 .1" pos="3 -1 2" euler="20 -70 10" material="tiles"/>"""
     floor = 'texture="checker" texrepeat="1 1" texuniform="true"' if has_textures else ""
