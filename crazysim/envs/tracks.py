@@ -12,6 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.errors import ConfigError, require
+from crazysim.scene.primitives import PRIMITIVES
 
 CELL_SIZE = (1.0, 1.2)
 """Size of the cells of a random course, along x and y, m. The start and each gate are in different cells."""
@@ -28,6 +29,9 @@ START_HEIGHT = 0.4
 
 OPENING = 0.45
 """Width and height of a gate's opening, m, unless a track has others."""
+
+GATE_COLOR = PRIMITIVES["gate"][1]
+"""Colour of gates, RGBA, unless a task has others."""
 
 Points = Sequence[Sequence[float]]
 """Points or angles, (n, 3)."""
@@ -129,15 +133,18 @@ def gates_of_track(track: Track) -> list[Gate]:
     return [Gate(*row) for row in rows]
 
 
-def gate_body(gate: Gate, bar: float = 0.05) -> str:
+def gate_body(gate: Gate, bar: float = 0.05, rgba: Sequence[float] = GATE_COLOR) -> str:
     """Return the MJCF of a gate in its own frame: bars around the inner edges of its frame, or a ball of glass.
 
     Args:
         bar: Radius of the bars, m.
+        rgba: Colour; a ball has the opacity 0.3.
     """
-    touch = 'contype="0" conaffinity="2" rgba="0.85 0.35 0.1 1"'
+    red, green, blue, opacity = rgba
+    touch = f'contype="0" conaffinity="2" rgba="{red} {green} {blue} {opacity}"'
     if gate.is_ball:
-        geoms = [f'<geom type="sphere" size="{gate.opening}" contype="0" conaffinity="0" rgba="0.85 0.35 0.1 0.3"/>']
+        ball = f'contype="0" conaffinity="0" rgba="{red} {green} {blue} 0.3"'
+        geoms = [f'<geom type="sphere" size="{gate.opening}" {ball}/>']
     else:
         corners = np.asarray(gate.frame)
         inner_radius = np.min(np.abs(dataclasses.replace(gate, opening=corners).half_planes[:, 2]))

@@ -323,8 +323,8 @@ def add_bodies(
     """
     poses = [{"pos": p, "quat": np.roll(q, 1)} for p, q in zip(pos, quat, strict=True)]
     if isinstance(source, str) and source in PRIMITIVES:
-        geoms = primitive_geoms(source, options)
-        for name, pose in zip(names, poses, strict=True):
+        objects = primitive_geoms(source, options, len(names))
+        for name, pose, geoms in zip(names, poses, objects, strict=True):
             body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)
             for geom in geoms:
                 body.add_geom(**geom)

@@ -92,16 +92,16 @@ PRIMITIVES: dict[str, tuple[Callable[..., Geoms], tuple[float, ...]]] = {
 """Function and default colour, RGBA, of each primitive."""
 
 
-def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
-    """Return the geoms of a primitive, complete for ``add_geom``.
+def primitive_geoms(name: str, options: dict[str, Any], count: int) -> list[Geoms]:
+    """Return the geoms of some objects of a primitive, complete for ``add_geom``.
 
     Args:
         name: Key of ``PRIMITIVES``.
-        options: Arguments of the function of the primitive, and ``rgba``.
+        options: Arguments of the function of the primitive, and ``rgba``, one colour or one for each object.
     """
     make, rgba = PRIMITIVES[name]
     settings = {"rgba": rgba} | options
-    rgba = as_rgba(settings.pop("rgba"))
+    colors = np.broadcast_to(as_rgba(settings.pop("rgba"), count), (count, 4))
     parameters = inspect.signature(make).parameters
     all_settings = ", ".join([*(f"{p.name}={p.default}" for p in parameters.values()), "rgba"])
     for key in settings.keys() & parameters.keys():
@@ -123,5 +123,5 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
         )
         geom["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{geom['type'].upper()}")
         geom["size"] = (*geom["size"], 0, 0)[:3]
-        geom |= {"rgba": rgba, **DRONE_TOUCH_BITS}
-    return geoms
+        geom |= DRONE_TOUCH_BITS
+    return [[geom | {"rgba": rgba} for geom in geoms] for rgba in colors]

@@ -123,7 +123,8 @@ class Scene:
             quat: Initial attitudes, body to world, xyzw. (4,), (count, 4) or (n_worlds, count, 4)
             mocap: Whether the objects can be moved, independently in each world; else they stay at ``pos`` in all
                 worlds.
-            **options: Settings of a primitive: lengths, m, and ``rgba``; see ``crazysim.scene.primitives``.
+            **options: Settings of a primitive: lengths, m, and ``rgba``, (4,) or (count, 4); see
+                ``crazysim.scene.primitives``.
         """
         require(
             self.environment is None,

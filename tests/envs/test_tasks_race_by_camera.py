@@ -1,5 +1,7 @@
 """The race by camera: observations, headings at the start, and the cost of looking away."""
 
+import colorsys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,3 +94,18 @@ def test_the_frame_of_the_next_gate_is_in_the_image():
     middle = depth[4:12, 12:20]
     assert (np.abs(middle - distance) < 0.35).sum() >= 4, "frame"
     assert (middle > 2 * distance).any(), "opening"
+
+
+def test_by_color_each_gate_has_its_own_in_images_and_films():
+    env = make("race_by_camera", 1, by_color=True, engine="interpret")
+    model = env.sim.mj_model
+    colors = [model.geom_rgba[model.body_geomadr[model.body(f"gate:{k}").id], :3] for k in range(4)]
+    hues = 360 * np.array([colorsys.rgb_to_hsv(*color)[0] for color in colors])
+    np.testing.assert_allclose(np.diff(hues), 90, atol=1)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert {name: x.shape[-1] for name, x in state.obs.items()} == SIZES | {"rgb": 32 * 24 * 3}
+    # The camera looks at the first gate; the sky is blue, and the third gate is, too.
+    pixels = np.array([colorsys.rgb_to_hsv(*x) for x in np.asarray(state.obs["rgb"]).reshape(-1, 3)])
+    is_gate = pixels[:, 1] > 0.6
+    nearest = np.abs((360 * pixels[:, 0] - hues[0] + 180) % 360 - 180)
+    assert (is_gate & (nearest < 30)).sum() >= 10

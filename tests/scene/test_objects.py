@@ -103,7 +103,7 @@ def test_set_pose_is_pure_masked_and_differentiable(course):
 @pytest.mark.parametrize("primitive", PRIMITIVES)
 def test_every_primitive_is_touched_by_drones_only(primitive):
     sim = Sim()
-    sim.scene.add(primitive, pos=[0, 0, 0.3], rgba=(1, 0, 0, 1))
+    sim.scene.add(primitive, pos=[0, 0, 0.3], count=2, rgba=[(1, 0, 0, 1), (0, 1, 0, 0.5)])
     model = sim.mj_model
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(f"{primitive}:0").id]
     assert geoms
@@ -113,3 +113,4 @@ def test_every_primitive_is_touched_by_drones_only(primitive):
         assert (contype[drone] & conaffinity[g]) | (contype[g] & conaffinity[drone])
         assert not (contype[floor] & conaffinity[g]) | (contype[g] & conaffinity[floor])
         np.testing.assert_allclose(model.geom_rgba[g], (1, 0, 0, 1))
+    np.testing.assert_allclose(model.geom_rgba[model.body_geomadr[model.body(f"{primitive}:1").id]], (0, 1, 0, 0.5))

@@ -27,6 +27,7 @@ from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.track_files import load_track
 from crazysim.envs.tracks import (
+    GATE_COLOR,
     Track,
     check_track,
     count_random_numbers,
@@ -287,8 +288,12 @@ class Race(ProgressTask, OutcomeTask):
         """The track, loaded."""
         return self.track  # type: ignore[return-value]
 
+    def gate_colors(self) -> Sequence[Sequence[float]]:
+        """Return the colour of each gate, RGBA. (n_gates, 4)"""
+        return [GATE_COLOR] * self.course.n_gates
+
     def _add_gates(self, sim: Sim) -> Handle:
-        course = self.course
+        course, colors = self.course, self.gate_colors()
         poses: dict[str, Any] = {"pos": course.gates_pos, "quat": self._gates_quat()}
         if course.openings is not None:
             gates = gates_of_track(course)
@@ -296,10 +301,12 @@ class Race(ProgressTask, OutcomeTask):
                 not any(gate.length for gate in gates),
                 "expected gates without length for the task race, got tunnels. Use length: 0.0.",
             )
-            return sim.scene.add([gate_body(gate) for gate in gates], "gate", count=course.n_gates, **poses)
+            bodies = [gate_body(gate, rgba=rgba) for gate, rgba in zip(gates, colors, strict=True)]
+            return sim.scene.add(bodies, "gate", count=course.n_gates, **poses)
         # Posts of all gates have the same length, so that they are computed as one batch; most extend below the floor.
         stand = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
-        return sim.scene.add("gate", count=course.n_gates, **poses, stand=stand, width=OPENING, height=OPENING)
+        size: dict[str, Any] = {"stand": stand, "width": OPENING, "height": OPENING}
+        return sim.scene.add("gate", count=course.n_gates, **poses, **size, rgba=colors)
 
     def _gates_quat(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # returns an array even while a step is traced

@@ -1,6 +1,9 @@
-"""Race through gates that the drone observes in a depth image."""
+"""Race through gates that the drone observes in images of depth or of colours."""
 
 from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +19,20 @@ from crazysim.envs.tasks.race import Race
 from crazysim.envs.tasks.race_observations import observe
 from crazysim.envs.tasks.race_rules import gate_index, gates_of, next_gate, race_of
 from crazysim.plugins.sensors.camera import Camera
+from crazysim.scene.appearance import RandomColors
 
 AWAY_COST = 0.03
 """Cost per environment step of looking away: factor of 1 - cos(angle between the camera's axis and the next gate)."""
 HASTE_COST = 0.1
 """Cost per environment step and m/s of a speed above the task's. It exceeds the reward of faster progress. Without the
 cost, policies with body rate commands reach the side of a gate faster than they can turn, and hit the frame."""
+IMAGE_SIZE = (32, 24)
+"""Width and height of the images, pixels: the bars of a gate are 5 cm wide."""
+SATURATION, BRIGHTNESS = 0.9, 0.9
+"""Saturation and value of the gates' colours with ``by_color``; their hues are as far apart as possible."""
+CHANGES = RandomColors(surfaces=0.2, lights=0.2, tilt=15.0)
+"""Changes of colours and lights with ``by_color``: hues of gates by up to 25 degrees, where those of four gates are 90
+degrees apart."""
 PRIVILEGED_NAMES = ("gate_corners", "obstacles_near")
 """Observations of the race for a critic, and with ``gates_observed`` also for the policy."""
 
@@ -29,10 +40,10 @@ PRIVILEGED_NAMES = ("gate_corners", "obstacles_near")
 class RaceByCamera(Race):
     """Race by the rules of ``race`` with a camera on each drone, which ``make`` adds.
 
-    Policies observe gates and obstacles in depth images only, and do not observe the horizontal position of the drone.
-    The reward has two more terms, costs of looking away from the next gate and of flying faster than ``speed``. Drones
-    at the start face the first gate; drones that start behind a gate look along its axis. The setting ``sensor_range``
-    has no effect.
+    Policies observe gates and obstacles only in images, of depth or with ``by_color`` of colours, and do not observe
+    the horizontal position of the drone. The reward has two more terms, costs of looking away from the next gate and of
+    flying faster than ``speed``. Drones at the start face the first gate; drones that start behind a gate look along
+    its axis. The setting ``sensor_range`` has no effect.
     """
 
     name = "race_by_camera"
@@ -42,6 +53,9 @@ class RaceByCamera(Race):
     """Speed above which flying faster costs reward, m/s."""
     gates_observed: bool = False
     """Whether to add true positions of gates and obstacles to the observations, for a teacher of other policies."""
+    by_color: bool = False
+    """Whether each gate has a colour of its own and policies observe colours instead of depths. Colours and light
+    change a little in every episode."""
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         data = super().spawn(data, key)
@@ -84,5 +98,11 @@ class RaceByCamera(Race):
         costs = terms.only_where(~race_of(data).flight_over_before, costs)
         return super().rewards(data, action, last_action) | costs
 
+    def gate_colors(self) -> Sequence[Sequence[float]]:
+        if not self.by_color:
+            return super().gate_colors()
+        hues = (np.arange(self.course.n_gates) + 0.5) / self.course.n_gates  # red is the colour of the obstacles
+        return [(*colorsys.hsv_to_rgb(hue, SATURATION, BRIGHTNESS), 1.0) for hue in hues.tolist()]
+
     def policy_camera(self) -> Camera:
-        return Camera(32, 24)
+        return Camera(*IMAGE_SIZE, outputs=("rgb",), random_colors=CHANGES) if self.by_color else Camera(*IMAGE_SIZE)
