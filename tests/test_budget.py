@@ -17,7 +17,7 @@ BUDGET = {
     "drones": 516,
     "dynamics": 367,
     "engine": 6794,
-    "envs": 3768,
+    "envs": 3788,
     "geometry": 944,
     "lab": 17768,
     "media": 1091,
