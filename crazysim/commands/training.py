@@ -42,7 +42,8 @@ def add_parsers(commands: argparse._SubParsersAction) -> None:
         "default the recipe's teacher, if it has one, which is trained first"
     )
     add("--teacher", metavar="FOLDER", help=teacher_help)
-    add("--start", metavar="FOLDER", help="folder of a run from whose policy the training starts, of the same network")
+    start_help = "folder of a run from whose policy ppo or apg starts; it must have the same network"
+    add("--start", metavar="FOLDER", help=start_help)
     add("--seed", type=seed, help="random seed; by default 0")
     seeds_help = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in the folder of the run"
     add("--seeds", type=parse_seeds, metavar="FIRST:END", help=seeds_help)

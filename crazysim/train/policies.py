@@ -31,27 +31,29 @@ class _FunctionPolicy(PyTree):
         return self.fn(obs)
 
 
-def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray] | None:
+def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray, str] | None:
     """Return the policy of a run from which a training with these observations starts; None without a run.
 
     Returns:
-        The policy, and the indices of its observations among those of the training. (n_obs,)
+        The policy, the indices of its observations among those of the training, (n_obs,), and its network in words.
     """
     from crazysim.train.training import load_policy
 
     if not folder:
         return None
-    policy, sizes = load_policy(folder)[0], sizes_of(obs)
+    (policy, config, _), sizes = load_policy(folder), sizes_of(obs)
+    names = ("hidden", "memory", "shape", "convolution")
+    network = ", ".join(f"{name}={config.config[name]}" for name in names if name in config.config)
     known, interface = policy.interface.sizes, Interface.read(describe_env(env, sizes))
     shared = tuple([x for x in interface.observations if x[0] in known])
     changes = {"observations": shared, "freq": None, "task": None, "task_code": None}
-    policy.interface.require(dataclasses.replace(interface, **changes), "a training")
+    policy.interface.require(dataclasses.replace(interface, **changes), f"a training with start={folder}")
     is_known = np.concatenate([np.full(size, name in known) for name, size in interface.observations])
-    return policy, np.flatnonzero(is_known)
+    return policy, np.flatnonzero(is_known), f"{folder}, {network}"
 
 
 def start_from(
-    start: tuple[Policy, np.ndarray] | None, weights: Weights, stats: RunningStats
+    start: tuple[Policy, np.ndarray, str] | None, weights: Weights, stats: RunningStats
 ) -> tuple[Weights, RunningStats]:
     """Return weights and statistics with which a training starts; observations that are new have no effect at first.
 
@@ -62,7 +64,7 @@ def start_from(
     """
     if start is None:
         return weights, stats
-    (policy, index), (rows, _) = start, weights.layers[0]
+    (policy, index, network), (rows, _) = start, weights.layers[0]
     (weight, bias), *others = policy.layers
     if not jax.tree.leaves(policy.body):
         weight = jnp.zeros((len(rows), weight.shape[1]), weight.dtype).at[index].set(weight)
@@ -70,8 +72,7 @@ def start_from(
     got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (started, weights))
     require(
         got == expected,
-        f"expected start= as a run with the same network, of weights {expected}, got {got}. Use its hidden, memory, "
-        f"shape and convolution.",
+        f"expected a training with the network of start={network}, got another. Give it with --config.",
     )
     stats = RunningStats.create(len(stats.mean), stats.unscaled).replace(count=policy.stats.count)
     mean, var = stats.mean.at[index].set(policy.stats.mean), stats.var.at[index].set(policy.stats.var)

@@ -19,6 +19,7 @@ from crazysim.envs.rendering import view_of
 from crazysim.envs.state import EnvState, Obs, terms_of
 from crazysim.errors import not_installed
 from crazysim.media import Film, View
+from crazysim.plugins.sensors.image_sensor import COLORS
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_text
@@ -249,8 +250,8 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     that would be smaller than 25 pixels have a ring of that width.
 
     If the policy observes images, the first depth image of the first drone, or else its first segmentation of the
-    target, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles then also
-    show a map from above.
+    target or colours, is drawn into each world. Near pixels, or pixels of the target, are bright. Worlds with obstacles
+    then also show a map from above.
 
     Args:
         path: Film to write, ``.mp4`` or ``.gif``.
@@ -268,11 +269,15 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
     formats = env.image_formats()
     depths = [name for name, x in formats.items() if x["unit"] == "m"]
     masks = [name for name, x in formats.items() if x["unit"] == "1" and x.get("output") == "segmentation"]
+    colors = [name for name, x in formats.items() if x.get("output") in COLORS]
 
     def draw_image(_: Sim, world: int) -> np.ndarray | None:
-        for name in depths + masks:
+        for name in depths + masks + colors:
             image = formats[name]
-            pixels = np.asarray(state.obs[name][world, 0]).reshape(image["height"], image["width"])
+            pixels = np.asarray(state.obs[name][world, 0]).reshape(image["height"], image["width"], -1)
+            if name in colors:
+                return (255 * np.broadcast_to(pixels, (*pixels.shape[:2], 3))).round().astype(np.uint8)
+            pixels = pixels[..., 0]
             return color_depth(pixels, image["far"]) if name in depths else color_depth(1 - pixels, 1.0)
         return None
 
@@ -314,7 +319,7 @@ def film(env: Env, policy: Policy, path: str | Path, worlds: int = 4, seed: int 
         lag=0.6,
         draw=draw_time,
         inset=draw_image,
-        top_view=bool(depths + masks),
+        top_view=bool(depths + masks + colors),
     )
     n_frames = (env.max_steps + freq) // frame_steps + 1
     with Film(path, view, fps=freq / frame_steps, progress=progress, total=n_frames) as recording:

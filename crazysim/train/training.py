@@ -358,10 +358,11 @@ class _Run:
             f"{self.steps_per_iteration:,} steps in {repetition}{config.n_worlds:,} worlds, {devices}"
             f"{sim.control.value} commands, {self.engine}" + (f"; continues after iteration {n_done}" if n_done else "")
         )
+        if start := self.config.config.get("start"):
+            self.log(f"starts from the policy of {start}")
         if (n_shown := self.config.config.get("demonstrations", 0)) > n_done:
-            start = self.config.config["start"]
-            what = f"train the value function of {start} alone" if start else "learn from demonstrate(obs)"
-            self.log(f"the first {n_shown} iterations {what}; leave out: --config demonstrations=0")
+            what = "train the value function alone" if start else "learn from demonstrate(obs)"
+            self.log(f"iterations 1 to {n_shown} {what}; leave out: --config demonstrations=0")
         if self.stored_hash != self.code_hash:
             self.log("the file of the task has changed since the checkpoint was written; it is used as it is now")
         if n_done >= self.n_iterations:

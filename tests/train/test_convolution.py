@@ -178,6 +178,18 @@ def test_a_film_shows_what_the_drone_sees(tmp_path, env, meta, opengl):
     np.testing.assert_allclose(frame[np.ix_(rows, columns)], expected, atol=40)
 
 
+@pytest.mark.long("renders a film")
+def test_a_film_shows_the_colors_that_the_drone_sees(tmp_path, opengl):
+    short_env = make("hover", 1, camera=Camera(5, 4, outputs=("rgb",)), seconds=0.04, engine="interpret")
+    film(short_env, lambda obs: jnp.zeros((1, 1, 4)), tmp_path / "film.gif", worlds=1)
+    short_env.sim.close()
+    frame = read_frames(tmp_path / "film.gif", 360, 480, "-vf", "scale=480:360").astype(int)[0]
+    colors = np.asarray(jax.jit(short_env.reset)(jax.random.key(1)).obs["camera.rgb"]).reshape(4, 5, 3)
+    assert np.ptp(colors) > 0.2
+    rows, columns = 360 - 24 * (4 - np.arange(4)) + 12, 480 - 24 * (5 - np.arange(5)) + 12
+    np.testing.assert_allclose(frame[np.ix_(rows, columns)], 255 * colors, atol=40)  # a GIF has 256 colours
+
+
 @pytest.mark.long("compiles a training")
 @pytest.mark.parametrize("algorithm", ["ppo", "apg"])
 def test_the_policy_of_a_run_with_a_convolution_comes_back(tmp_path, algorithm):
