@@ -142,7 +142,7 @@ def load_policy_and_env(
     """
     from crazysim.train.config import TrainConfig
     from crazysim.train.export import find_weights, raptor_policy
-    from crazysim.train.interface import check_policy, with_settings
+    from crazysim.train.interface import allow_rate_of, check_policy
     from crazysim.train.policies import MultiPolicy
     from crazysim.train.training import load_policy
 
@@ -155,7 +155,7 @@ def load_policy_and_env(
         return raptor_policy(weights, env.sim.airframes[0]), config, env
     require(drone is None, f"expected any, or a checkpoint (.tar), for --drone, got {str(folder)!r}", ValueError)
     policy, config, _ = load_policy(folder, task)
-    policy = with_settings(policy, settings)
+    policy = allow_rate_of(policy, settings)
     env = config.with_options(**settings).with_device(device).make_env(n_worlds)
     check_policy(policy, env)
     return policy, config, env

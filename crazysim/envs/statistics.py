@@ -23,6 +23,8 @@ class RunningStats(PyTree):
     """Number of observations. ()"""
     unscaled: tuple[range, ...] = static(default=())
     """Ranges of indices into k that are not normalised, such as the pixels of images."""
+    fixed: tuple[int, ...] = static(default=())
+    """Indices into k whose mean and variance stay as they are."""
 
     @staticmethod
     def create(size: int, unscaled: tuple[range, ...] = ()) -> RunningStats:
@@ -44,8 +46,9 @@ class RunningStats(PyTree):
         delta = mean - self.mean
         sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total_count
         mean, var = self.mean + delta * n / total_count, sum_of_squares / total_count
-        if self.unscaled:
-            mean, var = (jnp.where(self.is_scaled(), x, y) for x, y in ((mean, self.mean), (var, self.var)))
+        if self.unscaled or self.fixed:
+            changes = self.is_scaled() & ~np.isin(np.arange(len(self.is_scaled())), self.fixed)
+            mean, var = (jnp.where(changes, x, y) for x, y in ((mean, self.mean), (var, self.var)))
         return self.replace(mean=mean, var=var, count=total_count)
 
     def normalize(self, x: Array) -> Array:

@@ -29,9 +29,16 @@ def point_distance(shape: Shape, point: Array) -> Array:
     Args:
         point: Points in the frame of the shape, m. (..., 3)
     """
+    _require_solid(shape)
     if shape.kind == "hfield":
         return field_distance(shape, jnp.asarray(point))
     return POINT_DISTANCE[shape.kind](shape, jnp.asarray(point))
+
+
+def _require_solid(shape: Shape) -> None:
+    require(
+        shape.kind != "rectangle", "expected a solid, got a rectangle, which is for rays. Use plane, or a thin box."
+    )
 
 
 def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
@@ -53,6 +60,7 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         a.kind in DRONE_KINDS,
         f"expected a drone shape of kind {', '.join(DRONE_KINDS)}, got {a.kind}; use one of these",
     )
+    _require_solid(b)
     pos, rot = jnp.asarray(pos), jnp.asarray(rot)
     if b.kind == "hfield" and a.kind == "sphere":
         return field_distance(b, pos, a.size[0]) - a.size[0]

@@ -158,7 +158,7 @@ class Appearance:
             has_coordinates = shape.triangles is not None
             if shape.kind in ("hfield", "mesh") and not has_coordinates:
                 repeat = repeat / half
-            is_centred = shape.kind in ("hfield", "mesh") or (shape.kind == "plane" and not half.all())
+            is_centred = shape.kind in ("hfield", "mesh") or (shape.kind in ("plane", "rectangle") and not half.all())
             shift = 0.5 * (is_centred and not has_coordinates)
             look[:] = *rgba[:3], *shine[:2], SHININESS_SCALE * shine[2], *repeat, shift
             is_flat = texture >= 0 and int(model.tex_type[texture]) == flat

@@ -155,6 +155,8 @@ def visual_model(
 
     def read_shape(model: mujoco.MjModel, geom: int) -> Shape:
         shape, size = _read_shape(model, geom), model.geom_size[geom, :2]
+        if shape.kind == "mesh":
+            return dataclasses.replace(shape, triangles=_read_triangles(model, geom))
         if shape.kind != "plane" or not size.any():
             return shape
         return Shape("rectangle", tuple(float(x) if x > 0 else UNBOUNDED_LENGTH for x in size))
@@ -259,8 +261,7 @@ def _read_geom(
 def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
     kind, size = GEOM_KINDS[int(model.geom_type[geom])], model.geom_size[geom]
     if kind == "mesh":
-        mesh = int(model.geom_dataid[geom])
-        return dataclasses.replace(_read_hull(model, mesh), triangles=_read_triangles(model, geom, mesh))
+        return _read_hull(model, int(model.geom_dataid[geom]))
     if kind == "hfield":
         field = int(model.geom_dataid[geom])
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -270,7 +271,8 @@ def _read_shape(model: mujoco.MjModel, geom: int) -> Shape:
     return Shape(kind, tuple(map(float, size)))
 
 
-def _read_triangles(model: mujoco.MjModel, geom: int, mesh: int) -> np.ndarray | None:
+def _read_triangles(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
+    mesh = int(model.geom_dataid[geom])
     texture, first_vertex, first_coordinate = (
         texture_of(model, geom),
         model.mesh_vertadr[mesh],

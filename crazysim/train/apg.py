@@ -195,7 +195,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
     def init_agent(k_policy: Array, key: Array, raw_obs: Array) -> Agent:
         policy: Any = init_weights(network, k_policy, n_obs, (*hidden, env.actions.size), 0.01)
         stats, returns = RunningStats.create(raw_obs.shape[-1], network.pixels).update(raw_obs), RunningStats.create(1)
-        policy, stats = start_from(start, policy, stats)
+        policy, stats = start_from(start, policy, stats, n_obs)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.iterations).init(policy)
         value, value_optimizer = (), ()
         if config.critic_epochs:

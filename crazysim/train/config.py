@@ -29,7 +29,8 @@ ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 WORLDS = {"cpu": 2048, "gpu": 4096}
 """Default number of parallel worlds, by platform."""
 DEMONSTRATIONS = 80
-"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it; at most half."""
+"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it, or with ``start`` the
+value function alone; at most half."""
 
 
 @dataclass(frozen=True)

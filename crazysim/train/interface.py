@@ -149,7 +149,7 @@ def check_policy(policy: Any, env: Env) -> None:
         interface.require(other, "an environment")
 
 
-def with_settings(policy: Any, settings: Mapping[str, Any]) -> Any:
+def allow_rate_of(policy: Any, settings: Mapping[str, Any]) -> Any:
     """Return a trained policy that may also act at another rate if the settings of ``make`` have one."""
     interface = dataclasses.replace(policy.interface, freq=None) if "freq" in settings else policy.interface
     return policy.replace(interface=interface)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -41,6 +42,9 @@ def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray, str
 
     if not folder:
         return None
+    require(
+        Path(folder).is_dir(), f"expected the run of start={folder}, also to resume, got no such folder. Move it back."
+    )
     (policy, config, _), sizes = load_policy(folder), sizes_of(obs)
     names = ("hidden", "memory", "shape", "convolution")
     network = ", ".join(f"{name}={config.config[name]}" for name in names if name in config.config)
@@ -53,20 +57,28 @@ def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray, str
 
 
 def start_from(
-    start: tuple[Policy, np.ndarray, str] | None, weights: Weights, stats: RunningStats
+    start: tuple[Policy, np.ndarray, str] | None, weights: Weights, stats: RunningStats, n_obs: int
 ) -> tuple[Weights, RunningStats]:
-    """Return weights and statistics with which a training starts; observations that are new have no effect at first.
+    """Return weights and statistics with which a training starts.
+
+    Observations that are new have no effect at first. The normalisation of the others stays as it was.
 
     Args:
         start: From ``load_start``.
         weights: Untrained weights.
+        n_obs: Number of observations of the policy that is trained.
         stats: Statistics at the start of the training; the policy's observations come first.
     """
     if start is None:
         return weights, stats
     (policy, index, network), (rows, _) = start, weights.layers[0]
     (weight, bias), *others = policy.layers
-    if not jax.tree.leaves(policy.body):
+    is_dense = not jax.tree.leaves(policy.body)
+    require(
+        is_dense or len(index) == n_obs,
+        f"expected a training with the observations of start={network}, which is not dense, got more. Leave them out.",
+    )
+    if is_dense:
         weight = jnp.zeros((len(rows), weight.shape[1]), weight.dtype).at[index].set(weight)
     started = Weights([(weight, bias), *others], policy.body)
     got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (started, weights))
@@ -74,9 +86,8 @@ def start_from(
         got == expected,
         f"expected a training with the network of start={network}, got another. Give it with --config.",
     )
-    stats = RunningStats.create(len(stats.mean), stats.unscaled).replace(count=policy.stats.count)
     mean, var = stats.mean.at[index].set(policy.stats.mean), stats.var.at[index].set(policy.stats.var)
-    return started, stats.replace(mean=mean, var=var)
+    return started, stats.replace(mean=mean, var=var, fixed=tuple(index.tolist()))
 
 
 class MultiPolicy(PyTree):

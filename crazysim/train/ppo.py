@@ -249,7 +249,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
         log_std = jnp.full(n_actions, jnp.log(config.init_std), policy.layers[0][0].dtype)
         parameters: Any = (policy, log_std, value)
         optimizer = build_optimizer(config.learning_rate, config.max_grad_norm, config.n_updates).init(parameters)
-        policy, stats = start_from(start, policy, stats)
+        policy, stats = start_from(start, policy, stats, n_obs)
         networks = network, critic_network, apply_layers, apply_critic_layers
         agent = Agent(policy, log_std, value, optimizer, stats, returns, key, n_obs, *networks)
         if not config.opponents:
@@ -378,6 +378,9 @@ def learn(
     data = samples, advantages, targets, jax.tree.map(lambda x: x[None], own_memory)
     loss = partial(compute_loss, agent, config, imitates)
     parameters, optimizer, losses = run_epochs(loss, parameters, agent.optimizer, data, config, key)
+    if config.start:  # at first only the value function and the optimiser's moments change
+        stays = partial(jnp.where, imitates)
+        parameters = (*jax.tree.map(stays, (agent.policy, agent.log_std), parameters[:2]), parameters[2])
     # Statistics of the observations, and metrics.
     stats = agent.stats.update(raw_obs)
     metrics = losses | {
@@ -413,11 +416,8 @@ def compute_loss(
         square = jnp.square(sample.shown - mean) + LEAST_STD**2
         likelihood = -(0.5 * square / jnp.exp(2 * log_std) + log_std).sum(axis=-1).mean()
         objective = jnp.where(imitates, likelihood, objective)
-    objective = objective + config.entropy * log_std.sum()
-    if config.start:
-        objective = jnp.where(imitates, 0.0, objective)
     value_loss = 0.5 * jnp.square(values - target).mean()
-    total_loss = config.value_weight * value_loss - objective
+    total_loss = -objective + config.value_weight * value_loss - config.entropy * log_std.sum()
     return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}
 
 

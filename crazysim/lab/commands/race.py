@@ -145,7 +145,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     from crazysim.envs.tasks.race import Race
     from crazysim.lab.racing.flight import flight_of_policy
     from crazysim.plugins.effects.battery import Battery
-    from crazysim.train.interface import check_policy, with_settings
+    from crazysim.train.interface import allow_rate_of, check_policy
     from crazysim.train.training import load_policy
 
     given = [
@@ -156,7 +156,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     require(not given, f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
     policy, config, _ = load_policy(options.policy)
     settings = parse_pairs(options.set or ())
-    policy = with_settings(policy, settings)
+    policy = allow_rate_of(policy, settings)
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
     course |= {} if options.penalty is None else {"penalty": options.penalty}
     effects = [] if options.battery is None else [Battery(charge=options.battery)]

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.engine.pytree import PyTree
-from crazysim.errors import ConfigError, not_installed, require
+from crazysim.errors import ConfigError, expect, not_installed, require
 from crazysim.lab.scene.splats import Gaussians, spherical_harmonics
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import CarriedCamera, camera_pose
@@ -106,6 +106,12 @@ def build_splat_fn(
         camera_poses = pos.reshape(-1, 3), rot.reshape(-1, 3, 3)
         scene_index = None
         if not isinstance(gaussians, Gaussians):
+            expect(
+                isinstance(gaussians, (list, tuple)) and all(isinstance(x, Gaussians) for x in gaussians),
+                "Gaussians, or a list of them",
+                gaussians,
+                "Use SplatScene.gaussians.",
+            )
             require(
                 len(gaussians) == n_maps > 0,
                 f"expected Gaussians of one scene, or a list with those of each of {n_maps} maps, got a list of "
@@ -230,19 +236,26 @@ def _draw_with_jax(
     batch_size: int,
 ) -> tuple[Array, Array, Array]:
     def draw(camera_pose: CameraPoses, index: Array | None) -> tuple[Array, Array, Array]:
-        scene = gaussians if index is None else jax.tree.map(lambda x: x[index], gaussians)
-        return _draw_image(scene, camera_pose, focal, width, height, background)
+        return _draw_image(gaussians, camera_pose, focal, width, height, background, index)
 
     batch_size = min(batch_size, len(camera_poses[0]))
     return jax.lax.map(lambda x: draw(*x), (camera_poses, scene_index), batch_size=batch_size)
 
 
 def _draw_image(
-    gaussians: Gaussians, camera_pose: CameraPoses, focal: float, width: int, height: int, background: np.ndarray
+    gaussians: Gaussians,
+    camera_pose: CameraPoses,
+    focal: float,
+    width: int,
+    height: int,
+    background: np.ndarray,
+    scene_index: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    # Gaussians are projected to Gaussians in the image plane (Zwicker et al. 2001) and blended from near to far.
+    # Gaussians are projected to Gaussians in the image plane (Zwicker et al. 2001) and blended from near to far. Of
+    # several scenes, only positions are copied for each image.
     pos, rot = camera_pose
-    order = jnp.argsort(jnp.sum((gaussians.pos - pos) * -rot[:, 2], axis=-1))
+    scene = () if scene_index is None else (scene_index,)
+    order = jnp.argsort(jnp.sum((gaussians.pos[scene] - pos) * -rot[:, 2], axis=-1))
     order = jnp.pad(order, (0, -len(order) % BLOCK_SIZE), constant_values=-1).reshape(-1, BLOCK_SIZE)
     y, x = (np.arange(n, dtype=np.float32) + 0.5 for n in (height, width))
     zero = jnp.zeros((height, width), gaussians.pos.dtype)
@@ -251,7 +264,7 @@ def _draw_image(
         # The transmittance includes the Gaussian at which a pixel is finished, which is not drawn, so that the next
         # block knows it.
         color, depth, coverage, transmittance = carry
-        block_gaussians = jax.tree.map(lambda leaf: leaf[block], gaussians)
+        block_gaussians = jax.tree.map(lambda leaf: leaf[(*scene, block)], gaussians)
         center, (a, b, c), z, opacity = _project(block_gaussians, pos, rot, focal, width, height)
         dx, dy = (e[:, None, None] - p for e, p in zip(center, (x, y[:, None]), strict=True))
         a, b, c, opacity = (e[:, None, None] for e in (a, b, c, jnp.where(block < 0, 0.0, opacity)))
