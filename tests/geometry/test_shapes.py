@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.geometry import Shape, hfield, hull
+from crazysim.geometry import Shape, hfield, hull, point_distance
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
@@ -46,6 +46,7 @@ def test_a_hull_is_closed_and_contains_its_vertices(rng, n):
     (lambda: Shape("sphere", (0,)), "positive"),
     (lambda: Shape("sphere", (np.nan,)), "finite"),
     (lambda: Shape("mesh"), "expected a mesh with vertices"),
+    (lambda: point_distance(Shape("rectangle", (1, 1)), np.zeros(3)), "expected a solid, got a rectangle"),
     (lambda: Shape("hfield", (1, 1, 1, 1)), "expected a hfield with heights"),
     (lambda: hull(CUBE[:3]), r"got \(3, 3\)"),
     (lambda: hull(CUBE * [1, 1, 0]), "one plane"),
