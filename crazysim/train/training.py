@@ -319,6 +319,7 @@ class _Run:
         files = fetch_arrays({"learner": self.learner, "kept": [training.kept_policy for training in self.trainings]})
         if is_first_host():
             checkpoint.save(self.path, files, meta)
+        broadcast_decision(True)  # no host reads the checkpoint before it is whole
         self.saved_iteration, self.save_time = int(self.learner.iteration), time.perf_counter()
 
     def _mark_diverged(self, metrics: dict[str, Array], iteration: int) -> None:
