@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from crazysim.engine.stage import stage
 from crazysim.envs.actions import Actions
 from crazysim.envs.tasks import race
 from crazysim.envs.tasks.race_rules import gates_of, obstacles_of
-from crazysim.envs.tracks import Track
+from crazysim.envs.tracks import GATE_COLOR, Track
 from crazysim.scene.objects import IDENTITY_QUAT, Handle
 from crazysim.sim.sim import Sim
 from crazysim.storage import read_toml
@@ -114,7 +114,7 @@ class CompetitionRace(race.Race):
         return touches
 
     def _add_gates(self, sim: Sim) -> Handle:
-        look = 'contype="0" conaffinity="2" rgba="0.85 0.35 0.1 1"'
+        look = f'contype="0" conaffinity="2" rgba="{_text(GATE_COLOR)}"'
         geoms = [f'<geom type="box" pos="{_text(x)}" size="{_text(half)}" {look}/>' for x, half in GATE_BOXES]
         body = f"<mujoco><worldbody><body>{''.join(geoms)}</body></worldbody></mujoco>"
         return sim.scene.add(
@@ -146,7 +146,7 @@ def touches_boxes(pos: Array, quat: Array, objects_pos: Array, objects_quat: Arr
     return jnp.any(~jnp.any(is_apart, axis=-1), axis=-1)
 
 
-def _text(numbers: np.ndarray) -> str:
+def _text(numbers: Iterable[float]) -> str:
     return " ".join(map(str, numbers))
 
 
