@@ -32,11 +32,11 @@ class _FunctionPolicy(PyTree):
         return self.fn(obs)
 
 
-def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray, str] | None:
+def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray] | None:
     """Return the policy of a run from which a training with these observations starts; None without a run.
 
     Returns:
-        The policy, the indices of its observations among those of the training, (n_obs,), and its network in words.
+        The policy, and the indices of its observations among those of the training. (n_obs,)
     """
     from crazysim.train.training import load_policy
 
@@ -45,19 +45,17 @@ def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray, str
     require(
         Path(folder).is_dir(), f"expected the run of start={folder}, also to resume, got no such folder. Move it back."
     )
-    (policy, config, _), sizes = load_policy(folder), sizes_of(obs)
-    names = ("hidden", "memory", "shape", "convolution")
-    network = ", ".join(f"{name}={config.config[name]}" for name in names if name in config.config)
+    (policy, *_), sizes = load_policy(folder), sizes_of(obs)
     known, interface = policy.interface.sizes, Interface.read(describe_env(env, sizes))
     shared = tuple([x for x in interface.observations if x[0] in known])
     changes = {"observations": shared, "freq": None, "task": None, "task_code": None}
     policy.interface.require(dataclasses.replace(interface, **changes), f"a training with start={folder}")
     is_known = np.concatenate([np.full(size, name in known) for name, size in interface.observations])
-    return policy, np.flatnonzero(is_known), f"{folder}, {network}"
+    return policy, np.flatnonzero(is_known)
 
 
 def start_from(
-    start: tuple[Policy, np.ndarray, str] | None, weights: Weights, stats: RunningStats, n_obs: int
+    start: tuple[Policy, np.ndarray] | None, weights: Weights, stats: RunningStats, n_obs: int
 ) -> tuple[Weights, RunningStats]:
     """Return weights and statistics with which a training starts.
 
@@ -71,20 +69,15 @@ def start_from(
     """
     if start is None:
         return weights, stats
-    (policy, index, network), (rows, _) = start, weights.layers[0]
-    (weight, bias), *others = policy.layers
-    is_dense = not jax.tree.leaves(policy.body)
-    require(
-        is_dense or len(index) == n_obs,
-        f"expected a training with the observations of start={network}, which is not dense, got more. Leave them out.",
-    )
-    if is_dense:
-        weight = jnp.zeros((len(rows), weight.shape[1]), weight.dtype).at[index].set(weight)
+    (policy, index), ((weight, bias), *others) = start, start[0].layers
+    if not jax.tree.leaves(policy.body):
+        weight = jnp.zeros((n_obs, weight.shape[1]), weight.dtype).at[index].set(weight)
     started = Weights([(weight, bias), *others], policy.body)
-    got, expected = ([x.shape for x in jax.tree.leaves(tree)] for tree in (started, weights))
+    expected, got = ([x.shape for x in jax.tree.leaves(tree)] for tree in (started, weights))
     require(
-        got == expected,
-        f"expected a training with the network of start={network}, got another. Give it with --config.",
+        expected == got,
+        f"expected a training with the network of start, whose arrays have shapes {expected}, got {got}. Give hidden, "
+        f"memory, shape and convolution with --config; only a dense network without memory may have more observations.",
     )
     mean, var = stats.mean.at[index].set(policy.stats.mean), stats.var.at[index].set(policy.stats.var)
     return started, stats.replace(mean=mean, var=var, fixed=tuple(index.tolist()))

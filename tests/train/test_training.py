@@ -256,7 +256,7 @@ def test_a_training_starts_from_the_policy_of_a_run(uninterrupted_run, algorithm
     more = take_seed(learner.as_policy(), 0)(learner.env.obs)
     np.testing.assert_allclose(more, policy(obs), atol=1e-6, err_msg="an image that is new has no effect yet")
     for wrong_env, changes, message in (
-        (env, {"hidden": (8,)}, r"the network of start=.*hidden=\[16, 16\]"),
+        (env, {"hidden": (8,)}, r"\(16, 16\).*got .*\(8, .*hidden, memory"),
         (make("hover", 4, control="body_rate"), {}, "body_rate commands in place of attitude"),
         (make("reach_vel", 4), {}, "interface of the policy"),
     ):
