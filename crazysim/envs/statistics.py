@@ -47,8 +47,7 @@ class RunningStats(PyTree):
         sum_of_squares = self.var * self.count + var * n + delta * delta * self.count * n / total_count
         mean, var = self.mean + delta * n / total_count, sum_of_squares / total_count
         if self.unscaled or self.fixed:
-            changes = self.is_scaled()
-            changes[list(self.fixed)] = False
+            changes = self.is_scaled() & ~np.isin(np.arange(len(mean)), self.fixed)
             mean, var = (jnp.where(changes, x, y) for x, y in ((mean, self.mean), (var, self.var)))
         return self.replace(mean=mean, var=var, count=total_count)
 
