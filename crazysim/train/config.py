@@ -28,9 +28,9 @@ ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 
 WORLDS = {"cpu": 2048, "gpu": 4096}
 """Default number of parallel worlds, by platform."""
-DEMONSTRATIONS = 80
-"""Default number of iterations in which PPO learns from ``demonstrate`` of a task that has it, or with ``start`` the
-value function alone; at most half."""
+FIRST_ITERATIONS = 80
+"""Default of PPO's ``value_iterations`` with ``start``, or else of its ``demonstrations`` if the task has
+``demonstrate``; at most half of the iterations."""
 
 
 @dataclass(frozen=True)
@@ -283,9 +283,9 @@ class TrainConfig:
         for name, value in (("options", options), ("config", config)):
             expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
         options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
-        learns_first = hasattr(entry.task, "demonstrate") or config.get("start")
-        if recipe.algorithm == "ppo" and learns_first and "demonstrations" not in config:
-            config["demonstrations"] = min(DEMONSTRATIONS, int(config.get("iterations", ppo.Config.iterations)) // 2)
+        if recipe.algorithm == "ppo" and (config.get("start") or hasattr(entry.task, "demonstrate")):
+            n = min(FIRST_ITERATIONS, int(config.get("iterations", ppo.Config.iterations)) // 2)
+            config.setdefault("value_iterations" if config.get("start") else "demonstrations", n)
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
         if devices is not None:

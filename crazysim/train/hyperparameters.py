@@ -23,7 +23,7 @@ WEIGHT_NAMES = ("entropy", "value_weight")
 """Hyperparameters that are finite, and 0 or larger."""
 LIMIT_NAMES = ("max_grad_norm",)
 """Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
-COUNT_NAMES = ("memory", "demonstrations", "opponents", "critic_epochs")
+COUNT_NAMES = ("memory", "demonstrations", "value_iterations", "opponents", "critic_epochs")
 """Hyperparameters that are whole numbers of at least 0. All other whole numbers are larger than 0."""
 MAX_COUNT, MAX_SIZE = 2**26, 2**14
 """Largest whole number, and largest size of a layer or a memory."""

@@ -100,10 +100,12 @@ class Config:
     """Initial standard deviation of the actions."""
     demonstrations: int = 0
     """Iterations at the start in which the policy learns the actions of the task's ``demonstrate`` where it flies
-    itself, and the value function its returns. With ``start`` the policy stays as it is meanwhile."""
+    itself, and the value function its returns."""
     start: str = ""
     """Folder of a run, of any algorithm, from whose policy the training starts; empty for a new policy. It must have
     the same network; a dense one without memory may have fewer observations."""
+    value_iterations: int = 0
+    """Iterations at the start in which the value function learns, and the policy stays as it is."""
     opponents: int = 0
     """Drones of each world, its last ones, that earlier versions of the policy or ``rivals`` fly; the policy learns
     from the others. Each version and each rival flies in an equal share of the worlds. 0 if it flies all drones."""
@@ -224,7 +226,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array, network: Network | No
     """
     config = configs[0]
     check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))
-    if config.demonstrations and not config.start:
+    if config.demonstrations:
         check_demonstration(env)
     rivals = load_opponents(env, config, env.sim.n_worlds // len(configs)) if config.opponents else ()
     k_policy, k_value, k_env, k_agent = split_keys(keys, 4)
@@ -283,7 +285,7 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     key, k_fly, k_learn = split_keys(learner.agents.key, 3)
     agents, n_seeds = learner.agents.replace(key=key), len(learner.agents.key)
     initial_memory = _initial_memory(agents, learner.env)
-    show = env.task.demonstrate if config.demonstrations and not config.start else None
+    show = env.task.demonstrate if config.demonstrations else None
     # Fly the worlds of all seeds as one batch.
     state, memory, records = rollout_seeds(
         env,
@@ -299,9 +301,9 @@ def advance(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     # Update each agent with the worlds of its seed.
     blocks = split_blocks((learner.memory, state.obs, memory[1]), n_seeds)
     axes = (0, 0, 1, 0, 0, 0, 0, 0)
-    imitates = jnp.broadcast_to(learner.iteration < config.demonstrations, n_seeds)
+    iterations = jnp.broadcast_to(learner.iteration, n_seeds)
     agents, metrics = for_each_seed(
-        learn, agents, config, records, *blocks, k_learn, imitates, axes=axes, mesh=env.sim.mesh
+        learn, agents, config, records, *blocks, k_learn, iterations, axes=axes, mesh=env.sim.mesh
     )
     if config.opponents:
         agents = for_each_seed(partial(keep_version, config, learner.iteration + 1), agents)
@@ -359,7 +361,7 @@ def learn(
     last_obs: Obs,
     last_memory: Any,
     key: Array,
-    imitates: Array,
+    iteration: Array,
 ) -> tuple[Agent, dict[str, Array]]:
     """Update the agent with the records of its rollout, and return it with the metrics of the iteration.
 
@@ -376,10 +378,10 @@ def learn(
     # Epochs of updates on minibatches.
     own_memory = jax.tree.map(lambda x: x[:, : agent.n_learners], memory)
     data = samples, advantages, targets, jax.tree.map(lambda x: x[None], own_memory)
-    loss = partial(compute_loss, agent, config, imitates)
+    loss = partial(compute_loss, agent, config, iteration)
     parameters, optimizer, losses = run_epochs(loss, parameters, agent.optimizer, data, config, key)
-    if config.start:  # at first only the value function and the optimiser's moments change
-        stays = partial(jnp.where, imitates)
+    if config.value_iterations:  # at first only the value function and the optimiser's moments change
+        stays = partial(jnp.where, iteration < config.value_iterations)
         parameters = (*jax.tree.map(stays, (agent.policy, agent.log_std), parameters[:2]), parameters[2])
     # Statistics of the observations, and metrics.
     stats = agent.stats.update(raw_obs)
@@ -398,7 +400,7 @@ def learn(
 
 
 def compute_loss(
-    agent: Agent, config: Config, imitates: Array, parameters: Any, minibatch: Any
+    agent: Agent, config: Config, iteration: Array, parameters: Any, minibatch: Any
 ) -> tuple[Array, dict[str, Array]]:
     """Compute the loss of policy and value function on a minibatch: clipped objective, value error and entropy."""
     policy, log_std, value = parameters
@@ -415,7 +417,7 @@ def compute_loss(
         # Likelihood of the demonstrated actions with some noise, so that exploration does not end.
         square = jnp.square(sample.shown - mean) + LEAST_STD**2
         likelihood = -(0.5 * square / jnp.exp(2 * log_std) + log_std).sum(axis=-1).mean()
-        objective = jnp.where(imitates, likelihood, objective)
+        objective = jnp.where(iteration < config.demonstrations, likelihood, objective)
     value_loss = 0.5 * jnp.square(values - target).mean()
     total_loss = -objective + config.value_weight * value_loss - config.entropy * log_std.sum()
     return total_loss, {"value_error": value_loss, "ratio_off": jnp.abs(ratio - 1).mean()}

@@ -162,8 +162,8 @@ class _Trial:
         self.size = SIZES["cpu" if platform == "cpu" else "gpu"]
         n_places, n_worlds = self.size.n_places, self.size.n_worlds
         self.iterations = min(self.size.iterations, config.config["iterations"])
-        n_shown = min(config.config["demonstrations"], self.iterations // 4)
-        hyperparameters = config.config | {"iterations": self.iterations, "demonstrations": n_shown}
+        first = {x: min(config.config[x], self.iterations // 4) for x in ("demonstrations", "value_iterations")}
+        hyperparameters = config.config | first | {"iterations": self.iterations}
         self.class_recipe = dict(entry_of(config.task).task.recipe)
         self.config = dataclasses.replace(config, n_worlds=n_worlds, config=hyperparameters)
         env = self.config.make_training_env(n_places)

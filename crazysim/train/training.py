@@ -361,9 +361,12 @@ class _Run:
         )
         if start := self.config.config.get("start"):
             self.log(f"starts from the policy of {start}")
-        if (n_shown := self.config.config.get("demonstrations", 0)) > n_done:
-            what = "train the value function alone" if start else "learn from demonstrate(obs)"
-            self.log(f"iterations 1 to {n_shown} {what}; leave out: --config demonstrations=0")
+        for name, what in (
+            ("value_iterations", "train the value function alone"),
+            ("demonstrations", "learn from demonstrate(obs)"),
+        ):
+            if (n := self.config.config.get(name, 0)) > n_done:
+                self.log(f"iterations 1 to {n} {what}; leave out: --config {name}=0")
         if self.stored_hash != self.code_hash:
             self.log("the file of the task has changed since the checkpoint was written; it is used as it is now")
         if n_done >= self.n_iterations:

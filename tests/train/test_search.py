@@ -145,6 +145,11 @@ def test_a_class_with_a_demonstration_begins_with_it():
     assert TrainConfig.create("hover").config["demonstrations"] == 0
 
 
+def test_a_policy_of_another_run_begins_with_its_value_function():
+    config = TrainConfig.create(TASK, config={"start": "run", "iterations": 50}).config
+    assert (config["value_iterations"], config["demonstrations"]) == (25, 0)
+
+
 @pytest.mark.parametrize(
     ("task", "message"),
     [

@@ -235,7 +235,7 @@ def test_a_finished_run_resumes_with_more_iterations(uninterrupted_run, tmp_path
 @pytest.mark.parametrize("algorithm", ["ppo", "apg"])
 def test_a_training_starts_from_the_policy_of_a_run(uninterrupted_run, algorithm):
     """First the value function learns alone, then the policy, too; another network or command level is an error."""
-    folder, config = str(uninterrupted_run.folder), SMALL | {"demonstrations": 1, "entropy": 0.1}
+    folder, config = str(uninterrupted_run.folder), SMALL | {"value_iterations": 1, "entropy": 0.1}
     config = config if algorithm == "ppo" else {"n_steps": 8, "hidden": (16, 16)}
     module, policy = {"ppo": ppo, "apg": apg}[algorithm], uninterrupted_run.policy
     env = make("hover", 4, seconds=0.4, engine="plain")
