@@ -85,7 +85,7 @@ class Hierarchy(NamedTuple):
     """Boxes of the nodes, one order after the other. (8 * n_nodes, 6)"""
     links: Array
     """Index of the node after the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
-    geoms: Array
+    fixed_geoms: Array
     """Geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
     ranges: Array
     """First node, and number of nodes, of the hierarchy of each map. (n_maps, 2)"""
@@ -104,7 +104,7 @@ class Tables(NamedTuple):
     links: Array
     """As in ``Hierarchy``. (8 * n_nodes, 2)"""
     fixed_geoms: Array
-    """Fixed geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
+    """As in ``Hierarchy``. (n_fixed, 16)"""
     movable_boxes: Array
     """Boxes of the nodes of the movable geoms in every world, in the first order. (n_worlds * n_movable_nodes, 6)"""
     movable_links: Array
@@ -337,8 +337,7 @@ def first_hit_of_ray(
     """
     n_nodes, n_fixed, n_movable, n_movable_nodes, *map_range = counts
     best = limit, jnp.int32(-1)
-    fixed = t.codes, t.boxes, t.links, t.fixed_geoms
-    best = first_fixed_hit(surfaces, Hierarchy(*fixed, t.counts), ray, best, n_nodes, map_range or (0, n_nodes))
+    best = first_fixed_hit(surfaces, t, ray, best, n_nodes, map_range or (0, n_nodes))
 
     def read_node(k: Array) -> tuple[Sequence[Array], Array, Array]:
         next_node, geom, first_order = table_rows(t.movable_links, k)
@@ -469,7 +468,7 @@ def _mesh_normal(shape: Shape, x: Array, y: Array, z: Array) -> Components:
 
 def first_fixed_hit(
     surfaces: Sequence[Surface],
-    tables: Hierarchy,
+    tables: Hierarchy | Tables,
     ray: Ray,
     best: BestHit,
     n_nodes: Array | int,
@@ -493,7 +492,7 @@ def first_fixed_hit(
 
     def hit_geom(geom: Array, is_crossing: Array, best: BestHit) -> BestHit:
         code, _ = table_rows(tables.codes, geom)
-        return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, is_crossing, best)
+        return _nearer_hit(surfaces, code, geom, table_rows(tables.fixed_geoms, geom), ray, is_crossing, best)
 
     return _walk_hierarchy(read_node, hit_geom, ray, best, n_nodes, first_node, n_nodes_of_map, is_packet)
 

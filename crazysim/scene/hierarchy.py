@@ -34,7 +34,7 @@ class _Node:
     """Index of the geom of a leaf; -1 for other nodes."""
 
 
-def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def build_hierarchy(low: np.ndarray, high: np.ndarray, n_orders: int = N_ORDERS) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes of a hierarchy of boxes, in all orders.
 
     Bit k of an order's number is set where directions along axis k are negative.
@@ -42,22 +42,23 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
     Args:
         low: Lower corners of the boxes, m. (n, 3)
         high: Upper corners, m. (n, 3)
+        n_orders: Number of orders; 1 for a search that has no direction.
 
     Returns:
-        Lower and upper corner of the box of each node, m. (8, n_nodes, 6)
-        Index of the node after its subtree, and index of the geom of a leaf or -1. (8, n_nodes, 2)
+        Lower and upper corner of the box of each node, m. (n_orders, n_nodes, 6)
+        Index of the node after its subtree, and index of the geom of a leaf or -1. (n_orders, n_nodes, 2)
     """
     low, high = low - BOX_PADDING, high + BOX_PADDING
     is_bounded = np.all(high - low < UNBOUNDED_LENGTH, axis=1)
     roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~is_bounded)]
     if is_bounded.any():
         roots.append(_build_tree(low, high, np.flatnonzero(is_bounded)))
-    rows = np.array([_node_rows(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
+    rows = np.array([_node_rows(roots, order) for order in range(n_orders)]).reshape(n_orders, -1, 8)
     return rows[..., :6], rows[..., 6:].astype(np.int32)
 
 
 def build_hierarchies(
-    low: np.ndarray, high: np.ndarray, groups: Sequence[np.ndarray]
+    low: np.ndarray, high: np.ndarray, groups: Sequence[np.ndarray], n_orders: int = N_ORDERS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return hierarchies of groups of boxes, one after the other in every order; see ``build_hierarchy``.
 
@@ -65,15 +66,16 @@ def build_hierarchies(
         low: Lower corners of all boxes, m. (n, 3)
         high: Upper corners, m. (n, 3)
         groups: Indices of the boxes of each group.
+        n_orders: As in ``build_hierarchy``.
 
     Returns:
-        Boxes of the nodes. (8, n_nodes, 6)
-        Links, in which nodes are counted from the first node of their group. (8, n_nodes, 2)
+        Boxes of the nodes. (n_orders, n_nodes, 6)
+        Links, in which nodes are counted from the first node of their group. (n_orders, n_nodes, 2)
         First node and number of nodes of each group. (n_groups, 2)
     """
-    boxes, links, counts = [np.zeros((N_ORDERS, 0, 6))], [np.zeros((N_ORDERS, 0, 2), np.int32)], []
+    boxes, links, counts = [np.zeros((n_orders, 0, 6))], [np.zeros((n_orders, 0, 2), np.int32)], []
     for group in groups:
-        group_boxes, group_links = build_hierarchy(low[group], high[group])
+        group_boxes, group_links = build_hierarchy(low[group], high[group], n_orders)
         is_leaf = group_links[..., 1] >= 0
         group_links[..., 1][is_leaf] = group[group_links[..., 1][is_leaf]]
         boxes.append(group_boxes)

@@ -37,7 +37,7 @@ def nearest_geom(
         group: Index of the group that is searched. ()
     """
     dtype = point[0].dtype
-    node_boxes, node_links, ranges = build_hierarchies(low, high, groups)
+    node_boxes, node_links, ranges = build_hierarchies(low, high, groups, n_orders=1)
     first_node, n_nodes = table_rows(jnp.asarray(ranges), group)
     boxes, links = jnp.asarray(node_boxes[0], dtype), jnp.asarray(node_links[0])
     point = [lax.stop_gradient(x) for x in point]

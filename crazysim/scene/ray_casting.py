@@ -266,7 +266,7 @@ def _hit_fixed_geoms(
 
     chunks = [slice(k, k + MAX_LOOP_RAYS) for k in range(0, len(origins), MAX_LOOP_RAYS)]
     geom_index = jnp.concatenate([first_geoms(origins[chunk], directions[chunk]) for chunk in chunks])
-    rows = jnp.take(tables.geoms, jnp.maximum(geom_index, 0), axis=0)
+    rows = jnp.take(tables.fixed_geoms, jnp.maximum(geom_index, 0), axis=0)
     distance, normal_at = _hit_rows(surfaces, targets.codes, geom_index, rows, origin, direction)
     body_indices = jnp.asarray([target.body_index for target in targets.fixed_geoms], jnp.int32)
     return distance, normal_at(distance), jnp.take(body_indices, jnp.maximum(geom_index, 0))

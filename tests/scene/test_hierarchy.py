@@ -44,3 +44,8 @@ def test_equal_boxes_and_no_boxes_have_a_hierarchy():
     assert build_hierarchy(np.zeros((0, 3)), np.zeros((0, 3)))[0].shape == (N_ORDERS, 0, 6)
     geom = build_hierarchy(np.zeros((3000, 3)), np.ones((3000, 3)))[1][3, :, 1]
     assert sorted(geom[geom >= 0]) == list(range(3000))
+
+
+def test_one_order_is_the_first_of_all(boxes):
+    for first, orders in zip(build_hierarchy(*boxes, n_orders=1), build_hierarchy(*boxes), strict=True):
+        np.testing.assert_array_equal(first, orders[:1])
