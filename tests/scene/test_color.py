@@ -44,6 +44,21 @@ def textured_box(rng):
         face="{" ".join(map(str, faces))}"/>"""
 
 
+def textured_icosphere():
+    """Return a mesh of MJCF of 80 triangles, whose coordinates are continuous, but not linear over several of them."""
+    points = [np.roll([0, a, b * (1 + 5**0.5) / 2], k) for k in range(3) for a in (-1, 1) for b in (-1, 1)]
+    triangles = np.array(list(itertools.combinations(points, 3)))
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1)
+    triangles = triangles[np.isclose(edges, 2).all(axis=1)]
+    middles = triangles + np.roll(triangles, -1, axis=1)
+    parts = [np.stack([2 * triangles[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3)]
+    triangles = np.concatenate([middles, *parts])
+    triangles[np.linalg.det(triangles) < 0] = triangles[np.linalg.det(triangles) < 0, ::-1]
+    corners = triangles.reshape(-1, 3) / np.linalg.norm(triangles.reshape(-1, 3), axis=-1, keepdims=True)
+    return f"""<mesh name="icosphere" vertex="{text(0.7 * corners)}" texcoord="{text(np.sin(2 * corners[:, :2]))}"
+        face="{" ".join(map(str, range(len(corners))))}"/>"""
+
+
 def random_scene(rng, has_textures, has_shadows):
     """Return MJCF of 20 objects above a floor, with two lights and a camera.
 
@@ -64,9 +79,10 @@ def random_scene(rng, has_textures, has_shadows):
         materials += '<material name="tiles" texture="checker" texrepeat="4 3" texuniform="true"/>'
         materials += """<mesh name="wedge" vertex="0 0 0 .9 0 0 0 .8 0 0 0 .7"/>
             <hfield name="hill" nrow="3" ncol="3" elevation="0 0 0 0 1 0 0 0 0" size="1.5 1.5 .6 .1"/>"""
-        materials += textured_box(np.random.default_rng(7))
+        materials += textured_box(np.random.default_rng(7)) + textured_icosphere()
         geoms += """<geom type="mesh" mesh="wedge" pos="2 .8 1.2" quat=".5 .5 -.5 .6" material="tiles"/>
             <geom type="mesh" mesh="carton" pos="1.5 -.3 2" quat=".5 .2 -.5 .6" material="tiles"/>
+            <geom type="mesh" mesh="icosphere" pos="1.5 1 2.2" quat=".5 .2 -.5 .6" material="tiles"/>
             <geom type="hfield" hfield="hill" pos="4 -1 0" material="tiles"/>
             <geom type="plane" size=".9 .6 .1" pos="3 -1 2" euler="20 -70 10" material="tiles"/>"""
     floor = 'texture="checker" texrepeat="1 1" texuniform="true"' if has_textures else ""
