@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from crazysim.commands import airframe, demo, info, replay, training
 from crazysim.engine import cache
@@ -19,11 +20,16 @@ EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqd
 """Extra of crazysim that installs each package."""
 
 
+class _Parser(argparse.ArgumentParser):
+    # Each command refuses what it does not know, with its own usage instead of that of all commands.
+    def parse_known_args(self, *args: Any, **options: Any) -> Any:
+        known, unknown = super().parse_known_args(*args, **options)
+        return self.error(f"unrecognized arguments: {' '.join(unknown)}") if unknown else (known, unknown)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit status; without a command, print the help."""
-    parser = argparse.ArgumentParser(
-        prog="crazysim", description="A drone simulator in which millions of worlds advance in one call."
-    )
+    parser = _Parser(prog="crazysim", description="A drone simulator in which millions of worlds advance in one call.")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
     for module in (demo, replay, show, live, race, training, airframe, identify, validate, info):
         module.add_parsers(commands)

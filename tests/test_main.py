@@ -49,6 +49,15 @@ def test_an_error_of_the_system_is_a_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "crazysim: [Errno 28] No space left on device: 'out'\n"
 
 
+@pytest.mark.parametrize(("command", "option"), [("render run", "--film"), ("airframe check cf2x_L250", "--picture")])
+def test_an_unknown_option_shows_the_options_of_its_command(command, option, capsys):
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--out", "file"])
+    error = capsys.readouterr().err
+    assert option in error
+    assert "unrecognized arguments: --out file" in error
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_command_states_defaults_once(command, capsys):
     with pytest.raises(SystemExit):
