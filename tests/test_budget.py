@@ -13,7 +13,7 @@ BUDGET = {
     "commands": 908,
     "control": 1394,
     "core": 1581,
-    "crazysim": 840,
+    "crazysim": 845,
     "drones": 516,
     "dynamics": 367,
     "engine": 6794,
