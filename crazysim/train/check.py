@@ -58,7 +58,11 @@ def check_task(task: str | Task, log: Callable[[str], None] = print, **settings:
         settings["config"] = dict(settings.get("config") or {}) | {"iterations": ITERATIONS}
         run(task, Path(folder) / "run", film=False, log=lambda _: None, progress=False, **settings)
         before, *_, after = read_curve(Path(folder) / "run")
-    log(f"after {ITERATIONS} iterations, the return has changed from {before['reward']:.3g} to {after['reward']:.3g}")
+    start = f" from the policy of {config.config['start']}" if config.config.get("start") else ""
+    log(
+        f"after {ITERATIONS} iterations{start}, the return has changed from {before['reward']:.3g} to "
+        f"{after['reward']:.3g}"
+    )
     if after["reward"] > before["reward"] and after["error"] > 1.5 * before["error"]:
         findings.append(
             f"The return rises, but the error does, too, from {before['error']:.3g} to {after['error']:.3g} "

@@ -43,30 +43,15 @@ def test_flights_tell_what_is_wrong(case):
 def test_the_command_checks_a_task_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(check, "N_WORLDS", 8)
-    status = 0  # nothing was found
-    small = "n_steps=8 epochs=1 minibatches=1 hidden=[8]"
-    assert (
-        main(
-            [
-                "train",
-                "hover",
-                "--check",
-                "--worlds",
-                "4",
-                "--set",
-                "seconds=0.4",
-                "engine=interpret",
-                "--config",
-                *small.split(),
-            ]
-        )
-        == status
-    )
+    small = "--worlds 4 --set seconds=0.4 engine=interpret --config n_steps=8 epochs=1 minibatches=1 hidden=[8]"
+    main(["train", "hover", *small.split(), "--iterations", "1", "--no-film", "--out", "run"])
+    capsys.readouterr()
+    assert main(["train", "hover", "--check", "--start", "run", *small.split()]) == 0, "something was found"
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines[:2]] == [check.HOVER, check.RANDOM]
     assert lines[2].startswith("define demonstrate(obs)")
-    assert lines[3].startswith("after 10 iterations")
-    assert not list(tmp_path.iterdir())
+    assert lines[3].startswith(f"after 10 iterations from the policy of {tmp_path / 'run'}, the return")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 BROKEN = """
