@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -46,6 +47,11 @@ def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) 
     """
     carry = condition, value
     return lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(c[0]), fn(c[1])), carry)[1]
+
+
+def select_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) -> Carry:
+    """Return the same as ``compute_where``, with derivatives of all modes; ``fn`` is always computed."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), fn(value), value)
 
 
 def table_row(table: Array, index: Array) -> Array:

@@ -86,8 +86,16 @@ class RandomColors:
 class Appearance:
     """Materials, lights, textures and sky of a compiled scene."""
 
-    def __init__(self, model: mujoco.MjModel, shadows: bool, random_colors: RandomColors | None = None):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        shadows: bool,
+        random_colors: RandomColors | None = None,
+        has_derivatives: bool = False,
+    ):
         self._model, self._random_colors = model, random_colors
+        self.has_derivatives = has_derivatives
+        """Whether colours are numbers from 0 to 1 with derivatives, instead of uint8."""
         data = mujoco.MjData(model)
         for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
             update(model, data)

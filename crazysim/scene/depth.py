@@ -22,6 +22,7 @@ from crazysim.errors import ConfigError, UnknownNameError, require
 from crazysim.scene.appearance import Appearance
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import IGNORES_NONE
+from crazysim.scene.hit_color import unpack_color
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays, cast_rays_in_worlds, raise_to_floor
@@ -344,12 +345,15 @@ def build_depth_fn(
             x = jnp.swapaxes(x, -3 - n_trailing, -2 - n_trailing)
             return x.reshape(*leading, len(cameras), height, width, *trailing)
 
+        def untile_color(color: Array) -> Array:
+            return unpack_color(untile(color[..., 0], 0)) if color.dtype == np.int32 else untile(color, 1)
+
         return hits.replace(
             distance=untile(hits.distance * cosine, 0),
             normal=untile(hits.normal, 1),
             point=untile(hits.point, 1),
             body_index=untile(hits.body_index, 0),
-            color=None if hits.color is None else _unpack_color(untile(hits.color, 0)),
+            color=None if hits.color is None else untile_color(hits.color),
             is_hidden=None if hits.is_hidden is None else untile(hits.is_hidden, 0),
             earlier_point=None if hits.earlier_point is None else untile(hits.earlier_point, 1),
             was_hidden=None if hits.was_hidden is None else untile(hits.was_hidden, 0),
@@ -410,10 +414,6 @@ def build_depth_fn(
         return jax.lax.map(cast_in_world, parts, batch_size=worlds_per_batch)
 
     return depth
-
-
-def _unpack_color(packed: Array) -> Array:
-    return jax.lax.bitcast_convert_type(packed, np.uint8)[..., :3]
 
 
 def _pixel_angle(rays: np.ndarray) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from crazysim.core.branches import compute_where, table_rows
@@ -110,6 +111,28 @@ class Paint(NamedTuple):
     """See ``View``. (1, 10)"""
 
 
+class Sight(NamedTuple):
+    """A ray of a camera, and the geom that it meets."""
+
+    axes: Sequence[Array]
+    """Matrix with the axes of the camera as columns, row by row, world frame. () each"""
+    ray: Ray
+    """The ray."""
+    distance: Array
+    """Distance to the geom, m; any number where there is none. ()"""
+    geom: Array
+    """Index of the geom; -1 for none. ()"""
+    look: Array
+    """Its row in ``Paint.looks`` and ``Paint.textures``. ()"""
+    first_light: Array
+    """First row of its world in ``Paint.lights``. ()"""
+
+
+ReachLight = Callable[[int, Array, Components, Sequence[Array], Components, Array], Array]
+"""Function of a light's index, its strength, a point, the normal there, the direction to the light and the distance to
+it, m, that returns the strength that reaches the point."""
+
+
 def color_at_hit(
     lights: Sequence[Light],
     has_sky: bool,
@@ -121,7 +144,7 @@ def color_at_hit(
     index: Array,
     *tables: Array,
 ) -> list[Array]:
-    """Return the colour of a ray, 8 bits each for red (lowest), green and blue. () each
+    """Return red, green and blue of a ray, from 0 to 1. () each
 
     Args:
         lights: Lights in the order of ``Paint.lights``.
@@ -134,57 +157,146 @@ def color_at_hit(
         index: Index of the ray, as in ``first_hit``. ()
         *tables: Fields of ``Paint`` and ``Tables``, then the two results of ``first_hit``. (n_rays, 1) each
     """
+    paint, sight, describe, reach_light = _look_along(
+        lights, is_per_world, surfaces, n_pixels, n_cameras, index, *tables
+    )
+    color = shade(lights, has_sky, has_haze, paint, sight, describe, reach_light)
+    return [jnp.clip(c, 0.0, 1.0) for c in color]
+
+
+def packed_color_at_hit(*args: Any) -> list[Array]:
+    """Return the same as ``color_at_hit``, 8 bits each for red (lowest), green and blue. ()"""
+    # OpenGL rounds colours to the nearest of 255 steps.
+    red, green, blue = ((255 * c + 0.5).astype(jnp.int32) for c in color_at_hit(*args))
+    return [red + green * 256 + blue * 65536]
+
+
+def unpack_color(packed: Array) -> Array:
+    """Return the colours that ``packed_color_at_hit`` returned, uint8. (..., 3)"""
+    return lax.bitcast_convert_type(packed, np.uint8)[..., :3]
+
+
+def trace_at_hit(
+    lights: Sequence[Light],
+    has_sky: bool,
+    has_haze: bool,
+    is_per_world: bool,
+    surfaces: Sequence[Surface],
+    n_pixels: int,
+    n_cameras: int,
+    index: Array,
+    *tables: Array,
+) -> list[Array]:
+    """Return what ``shade`` needs beside the normal of a surface: position along both axes of the texture, each
+    with its gradient in the world frame, 1/m, and for each light whether it reaches the surface, 0 or 1. () each
+
+    For the arguments see ``color_at_hit``.
+    """
+    del has_sky, has_haze
+    paint, sight, describe, reach_light = _look_along(
+        lights, is_per_world, surfaces, n_pixels, n_cameras, index, *tables
+    )
+    normal, texture = (numbers := describe())[:3], numbers[3:]
+    point = _end(sight)
+    shares = []
+    for k, light in enumerate(lights):
+        row = LightRow.read(paint.lights, sight.first_light + k)
+        strength, to_light, limit = _incidence(light, row, point, _column(sight.axes, 2))
+        shares.append(jnp.where(reach_light(k, strength, point, normal, to_light, limit) > 0, 1.0, 0.0))
+    return [*texture, *shares]
+
+
+def _look_along(
+    lights: Sequence[Light],
+    is_per_world: bool,
+    surfaces: Sequence[Surface],
+    n_pixels: int,
+    n_cameras: int,
+    index: Array,
+    *tables: Array,
+) -> tuple[Paint, Sight, Callable[[], Sequence[Array]], ReachLight]:
     n_paint = len(Paint._fields)
     paint, t, (distances, geoms) = Paint(*tables[:n_paint]), Tables(*tables[n_paint:-2]), tables[-2:]
     world, ray = camera_ray(t, n_pixels, n_cameras, index)
     counts = counts_in_world(t, world)
-    pose = table_rows(t.camera_poses, lax.div(index, jnp.int32(n_pixels)))
-    back = pose[5], pose[8], pose[11]
+    axes = table_rows(t.camera_poses, lax.div(index, jnp.int32(n_pixels)))[3:]
     (distance,), (geom,) = table_rows(distances, index), table_rows(geoms, index)
-    view = View(*table_rows(paint.view, jnp.int32(0)))
-    zero = jnp.zeros_like(distance)
     scene = world if is_per_world else jnp.int32(0)
     row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
+    look = row + scene * (counts[1] + counts[2])
 
-    def shade(_: Components) -> Components:
-        surface_numbers = surface_at_hit(
-            _normal_and_texture, 11, surfaces, n_pixels, n_cameras, index, *tables[n_paint:]
-        )
+    def describe() -> Sequence[Array]:
+        return surface_at_hit(_normal_and_texture, 11, surfaces, n_pixels, n_cameras, index, *tables[n_paint:])
+
+    def reach_light(
+        k: int, strength: Array, point: Components, normal: Sequence[Array], to_light: Components, limit: Array
+    ) -> Array:
+        def trace_to_light(strength: Array) -> Array:
+            x, y, z = (p + SHADOW_OFFSET * n for p, n in zip(point, normal, strict=True))
+            shadow_ray = Ray((x, y, z), to_light, ray.ignored_drone)
+            return jnp.where(first_hit_of_ray(surfaces, t, counts, world, shadow_ray, limit)[1] < 0, strength, 0.0)
+
+        if not lights[k].casts_shadow:
+            return strength
+        is_facing = (strength > 0) & (_dot(normal, to_light) > 0)
+        return compute_where(is_facing, trace_to_light, jnp.where(is_facing, strength, 0.0))
+
+    return paint, Sight(axes, ray, distance, geom, look, scene * len(lights)), describe, reach_light
+
+
+def shade(
+    lights: Sequence[Light],
+    has_sky: bool,
+    has_haze: bool,
+    paint: Paint,
+    sight: Sight,
+    describe: Callable[[], Sequence[Array]],
+    reach_light: ReachLight,
+    branch: Callable[..., Any] = compute_where,
+) -> Components:
+    """Return red, green and blue of a ray, from 0 to 1 before they are limited. () each
+
+    Args:
+        lights: As in ``color_at_hit``, like the next two.
+        has_sky: Whether there is a sky.
+        has_haze: Whether there is haze.
+        paint: Colours of the scene.
+        sight: The ray and the geom that it meets.
+        describe: Function that returns the normal of the surface, then its texture, as from ``trace_at_hit``.
+        reach_light: Function for the shadows of lights.
+        branch: ``compute_where``, or ``select_where`` for derivatives.
+    """
+    ray, distance, view = sight.ray, sight.distance, View(*table_rows(paint.view, jnp.int32(0)))
+    back, zero = _column(sight.axes, 2), jnp.zeros_like(sight.distance)
+
+    def light_surface(_: Components) -> Components:
+        surface_numbers = describe()
         normal, (u, *u_rates), (v, *v_rates) = surface_numbers[:3], surface_numbers[3:7], surface_numbers[7:]
-        look = row + scene * (counts[1] + counts[2])
-        *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, look)
-        point = [o + distance * d for o, d in zip(ray.origin, ray.direction, strict=True)]
+        *own_color, emission, specular, exponent, u_scale, v_scale, shift = table_rows(paint.looks, sight.look)
+        point = _end(sight)
         to_eye = [-d for d in ray.direction]
         steepness = _dot(normal, to_eye)
-
-        def without_shadow(strength: Array, to_light: Components, limit: Array) -> Array:
-            def trace_to_light(strength: Array) -> Array:
-                x, y, z = (p + SHADOW_OFFSET * n for p, n in zip(point, normal, strict=True))
-                shadow_ray = Ray((x, y, z), to_light, ray.ignored_drone)
-                return jnp.where(first_hit_of_ray(surfaces, t, counts, world, shadow_ray, limit)[1] < 0, strength, 0.0)
-
-            is_facing = (strength > 0) & (_dot(normal, to_light) > 0)
-            return compute_where(is_facing, trace_to_light, jnp.where(is_facing, strength, 0.0))
-
         # OpenGL limits the sum of all lights without shadows, and each light with shadows, which MuJoCo adds to it.
         color, shaded_color = [c * (emission + view.ambient) for c in own_color], [zero] * 3
         for k, light in enumerate(lights):
-            row_of_light = LightRow.read(paint.lights, scene * len(lights) + k)
-            parts = _light(light, row_of_light, point, normal, to_eye, back, specular, exponent, without_shadow)
+            row_of_light = LightRow.read(paint.lights, sight.first_light + k)
+            strength, to_light, limit = _incidence(light, row_of_light, point, back)
+            strength = reach_light(k, strength, point, normal, to_light, limit)
+            parts = _reflection(row_of_light, strength, to_light, normal, to_eye, specular, exponent)
             part = [a * own + b for own, (a, b) in zip(own_color, parts, strict=True)]
             if light.casts_shadow:
                 shaded_color = [a + jnp.minimum(b, 1.0) for a, b in zip(shaded_color, part, strict=True)]
             else:
                 color = [a + b for a, b in zip(color, part, strict=True)]
         color = [jnp.minimum(a, 1.0) + b for a, b in zip(color, shaded_color, strict=True)]
-        first_level, n_levels = table_rows(paint.textures, look)
+        first_level, n_levels = table_rows(paint.textures, sight.look)
 
         def draw_texture(color: Components) -> Components:
             # The image whose texels are nearest to the distance between neighbouring pixels on the surface.
             _, width, height = table_rows(paint.levels, first_level)
             spacing = -distance * view.pixel_angle * _dot(ray.direction, back)
             squared_rate = zero
-            for axis in ((pose[3], pose[6], pose[9]), (pose[4], pose[7], pose[10])):
+            for axis in (_column(sight.axes, 0), _column(sight.axes, 1)):
                 slope = _dot(normal, axis) / jnp.maximum(steepness, MIN_COSINE)
                 step = [spacing * (a + slope * d) for a, d in zip(axis, ray.direction, strict=True)]
                 du, dv = _dot(u_rates, step) * u_scale * width, _dot(v_rates, step) * v_scale * height
@@ -196,21 +308,26 @@ def color_at_hit(
             texel = _interpolate(paint, level, u * u_scale - shift, v * v_scale - shift)
             return tuple(c * k for c, k in zip(color, texel, strict=True))  # type: ignore[return-value]
 
-        return compute_where(n_levels > 0, draw_texture, tuple(color))  # type: ignore[arg-type]
+        return branch(n_levels > 0, draw_texture, tuple(color))
 
     x, y, rise = ray.direction
     level_share = safe_sqrt(x * x + y * y)
-    reach = jnp.where(geom >= 0, distance, jnp.inf) * level_share
+    reach = jnp.where(sight.geom >= 0, distance, jnp.inf) * level_share
     color = zero, zero, zero
     is_far = ~(reach < view.radius)
     if has_sky:
-        color = compute_where(is_far, lambda _: _sky_color(paint, view, ray.direction), color)
-    color = compute_where(~is_far, shade, color)
-    if has_haze:
-        color = _add_haze(view, ray.origin[2], rise, level_share, reach, color)
-    # OpenGL rounds colours to the nearest of 255 steps.
-    red, green, blue = ((255 * jnp.clip(c, 0.0, 1.0) + 0.5).astype(jnp.int32) for c in color)
-    return [red + green * 256 + blue * 65536]
+        color = branch(is_far, lambda _: _sky_color(paint, view, ray.direction), color)
+    color = branch(~is_far, light_surface, color)
+    return _add_haze(view, ray.origin[2], rise, level_share, reach, color) if has_haze else color
+
+
+def _end(sight: Sight) -> Components:
+    x, y, z = (o + sight.distance * d for o, d in zip(sight.ray.origin, sight.ray.direction, strict=True))
+    return x, y, z
+
+
+def _column(matrix: Sequence[Array], k: int) -> Components:
+    return matrix[k], matrix[k + 3], matrix[k + 6]
 
 
 def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
@@ -245,18 +362,8 @@ def _normal_and_texture(
     return *world_vector(row, normal), *texture
 
 
-def _light(
-    light: Light,
-    row: LightRow,
-    point: Sequence[Array],
-    normal: Sequence[Array],
-    to_eye: Sequence[Array],
-    back: Components,
-    specular: Array,
-    exponent: Array,
-    without_shadow: Callable[[Array, Components, Array], Array],
-) -> list[tuple[Array, Array]]:
-    # Per channel: light that the surface's colour multiplies, and its highlight.
+def _incidence(light: Light, row: LightRow, point: Components, back: Components) -> tuple[Array, Components, Array]:
+    # Strength at a point without shadows, direction to the light, and distance to it.
     strength, distance = jnp.ones_like(point[0]), jnp.full_like(point[0], jnp.inf)
     to_light: Any = back if light.is_headlight else [-x for x in row.dir]
     if light.is_spot:
@@ -266,8 +373,19 @@ def _light(
         cosine = -_dot(to_light, row.dir)
         falloff = row.attenuation[0] + distance * (row.attenuation[1] + distance * row.attenuation[2])
         strength = jnp.where(cosine >= row.cutoff, _power(jnp.maximum(cosine, 0.0), row.exponent) / falloff, 0.0)
-    if light.casts_shadow:
-        strength = without_shadow(strength, tuple(to_light), distance)
+    return strength, tuple(to_light), distance  # type: ignore[return-value]
+
+
+def _reflection(
+    row: LightRow,
+    strength: Array,
+    to_light: Components,
+    normal: Sequence[Array],
+    to_eye: Sequence[Array],
+    specular: Array,
+    exponent: Array,
+) -> list[tuple[Array, Array]]:
+    # Per channel: light that the surface's colour multiplies, and its highlight.
     cosine = _dot(normal, to_light)
     # Of the direction midway between light and eye, which is their sum with the length sqrt(2 + 2 l.e).
     square = jnp.maximum(2 + 2 * _dot(to_light, to_eye), 1e-6)

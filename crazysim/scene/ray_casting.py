@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim import rotation
-from crazysim.core.branches import table_rows
+from crazysim.core.branches import select_where, table_rows
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
@@ -41,7 +41,7 @@ from crazysim.scene.first_hit import (
     ray_in_frame,
 )
 from crazysim.scene.hierarchy import N_ORDERS
-from crazysim.scene.hit_color import color_at_hit
+from crazysim.scene.hit_color import Paint, Sight, color_at_hit, packed_color_at_hit, shade, trace_at_hit
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import map_index_of
 
@@ -78,7 +78,8 @@ class Hits(PyTree):
     names: tuple[str, ...] = static()
     """Names of floor, objects and drones, in the order of ``body_index``."""
     color: Array | None = None
-    """Colour of the surface, or of the sky, red, green and blue, uint8; None if it was not requested. (..., 3)"""
+    """Colour of the surface, or of the sky, red, green and blue, uint8, or from 0 to 1 with derivatives; None if it was
+    not requested. (..., 3)"""
     is_hidden: Array | None = None
     """Whether the second imager of a stereo camera does not see the surface; None for other cameras. (...)"""
     earlier_point: Array | None = None
@@ -356,9 +357,11 @@ def cast_rays_in_worlds(
     color = None
     if appearance is not None:
         paint = appearance.paint(data, targets.all_geoms, pixel_angle)
-        color_fn = functools.partial(color_at_hit, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
-        (packed,), _ = kernels._map_indices(color_fn, n, [*paint, *tables, *hit_table])
-        color = packed.reshape(n_worlds, -1)  # unpacked when its pixels are in the order of the image
+        color_fn = color_at_hit if appearance.has_derivatives else packed_color_at_hit
+        color_fn = functools.partial(color_fn, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
+        color, _ = kernels._map_indices(color_fn, n, [*paint, *tables, *hit_table])
+        # Packed colours are unpacked when their pixels are in the order of the image.
+        color = jnp.stack(color, axis=-1).reshape(n_worlds, -1, len(color))
     if not targets.all_geoms:
         return Hits(distance, jnp.zeros_like(origin), jnp.zeros_like(origin), geom_index, names, color)
     # The normal, in a kernel if possible, and derivatives of both.
@@ -376,8 +379,57 @@ def cast_rays_in_worlds(
         normal = normal.reshape(*distance.shape, 3)
     distance = _replace_derivative(distance, _gap(distance, normal, rows, origin, direction))
     normal = _replace_derivative(normal, normal_at(distance))
+    if appearance is not None and appearance.has_derivatives:
+        trace_fn = functools.partial(trace_at_hit, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
+        trace = map_indices(trace_fn, n, [*paint, *tables, *hit_table], platform, compile_now=False)
+        all_axes = jnp.broadcast_to(axes, (n_worlds, n_cameras, n_pixels, 3, 3)).reshape(n_worlds, -1, 9)
+        args = distance, geom_index, normal, rows, origin, direction, all_axes
+        shaded = _shade(appearance, paint, len(targets.all_geoms), jnp.stack(trace, axis=-1), *args)
+        color = _replace_derivative(color, shaded)
     body_indices = jnp.asarray([*(target.body_index for target in targets.all_geoms), -1], jnp.int32)
     return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names, color)
+
+
+def _shade(
+    appearance: Appearance,
+    paint: Paint,
+    n_geoms: int,
+    trace: Array,
+    distance: Array,
+    geom_index: Array,
+    normal: Array,
+    rows: Array,
+    origin: Array,
+    direction: Array,
+    axes: Array,
+) -> Array:
+    # Colours with derivatives, (n_worlds, n_rays, 3), from the results of ``trace_at_hit``.
+    lights, has_sky, has_haze, is_per_world = appearance.flags
+    distance = jnp.where(jnp.isfinite(distance), distance, 1.0)
+    trace = jax.lax.stop_gradient(trace.reshape(*distance.shape, -1))
+    geom_axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
+    local_point = jnp.sum(geom_axes * (origin + distance[..., None] * direction - rows[..., :3])[..., None], axis=-2)
+    local_shift = local_point - jax.lax.stop_gradient(local_point)
+    shift = jnp.sum(jax.lax.stop_gradient(geom_axes) * local_shift[..., None, :], axis=-1)
+    u, v = (trace[..., k] + jnp.sum(trace[..., k + 1 : k + 4] * shift, axis=-1) for k in (0, 4))
+    scene = jnp.broadcast_to(jnp.arange(len(distance), dtype=np.int32)[:, None] * is_per_world, distance.shape)
+    look, first_light = jnp.maximum(geom_index, 0) + scene * n_geoms, scene * len(lights)
+
+    @jax.checkpoint
+    def shade_ray(*ray: Array) -> Array:
+        distance, geom, look, first_light, u, v, *vectors = ray
+        normal, origin, direction, axes, trace = (tuple(x) for x in vectors)
+        sight = Sight(axes, Ray(origin, direction, jnp.int32(IGNORES_NONE)), distance, geom, look, first_light)
+        numbers = *normal, u, *trace[1:4], v, *trace[5:8]
+
+        def reach_light(k: int, strength: Array, *_: Any) -> Array:
+            return strength * trace[8 + k]
+
+        color = shade(lights, has_sky, has_haze, paint, sight, lambda: numbers, reach_light, select_where)
+        return jnp.clip(jnp.stack(color), 0.0, 1.0)
+
+    ray = distance, geom_index, look, first_light, u, v, normal, origin, direction, axes, trace
+    return jax.vmap(jax.vmap(shade_ray))(*ray)
 
 
 def _gap(distance: Array, normal: Array, rows: Array, origin: Array, direction: Array) -> Array:

@@ -354,6 +354,7 @@ class Scene:
         color: bool = False,
         shadows: bool = True,
         random_colors: RandomColors | None = None,
+        color_gradients: bool = False,
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None, before=None) -> Hits``, pure: depth images of all worlds, one ray per pixel.
 
@@ -376,6 +377,7 @@ class Scene:
             color: Whether to return ``Hits.color``, the colours that MuJoCo's renderer draws.
             shadows: Whether lights of the scene cast shadows, by a second ray of each pixel.
             random_colors: Changes of the colours in every world and episode; None for the colours of the scene.
+            color_gradients: Whether colours are numbers from 0 to 1, with derivatives, instead of uint8.
         """
         if isinstance(camera, depth.DroneCamera):
             height, width = camera.rays.shape[:2]
@@ -386,6 +388,7 @@ class Scene:
             cameras = depth.find_cameras(self.mj_model, camera, objects)
         self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
         color, shadows = check_flag("color", color), check_flag("shadows", shadows)
+        color_gradients = check_flag("color_gradients", color_gradients)
         if isinstance(camera, depth.DroneCamera):
             # The frame of MuJoCo's cameras: x right, y up, z back.
             rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)
@@ -394,7 +397,7 @@ class Scene:
         return depth.build_depth_fn(
             self.visual_model, cameras, rays, drones, hide_own, along, self.plugins, self.ray_kernels,
             camera if isinstance(camera, depth.DroneCamera) else None,
-            Appearance(self.mj_model, shadows, random_colors) if color else None,
+            Appearance(self.mj_model, shadows, random_colors, color_gradients) if color else None,
         )  # fmt: skip
 
     def splat_fn(

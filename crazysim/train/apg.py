@@ -23,7 +23,6 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.errors import require
-from crazysim.plugins.sensors.image_sensor import OUTPUTS
 from crazysim.train.convolution import images_of
 from crazysim.train.critic import (
     check_factors,
@@ -174,11 +173,11 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         keys: Random keys of the seeds. (n_seeds,)
     """
     config, formats = configs[0], env.image_formats()
-    constant = [name for name, x in formats.items() if OUTPUTS[x["output"]].dtype is not None]
+    constant = [name for name, x in formats.items() if not x["has_gradient"]]
     require(
         not (constant and config.image_gradients),
-        f"expected images whose gradients are not zero, got {', '.join(constant)}. Use outputs=('depth',) of the "
-        f"camera, or image_gradients=False.",
+        f"expected images whose gradients are not zero, got {', '.join(constant)}. Use color_gradients=True or "
+        f"outputs=('depth',) of the camera, or image_gradients=False.",
     )
     if config.critic_epochs:
         check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))

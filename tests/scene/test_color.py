@@ -3,6 +3,7 @@
 import itertools
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -158,6 +159,56 @@ def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, look):
     plain = jax.jit(sim.scene.depth_fn("eye", WIDTH, HEIGHT, drones=False, color=True))(sim.data).color
     difference = np.abs(np.asarray(plain, int) - hits.color)
     assert (difference <= 1).mean() > 0.999
+
+
+MOVING = """<mujoco><asset>
+<texture name="spots" type="2d" builtin="checker" mark="random" random="0.05" rgb1=".9 .2 .1" rgb2=".1 .3 .8" width="32"
+height="16"/><material name="spots" texture="spots" specular="0.8"/></asset><worldbody>
+<geom type="box" size=".4 .3 .5" material="spots"/><geom type="sphere" size=".3" pos=".2 .6 .3" rgba=".9 .8 .2 1"/>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.long("compiles two images and a gradient")
+def test_gradients_of_colors_are_central_differences(x64, tmp_path):
+    """By the poses of two cameras and of an object that turns before them, under spots with shadows."""
+    path, rng = tmp_path / "scene.xml", np.random.default_rng(5)
+    path.write_text(random_scene(np.random.default_rng(1), True, True))
+    sim = Sim(2, xml_path=path, control="attitude")
+    sim.scene.add(MOVING, "moving", pos=[1.2, 0.2, 1.3])
+    data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, sim.data)
+    args = [np.asarray(x) for x in (data.states.pos, data.states.quat, data.objects.pos, data.objects.quat)]
+    args[0] = args[0] * 0 + rng.uniform([-0.8, -0.2, 1.2], [-0.4, 0.2, 1.7], (2, 1, 3))
+    for k in (1, 3):
+        args[k] = args[k] + 0.1 * rng.normal(size=args[k].shape)
+        args[k] /= np.linalg.norm(args[k], axis=-1, keepdims=True)
+    weight = rng.uniform(size=(2, 1, 12, 16, 3))
+
+    def cast_rays(args, gradients):
+        pos, quat, object_pos, object_quat = args
+        states, objects = (
+            x.replace(pos=p, quat=q / jnp.linalg.norm(q, axis=-1, keepdims=True))
+            for x, p, q in ((data.states, pos, quat), (data.objects, object_pos, object_quat))
+        )
+        cast = sim.scene.depth_fn(
+            "fpv_cam", 16, 12, color=True, random_colors=RandomColors(), color_gradients=gradients
+        )
+        return cast(data.replace(states=states, objects=objects))
+
+    def weighted_sum(args):
+        hits = cast_rays(args, True)
+        return jnp.sum(weight * hits.color), hits
+
+    value_and_gradients = jax.jit(jax.value_and_grad(weighted_sum, has_aux=True))
+    (_, hits), gradients = value_and_gradients(args)
+    rounded = jax.jit(lambda args: cast_rays(args, False).color)(args)
+    assert rounded.dtype == np.uint8
+    assert np.abs(255 * hits.color - rounded).max() < 0.5 + 1e-6
+    h = 1e-6  # of which rounding costs 1e-16 / h of the sum, about 500
+    for k, gradient in enumerate(gradients):
+        assert np.abs(gradient).max() > 0.1
+        shift = rng.normal(size=gradient.shape)
+        sums = [value_and_gradients([*args[:k], args[k] + s * h * shift, *args[k + 1 :]])[0][0] for s in (1, -1)]
+        np.testing.assert_allclose(np.sum(gradient * shift), (sums[0] - sums[1]) / (2 * h), rtol=1e-5, err_msg=k)
 
 
 @pytest.mark.parametrize("random_colors", [None, RandomColors(0, 0, 0)])

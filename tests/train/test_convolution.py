@@ -243,6 +243,26 @@ def test_a_student_learns_from_images(env, rng):
     assert measure(agent) < 0.2 * before
 
 
+@pytest.mark.long("compiles steps with images, and their gradient")
+def test_analytic_gradients_pass_through_colors():
+    """Of blurred images of the floor through a rolling shutter, which arrive late."""
+    times = {"exposure": 0.01, "blur_samples": 2, "readout": 0.01, "latency": 0.02}
+    camera = Camera(3, 2, rpy=(0, 1, 0), outputs=("rgb", "gray"), color_gradients=True, **times)
+    env = make("hover", 4, camera=camera)
+    jax.eval_shape(functools.partial(apg.init, env, (apg.Config(hidden=(8,)),)), jax.random.key(0)[None])
+
+    def sum_of_images(actions, state):
+        for action in actions:
+            state = env.step(state, action)
+        return sum(jnp.sum(state.obs[f"camera.{name}"]) for name in ("rgb", "gray"))
+
+    actions, state = jnp.zeros((3, 4, 1, 4)), jax.jit(env.reset)(jax.random.key(1))
+    gradient = np.asarray(jax.jit(jax.grad(sum_of_images))(actions, state))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient[0]).max(axis=(1, 2)).min() > 1e-3
+    assert not gradient[-1].any(), "the image is older than the last action"
+
+
 def test_law_09_convolutions_that_do_not_fit_are_refused(env):
 
     def init_learner(env, **config):

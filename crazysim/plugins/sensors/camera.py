@@ -3,8 +3,8 @@
 The same plugin serves simulations and environments::
 
     Camera(width=64, height=48, fovy=70.0, *, pos=None, rpy=(0, 0, 0), outputs=("depth",), max_depth=10.0,
-           noise=None, distortion=None, shadows=True, random_colors=None, random_pose=None, exposure=0.0,
-           blur_samples=8, readout=0.0, drones=True, freq=None, latency=0.0, name="camera")
+           noise=None, distortion=None, shadows=True, random_colors=None, color_gradients=False, random_pose=None,
+           exposure=0.0, blur_samples=8, readout=0.0, drones=True, freq=None, latency=0.0, name="camera")
 
     camera = sim.add(Camera(16, 12, freq=60, latency=0.03))      # in the step of a simulation
     camera.read(sim.data).images["depth"]                        # (n_worlds, n_drones, 12, 16), m
@@ -64,6 +64,9 @@ class Camera(ImageSensor):
     """Whether lights cast shadows in colours, by a second ray of each pixel."""
     random_colors: RandomColors | None = None
     """Changes of colours and lights in every world and episode, such as ``RandomColors()``; None for none."""
+    color_gradients: bool = False
+    """Whether colours are numbers from 0 to 1 with derivatives, for gradients through images (``--algorithm apg``),
+    instead of uint8; they are not rounded to 8 bits, and take four times the memory."""
     exposure: float = setting(default=0.0, low=0.0, high=MAX_EXPOSURE)
     """Time over which colours are averaged, s, which ends at the time of the image, or with a rolling shutter of the
     row; 0 for sharp images. Meanwhile drones, with their cameras, move by their velocities, and objects by theirs
@@ -111,7 +114,8 @@ class Camera(ImageSensor):
 
     @property
     def color_settings(self) -> dict[str, Any]:
-        return {"color": True, "shadows": self.shadows, "random_colors": self.random_colors}
+        names = "shadows", "random_colors", "color_gradients"
+        return {"color": True} | {name: getattr(self, name) for name in names}
 
     @property
     def far_ratio(self) -> np.ndarray:

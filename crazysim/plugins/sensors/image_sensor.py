@@ -232,13 +232,14 @@ class ImageSensor(Plugin):
         sensor |= {"freq": self.freq, "latency": np.asarray(self.latency, np.float64).tolist()}
         formats = {}
         for name in self.outputs:
-            output = OUTPUTS[name]
+            output = self._output(name)
             formats[name] = {
                 "height": height,
                 "width": width,
                 "unit": output.unit,
                 "far": self.far if output.empty is None else output.empty,
                 "output": name,
+                "has_gradient": output.dtype is None,
             } | sensor
         return formats
 
@@ -260,7 +261,7 @@ class ImageSensor(Plugin):
                 f"expected a latency of {self.name!r} of at most {MAX_ROWS - 1} images, got {self.latency} s. Use a "
                 f"shorter latency or a lower freq=."
             )
-        outputs = [OUTPUTS[name] for name in self.outputs]
+        outputs = [self._output(name) for name in self.outputs]
         number_bytes = [np.dtype(x.dtype or np.float32).itemsize * math.prod(x.shape) for x in outputs]
         bytes_per_pixel = sum(number_bytes) * (1 + n_rows) + BYTES_PER_RAY
         check_image_memory(sim.n_worlds * sim.n_drones, width, height, bytes_per_pixel, sim.scene.device)
@@ -273,6 +274,7 @@ class ImageSensor(Plugin):
         self.check(sim)
         rays, far, camera = self.rays, self.far, self.drone_camera(sim)
         color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
+        has_gradients = color_settings.get("color_gradients", False)
         cast_rays: Any = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
         height, width = self.image_size
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -284,10 +286,12 @@ class ImageSensor(Plugin):
             def add_color(total: Array, time: Array) -> tuple[Array, None]:
                 return total + cast_rays(extrapolate(data, time)).color, None
 
-            total, _ = jax.lax.scan(
-                add_color, jnp.zeros(hits.color.shape, np.float32), jnp.asarray(self.exposure_times)
-            )
-            return jnp.round(total / len(self.exposure_times)).astype(np.uint8)
+            start = jnp.zeros(hits.color.shape, jnp.result_type(hits.color, np.float32))
+            total, _ = jax.lax.scan(add_color, start, jnp.asarray(self.exposure_times))
+            return round_color(total / len(self.exposure_times))
+
+        def round_color(color: Array) -> Array:
+            return color if has_gradients else jnp.round(color).astype(np.uint8)
 
         def take_images(data: SimData, before: SimData | None = None) -> Images:
             before = before if self.compares_images else None
@@ -314,7 +318,7 @@ class ImageSensor(Plugin):
                     images[name] = color
                 elif name == "gray":
                     parts = [weight * color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
-                    images[name] = jnp.round(sum(parts)).astype(np.uint8)
+                    images[name] = round_color(sum(parts))  # type: ignore[arg-type]
                 elif name in FLOWS and before is None:
                     output = OUTPUTS[name]
                     images[name] = jnp.zeros(distance.shape + output.shape, output.dtype or distance.dtype)
@@ -401,7 +405,7 @@ class ImageSensor(Plugin):
         shape, n = (*sim.data.states.pos.shape[:2], *self.image_size), self._n_rows(sim.data, period)
         images, transit = {}, {}
         for name in self.outputs:
-            output = OUTPUTS[name]
+            output = self._output(name)
             dtype = output.dtype or sim.data.states.pos.dtype
             value = self.far if output.empty is None else output.empty
             images[name] = device_array(np.full(shape + output.shape, value), dtype)
@@ -441,6 +445,10 @@ class ImageSensor(Plugin):
         pos = np.asarray(fpv_pos if self.pos is None else [self.pos] * sim.n_drones, np.float64)
         rpy, random_pose = np.asarray(self.rpy, np.float64), self.random_pose
         return DroneCamera(self.rays, pos, rpy, self.baseline, self.row_times, random_pose, self.name)
+
+    def _output(self, name: str) -> Output:
+        is_float = name in COLORS and self.color_settings.get("color_gradients", False)
+        return OUTPUTS[name]._replace(dtype=None) if is_float else OUTPUTS[name]
 
     def _latency_range(self, freq: int) -> tuple[int, int]:
         low, high = np.broadcast_to(np.asarray(self.latency, np.float64), 2).tolist()
