@@ -70,7 +70,8 @@ class Hooks:
         """Return the format of each image that ``look`` takes, by name, for networks and exports.
 
         A format is a dict that can be written as JSON: ``height`` and ``width``, pixels; ``unit``, the unit of a
-        pixel's value, such as ``"m"`` for depths; and entries that describe the camera (``ImageSensor.describe``).
+        pixel's value, such as ``"m"`` for depths; ``has_gradient``, whether it has derivatives, by default True; and
+        entries that describe the camera (``ImageSensor.describe``).
         """
         return {}
 

@@ -196,7 +196,8 @@ class Appearance:
         vis, far = self._model.vis, self._model.vis.map.zfar * self._model.stat.extent
         share = vis.map.haze
         slope = np.arctan2(1, share)
-        densest = np.sqrt(0.5) * share * np.sin(slope) / np.sin(0.75 * np.pi - slope)
+        # Not zero, by which the derivative of the haze is divided.
+        densest = max(np.sqrt(0.5) * share * np.sin(slope) / np.sin(0.75 * np.pi - slope), 1e-6)
         ambient = 0.0 if self.flags[0] else AMBIENT_WITHOUT_LIGHTS
         radius = far * SKY_RADIUS if self.flags[1] else far
         numbers = (

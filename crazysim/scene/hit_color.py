@@ -372,6 +372,7 @@ def _incidence(light: Light, row: LightRow, point: Components, back: Components)
         to_light = [x / distance for x in offset]
         cosine = -_dot(to_light, row.dir)
         falloff = row.attenuation[0] + distance * (row.attenuation[1] + distance * row.attenuation[2])
+        falloff = jnp.maximum(falloff, 1e-9)  # an attenuation of zeros is allowed
         strength = jnp.where(cosine >= row.cutoff, _power(jnp.maximum(cosine, 0.0), row.exponent) / falloff, 0.0)
     return strength, tuple(to_light), distance  # type: ignore[return-value]
 

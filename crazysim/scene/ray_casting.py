@@ -406,11 +406,11 @@ def _shade(
     # Colours with derivatives, (n_worlds, n_rays, 3), from the results of ``trace_at_hit``.
     lights, has_sky, has_haze, is_per_world = appearance.flags
     distance = jnp.where(jnp.isfinite(distance), distance, 1.0)
-    trace = jax.lax.stop_gradient(trace.reshape(*distance.shape, -1))
+    trace = trace.reshape(*distance.shape, -1).astype(distance.dtype)
     geom_axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
     local_point = jnp.sum(geom_axes * (origin + distance[..., None] * direction - rows[..., :3])[..., None], axis=-2)
     local_shift = local_point - jax.lax.stop_gradient(local_point)
-    shift = jnp.sum(jax.lax.stop_gradient(geom_axes) * local_shift[..., None, :], axis=-1)
+    shift = jnp.sum(geom_axes * local_shift[..., None, :], axis=-1)
     u, v = (trace[..., k] + jnp.sum(trace[..., k + 1 : k + 4] * shift, axis=-1) for k in (0, 4))
     scene = jnp.broadcast_to(jnp.arange(len(distance), dtype=np.int32)[:, None] * is_per_world, distance.shape)
     look, first_light = jnp.maximum(geom_index, 0) + scene * n_geoms, scene * len(lights)

@@ -389,6 +389,10 @@ class Scene:
         self._check_image_memory(len(cameras), (width, height), depth.BYTES_PER_RAY)
         color, shadows = check_flag("color", color), check_flag("shadows", shadows)
         color_gradients = check_flag("color_gradients", color_gradients)
+        require(
+            color or not (color_gradients or random_colors),
+            "expected color=True with color_gradients or random_colors, got False.",
+        )
         if isinstance(camera, depth.DroneCamera):
             # The frame of MuJoCo's cameras: x right, y up, z back.
             rays = [np.stack([-camera.rays[..., 1], camera.rays[..., 2], -camera.rays[..., 0]], axis=-1)] * len(cameras)

@@ -173,7 +173,7 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
         keys: Random keys of the seeds. (n_seeds,)
     """
     config, formats = configs[0], env.image_formats()
-    constant = [name for name, x in formats.items() if not x["has_gradient"]]
+    constant = [name for name, x in formats.items() if not x.get("has_gradient", True)]
     require(
         not (constant and config.image_gradients),
         f"expected images whose gradients are not zero, got {', '.join(constant)}. Use color_gradients=True or "

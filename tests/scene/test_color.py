@@ -211,6 +211,25 @@ def test_gradients_of_colors_are_central_differences(x64, tmp_path):
         np.testing.assert_allclose(np.sum(gradient * shift), (sums[0] - sums[1]) / (2 * h), rtol=1e-5, err_msg=k)
 
 
+def test_law_07_gradients_of_colors_are_finite_without_haze_and_attenuation(x64, tmp_path):
+    """Of single precision, among numbers of double precision, towards the sky, the haze and a lit floor."""
+    path = tmp_path / "scene.xml"
+    path.write_text("""<mujoco><visual><map haze="0"/></visual><asset><texture name="sky" type="skybox"
+        builtin="gradient" rgb1=".3 .5 .7" width="8" height="48"/></asset><worldbody><geom type="plane" size="0 0 .1"/>
+        <light pos="0 0 3" dir="0 0 -1" type="spot" attenuation="0 0 0" cutoff="90"/></worldbody></mujoco>""")
+    sim = Sim(1, control="attitude", xml_path=path)
+    take = Camera(9, 7, fovy=110, outputs=("rgb",), color_gradients=True).image_fn(sim)
+    data = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, sim.data)
+    pos = data.states.pos.at[..., 2].set(0.5)
+
+    def loss(pos):
+        return jnp.sum(take(data.replace(states=data.states.replace(pos=pos)))["rgb"] ** 2)
+
+    value, gradient = jax.jit(jax.value_and_grad(loss))(pos)
+    assert np.isfinite([value, *gradient.ravel()]).all()
+    assert gradient.dtype == np.float32
+
+
 @pytest.mark.parametrize("random_colors", [None, RandomColors(0, 0, 0)])
 @pytest.mark.parametrize("geom, color", [("", 0), ("<geom type='sphere' size='.3' pos='1 0 1'/>", 38)])
 def test_scenes_without_lights_textures_and_sky(tmp_path, geom, color, random_colors):

@@ -29,7 +29,7 @@ from jax import Array
 from crazysim.core.settings import setting
 from crazysim.errors import require
 from crazysim.plugins.sensors.depth_errors import Distortion, StereoNoise
-from crazysim.plugins.sensors.image_sensor import ImageSensor
+from crazysim.plugins.sensors.image_sensor import COLORS, ImageSensor
 from crazysim.scene.appearance import RandomColors
 from crazysim.scene.depth import pixel_directions
 
@@ -84,6 +84,12 @@ class Camera(ImageSensor):
             not (self.readout and self.compares_images),
             f"expected flow from a global shutter, got readout={self.readout} of {self.name!r}. Use readout=0.",
         )
+        for name in ("random_colors", "color_gradients"):
+            require(
+                not getattr(self, name) or {*COLORS} & {*self.outputs},
+                f"expected a colour among the outputs of {self.name!r} for {name}, got {[*self.outputs]}. Use "
+                f'outputs=("rgb",).',
+            )
 
     @property
     def exposure_times(self) -> np.ndarray:

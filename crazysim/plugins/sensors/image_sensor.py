@@ -57,7 +57,7 @@ OUTPUTS = {
 }
 """Outputs of an image by name."""
 COLORS = "rgb", "gray"
-"""Outputs that are colours, uint8."""
+"""Outputs that are colours, uint8, or numbers from 0 to 1 with derivatives."""
 FLOWS = "flow", "flow_valid"
 """Outputs that compare an image with the image before it."""
 LUMA = 0.299, 0.587, 0.114
@@ -116,7 +116,8 @@ class ImageSensor(Plugin):
     outputs: Sequence[str] = ("depth",)
     """Images to take, some of ``"depth"`` (along the axis of the sensor, m), ``"distance"`` (along the ray, m),
     ``"normal"`` (of the surface, unit, sensor frame), ``"segmentation"`` (index in ``segment_names``, -1 for
-    nothing), ``"rgb"`` (colour as MuJoCo's renderer draws it, uint8), ``"gray"`` (its brightness, uint8), ``"flow"``
+    nothing), ``"rgb"`` (colour as MuJoCo's renderer draws it), ``"gray"`` (its brightness; both uint8 unless they have
+    derivatives), ``"flow"``
     (motion of the surface since the image before, right and down, pixels: the place of its point in this image minus
     its place in the image before, the negative of Kubric's ``backward_flow``) and ``"flow_valid"`` (whether the image
     before shows this point, bool; False in the first image of an episode, whose flow is zero). A lidar has no depths
@@ -274,7 +275,7 @@ class ImageSensor(Plugin):
         self.check(sim)
         rays, far, camera = self.rays, self.far, self.drone_camera(sim)
         color_settings = self.color_settings if {*COLORS} & {*self.outputs} else {}
-        has_gradients = color_settings.get("color_gradients", False)
+        color_dtype = self._output("rgb").dtype
         cast_rays: Any = sim.scene.depth_fn(camera, drones=self.drones, along="ray", **color_settings)
         height, width = self.image_size
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -288,10 +289,10 @@ class ImageSensor(Plugin):
 
             start = jnp.zeros(hits.color.shape, jnp.result_type(hits.color, np.float32))
             total, _ = jax.lax.scan(add_color, start, jnp.asarray(self.exposure_times))
-            return round_color(total / len(self.exposure_times))
+            return as_color(total / len(self.exposure_times))
 
-        def round_color(color: Array) -> Array:
-            return color if has_gradients else jnp.round(color).astype(np.uint8)
+        def as_color(x: Array) -> Array:
+            return x if color_dtype is None else jnp.round(x).astype(color_dtype)
 
         def take_images(data: SimData, before: SimData | None = None) -> Images:
             before = before if self.compares_images else None
@@ -318,7 +319,7 @@ class ImageSensor(Plugin):
                     images[name] = color
                 elif name == "gray":
                     parts = [weight * color[..., k].astype(distance.dtype) for k, weight in enumerate(LUMA)]
-                    images[name] = round_color(sum(parts))  # type: ignore[arg-type]
+                    images[name] = as_color(sum(parts))  # type: ignore[arg-type]
                 elif name in FLOWS and before is None:
                     output = OUTPUTS[name]
                     images[name] = jnp.zeros(distance.shape + output.shape, output.dtype or distance.dtype)

@@ -99,3 +99,5 @@ def test_law_09_settings_that_exclude_each_other():
         Camera(outputs=("flow",), readout=0.01)
     with pytest.raises(ConfigError, match="exposure"):
         Camera(exposure=1.0)
+    with pytest.raises(ConfigError, match=r"a colour among the outputs.*color_gradients.*rgb"):
+        Camera(color_gradients=True)
