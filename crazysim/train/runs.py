@@ -29,6 +29,8 @@ from crazysim.train.training import (
     TEACHER_FOLDER,
     TrainResult,
     require_no_run,
+    require_same_trainings,
+    store_configs,
     stored_configs,
     train,
     train_many,
@@ -60,8 +62,8 @@ def run(
     The recipe of a task is the settings that are known to solve it (``crazysim.train.config``). Some recipes have a
     teacher, such as the recipe of ``race_by_camera``. The teacher is trained first, in the folder ``teacher`` of the
     run, unless the settings name another teacher or another algorithm. ``options`` apply to teacher and student;
-    ``n_worlds``, ``config`` and ``on_iteration`` apply only to the student. If the teacher is interrupted, call ``run``
-    again with the same settings and ``resume=True``.
+    ``n_worlds``, ``config`` and ``on_iteration`` apply only to the student. If the teacher is interrupted,
+    ``resume=True`` continues it, and then trains the student with the settings of the first call.
 
     Args:
         task: Name of a task, reference of your class (``FILE.py:NAME`` or ``MODULE:NAME``), or a ``Task`` such as
@@ -246,34 +248,33 @@ def _train_variants(
     first_seed, _ = next(iter(variants.values()))
     config = TrainConfig.create(task, **{**settings, "seed": first_seed})
     folder = Path("out") / config.title if folder is None else as_path(folder)
-    has_teacher = _train_teacher(config, folder, resume, options)
-    resume = resume and not has_teacher
     stored_by_name = stored_configs(folder) if resume else {}
     configs = {}
     for name, (seed, changes) in variants.items():
         own_settings = {**settings, "seed": seed, "config": {**(settings.get("config") or {}), **changes}}
-        config = TrainConfig.create(task, **own_settings, resumed=stored_by_name.get(name))
-        if has_teacher:
-            config = dataclasses.replace(config, config=config.config | {"teacher": str(folder / TEACHER_FOLDER)})
-        configs[name] = config
+        configs[name] = TrainConfig.create(task, **own_settings, resumed=stored_by_name.get(name))
+    if resume:
+        require_same_trainings(folder, stored_by_name, configs)
+    if _train_teacher(configs, folder, resume, options):
+        resume, teacher = False, str(folder / TEACHER_FOLDER)
+        configs = {name: dataclasses.replace(x, config=x.config | {"teacher": teacher}) for name, x in configs.items()}
     return folder, configs, train_many(configs, folder, resume, on_iteration=on_iteration, **options)
 
 
-def _train_teacher(student: TrainConfig, folder: Path, resume: bool, options: Mapping[str, Any]) -> bool:
+def _train_teacher(students: Mapping[str, TrainConfig], folder: Path, resume: bool, options: Mapping[str, Any]) -> bool:
+    student = next(iter(students.values()))
     teacher = student.teacher_config()
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
         return False
-    require_no_run(folder)
-    require(
-        not resume or (folder / TEACHER_FOLDER / CHECKPOINT_FILE).exists(),
-        f"expected a run to resume in {folder}, got none. Train without --resume first.",
-    )
-    _check_student(student)
-    options["log"](
-        f"first the teacher of {student.title}, then the student by {student.algorithm}; if the teacher is "
-        f"interrupted, repeat the command with --resume"
-    )
-    train(teacher, folder / TEACHER_FOLDER, resume, **options)
+    teacher_folder = folder / TEACHER_FOLDER
+    if not resume:
+        require_no_run(folder)
+        require_no_run(teacher_folder)
+        _check_student(student)
+        if is_first_host():
+            store_configs(students, folder)
+    options["log"](f"first the teacher of {student.title}, then the student by {student.algorithm}")
+    train(teacher, teacher_folder, resume and (teacher_folder / CHECKPOINT_FILE).exists(), **options)
     return True
 
 

@@ -51,8 +51,9 @@ from crazysim.train.seeds import take_seed
 CHECKPOINT_FILE, POLICY_FILE, CURVE_FILE, TABLE_FILE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
 """Names of the files of a run: checkpoint, kept policy, learning curve, and table of all seeds."""
 
-TEACHER_FOLDER = "teacher"
-"""Name of the subfolder of a run for the teacher that the recipe of the task trains first."""
+TEACHER_FOLDER, STUDENTS_FILE = "teacher", "students.npz"
+"""Names of the subfolder of a run for the teacher that the recipe of the task trains first, and of the file with the
+settings of the students, which have no checkpoint yet."""
 
 CHECK_SEED = 0xC4EC
 """Seed of the initial states of the check set, which differ from the held-out states of ``EVALUATION_SEED``."""
@@ -570,13 +571,20 @@ def _run_metadata(config: TrainConfig) -> dict[str, Any]:
         ) from error
 
 
+def store_configs(configs: Mapping[str, TrainConfig], folder: Path) -> None:
+    """Write the configurations of trainings that begin after that of their teacher, for ``stored_configs``."""
+    make_folder(folder)
+    checkpoint.save(folder / STUDENTS_FILE, {}, {"runs": {name: _run_metadata(x) for name, x in configs.items()}})
+
+
 def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
-    """Return the configurations of the trainings in the checkpoint of a folder, by name.
+    """Return the configurations of the trainings in a folder, by name: of its checkpoint, or by ``store_configs``.
 
     Raises:
-        ConfigError: If there is no intact checkpoint.
+        ConfigError: If there is no intact file.
     """
-    path = as_path(folder) / CHECKPOINT_FILE
+    paths = [as_path(folder) / name for name in (CHECKPOINT_FILE, STUDENTS_FILE)]
+    path = next((path for path in paths if path.exists()), paths[0])
     meta = checkpoint.read(path)[1]
     with checkpoint.wrap_checkpoint_errors(path):
         return {name: TrainConfig(**run["settings"]) for name, run in meta["runs"].items()}
@@ -593,15 +601,20 @@ def _read_run(
             f"run in another folder with --out",
         )
         runs = meta["runs"]
-        require(
-            list(runs) == list(metadata),
-            f"expected the seeds and the sweep of {path}, {', '.join(runs) or 'none'}, got "
-            f"{', '.join(metadata) or 'none'}; resume with the same ones, or start a new run in another folder with "
-            f"--out",
-        )
+        require_same_trainings(path, runs, metadata)
         for name, run in metadata.items():
             _require_same_settings(path, runs[name]["settings"], run["settings"])
         return arrays, runs, meta["code"], float(meta["seconds"])
+
+
+def require_same_trainings(path: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
+    """Raise ``ConfigError`` if other trainings are requested than those that a file or folder holds, by name."""
+    require(
+        list(stored) == list(requested),
+        f"expected the seeds and the sweep of {path}, {', '.join(stored) or 'none'}, got "
+        f"{', '.join(requested) or 'none'}; resume with the same ones, or start a new run in another folder with "
+        f"--out",
+    )
 
 
 def _require_same_settings(path: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:

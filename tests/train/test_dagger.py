@@ -142,7 +142,7 @@ def test_a_recipe_trains_its_teacher_first(recipe_with_teacher, tmp_path):
     assert sum("by ppo" in line for line in lines) == 1
     assert any("nothing is left to train" in line for line in lines)
 
-    with pytest.raises(ConfigError, match=r"run to resume in .*none, got none"):
+    with pytest.raises(ConfigError, match=r"an existing file with a checkpoint of crazysim, got .*none"):
         run("hover", tmp_path / "none", resume=True, **settings)
     students = run_many("hover", tmp_path / "many", seeds=[5, 6], **settings)
     with pytest.raises(ConfigError, match=r"the folder of one training, .* Use one of its folders: seed-5, seed-6"):
@@ -160,13 +160,20 @@ def test_an_interrupted_teacher_continues_and_then_teaches(recipe_with_teacher, 
     with monkeypatch.context() as context:
         context.setattr("crazysim.train.training.must_stop", lambda iteration: True)
         with pytest.raises(SystemExit):
-            run("hover", tmp_path / "run", film=False, **settings)
+            run("hover", tmp_path / "run", film=False, seed=3, n_worlds=6, config={"n_steps": 5}, **settings)
+    options = settings["options"]
     with pytest.raises(ConfigError, match=r"a folder without a run, got .*teacher; continue the run with --resume"):
         run("hover", tmp_path / "run", film=False, **settings)
+    del settings["options"]
+    with pytest.raises(ConfigError, match=r"expected the seeds and the sweep of .*run, none, got seed-0"):
+        run_many("hover", tmp_path / "run", resume=True, **settings)
     run("hover", tmp_path / "run", film=False, resume=True, **settings)
     headers = [line for line in lines if " by " in line and "engine: " in line]
     assert "continues after iteration 1" in headers[1]
     assert "by dagger" in headers[2]
+    _, student, _ = load_policy(tmp_path / "run")
+    assert student.options == options
+    assert (student.seed, student.n_worlds, student.config["n_steps"]) == (3, 6, 5)
 
 
 def test_settings_of_a_student_are_checked_before_its_teacher_is_trained(recipe_with_teacher, tmp_path):
