@@ -9,6 +9,7 @@ import pytest
 from pages import GENERATED, ROOT, navigation_pages
 
 from crazysim.commands import training
+from crazysim.commands.options import parse_pairs
 from crazysim.lab.commands import live
 from crazysim.train.config import TrainConfig
 
@@ -99,3 +100,18 @@ def test_the_check_finds_refused_commands(language, code, complaint):
     result = complaints({"a.md": "```sh\ncrazysim train hover\n```\n", "b.md": f"```{language}\n{code}\n```\n"})
     assert len(result) == (complaint is not None)
     assert complaint is None or complaint in result[0]
+
+
+def test_the_commands_of_the_page_are_the_recipes_teacher_and_student():
+    parser = argparse.ArgumentParser()
+    training.add_parsers(parser.add_subparsers())
+    page = (ROOT / "docs/learn/sight.md").read_text().replace("\\\n", " ")
+    teacher, student = re.findall(r"^crazysim (train race_by_camera .*--out out/race_\w+)$", page, re.MULTILINE)
+    options = parser.parse_args(shlex.split(teacher))
+    config = parse_pairs(options.config) | {"iterations": options.iterations}
+    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in parse_pairs(options.set).items()}
+    chosen = TrainConfig.create(
+        options.task, options.algorithm, n_worlds=options.worlds, options=settings, config=config
+    )
+    assert chosen == TrainConfig.create(options.task).teacher_config()
+    assert parser.parse_args(shlex.split(student)).teacher == str(options.out)
