@@ -90,9 +90,15 @@ RECIPES: dict[str, Recipe] = {
     "race_by_camera": Recipe(
         "dagger",
         n_worlds=256,
-        config={"iterations": 350, "hidden": (128, 128), "convolution": (8, 16, 16)},
+        config={
+            "iterations": 600,
+            "minibatches": 8,
+            "learning_rate": 1.5e-3,
+            "hidden": (128, 128),
+            "convolution": (8, 16, 16),
+        },
         practice={"practice": True},
-        evaluate_every=50,
+        evaluate_every=100,
         teacher=Recipe(
             n_worlds=2048,
             config={
