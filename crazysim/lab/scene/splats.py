@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -88,6 +90,16 @@ class SplatScene:
         min_opacity = read_number("min_opacity", min_opacity, range_between(0.0, 1.0))
         opacity = 1 / (1 + np.exp(-np.asarray(self.gaussians.logit_opacity, np.float64)))
         return np.asarray(self.gaussians.pos, np.float64)[opacity >= min_opacity]
+
+
+def _make_scene(_: None, children: Iterable[Gaussians]) -> SplatScene:
+    scene = object.__new__(SplatScene)
+    (scene.gaussians,) = children
+    return scene
+
+
+# Jitted functions that expect Gaussians then refuse a scene by themselves, instead of JAX.
+jax.tree_util.register_pytree_node(SplatScene, lambda scene: ((scene.gaussians,), None), _make_scene)
 
 
 def spherical_harmonics(direction: Any, n: int) -> list[Any]:

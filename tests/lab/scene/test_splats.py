@@ -141,6 +141,12 @@ def test_each_world_sees_the_splats_of_its_map(tmp_path):
         np.testing.assert_allclose(images.coverage[rows], alone.coverage[rows], atol=1e-5)
     with pytest.raises(ConfigError, match="each of 3 maps, got a list of 2"):
         draw(data, scenes[:2])
+    scene = SplatScene(tmp_path / "a.ply")
+    for wrong in (scene, [scene] * 3):
+        with pytest.raises(
+            ConfigError, match=r"expected Gaussians, or a list of them, got .* Use SplatScene.gaussians"
+        ):
+            draw(data, wrong)
 
 
 def sim_camera(sim, world, drone):
