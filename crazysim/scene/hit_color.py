@@ -15,6 +15,7 @@ from jax import Array, lax
 from crazysim.core.branches import compute_where, table_rows
 from crazysim.geometry import Shape
 from crazysim.geometry.points import Components
+from crazysim.geometry.shapes import UNBOUNDED_LENGTH
 from crazysim.geometry.vector import Vector
 from crazysim.rotation import safe_sqrt
 from crazysim.scene.first_hit import (
@@ -338,7 +339,7 @@ def _normal_and_texture(
     surface: Surface, row: Sequence[Array], origin: Components, direction: Components, distance: Array
 ) -> tuple[Array, ...]:
     # World normal; position along both axes of the texture, each with its gradient. The texture covers a side of a box,
-    # or a plane, once; of infinite planes, terrain and meshes without coordinates of their own it covers 2 m.
+    # or a plane, once; along infinite axes of planes, of terrain and meshes without own coordinates it covers 2 m.
     normal = normal_in_frame(surface, row, origin, direction, distance)
     texture = [jnp.zeros_like(distance)] * 8
     point, half = [o + distance * d for o, d in zip(origin, direction, strict=True)], row[13:16]
@@ -356,8 +357,9 @@ def _normal_and_texture(
         texture = []
         for axis, sign in zip(axes, (0.5, -0.5), strict=True):
             size = _dot(axis, half)
-            rate = sign / jnp.where(size > 0, size, 1.0)
-            start = jnp.where(size > 0, 0.5, 0.0)
+            is_finite = (size > 0) & (size < UNBOUNDED_LENGTH)
+            rate = sign / jnp.where(is_finite, size, 1.0)
+            start = jnp.where(is_finite, 0.5, 0.0)
             texture += [start + rate * _dot(axis, point), *world_vector(row, tuple(rate * a for a in axis))]  # type: ignore[arg-type]
     return *world_vector(row, normal), *texture
 

@@ -161,6 +161,26 @@ def test_colors_equal_those_of_mujocos_renderer(tmp_path, seed, look):
     assert (difference <= 1).mean() > 0.999
 
 
+@pytest.mark.usefixtures("opengl")
+def test_planes_that_are_infinite_along_one_axis_have_mujocos_texture(tmp_path):
+    """With the bounds of the test above; a track on the floor, and a fence beside it."""
+    path = tmp_path / "scene.xml"
+    path.write_text("""<mujoco><statistic extent="3"/><visual><map zfar="10"/><headlight ambient=".8 .8 .8"/></visual>
+        <asset><texture name="checker" type="2d" builtin="checker" rgb1=".9 .2 .1" rgb2=".1 .3 .8" width="64"
+        height="64"/><material name="tiles" texture="checker" texrepeat=".7 .4"/><material name="uniform"
+        texture="checker" texrepeat=".7 .4" texuniform="true"/></asset><worldbody>
+        <geom type="plane" size="0 1.4 .1" pos="2 -.5 .1" material="tiles"/>
+        <geom type="plane" size="1.2 0 .1" pos="3 1 1.3" euler="90 0 -90" material="uniform"/>
+        <camera name="eye" pos="-1 0.2 1.7" xyaxes="0.1 -1 0 0.3 0 1" fovy="60"/></worldbody></mujoco>""")
+    sim = Sim(1, xml_path=path)
+    hits = jax.device_get(jax.jit(sim.scene.depth_fn("eye", WIDTH, HEIGHT, drones=False, color=True))(sim.data))
+    error = np.abs(hits.color[0, 0] - mujoco_images(sim.mj_model)[0])
+    is_inside = ~edge_mask(hits, np.zeros_like(error))
+    is_upright = hits.normal[0, 0, ..., 1] < -0.9
+    assert 0.1 < (is_inside & is_upright).mean() < 0.5
+    assert (error[is_inside].max(axis=-1) <= 16).mean() >= 0.99
+
+
 MOVING = """<mujoco><asset>
 <texture name="spots" type="2d" builtin="checker" mark="random" random="0.05" rgb1=".9 .2 .1" rgb2=".1 .3 .8" width="32"
 height="16"/><material name="spots" texture="spots" specular="0.8"/></asset><worldbody>
