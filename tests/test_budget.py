@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 17776,
     "media": 1091,
     "plugins": 5083,
-    "scene": 3287,
+    "scene": 3289,
     "sim": 914,
     "train": 2770,
     "trajectories": 497,
