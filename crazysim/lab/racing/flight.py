@@ -236,9 +236,10 @@ def plot(flight: RaceFlight, path: str | Path) -> None:
         if gate.is_ball:
             above.add_patch(plt.Circle((gate.pos[0], gate.pos[1]), float(gate.opening), fill=False))
             continue
-        for x in {-gate.length / 2, gate.length / 2}:
-            corners = gate.pos + np.insert(np.asarray(gate.frame), 0, x, axis=-1) @ gate.rot.T
-            above.plot(*corners[[*range(len(corners)), 0], :2].T, color="black")
+        ends = [np.insert(np.asarray(gate.frame), 0, x * gate.length, axis=-1) @ gate.rot.T for x in (-0.5, 0.5)]
+        rings = gate.pos[:2] + np.array(ends)[:, [*range(len(ends[0])), 0], :2]
+        for line in (*rings, *rings.swapaxes(0, 1)):
+            above.plot(*line.T, color="black")
     for k, marker, label in ((0, "^", "start"), (-1, "s", "end")):
         above.plot(*flight.pos[k, :2], marker, color="red", label=label)
     above.legend()

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from crazysim.__main__ import main
 from crazysim.envs import Track, load_track, make
 from crazysim.envs.statistics import RunningStats
 from crazysim.lab.live import Live, PolicyPilot
-from crazysim.lab.racing.flight import clock_text_at, flight_of_plan, flight_of_policy, summary, track_simulation
+from crazysim.lab.racing.flight import clock_text_at, flight_of_plan, flight_of_policy, plot, summary, track_simulation
 from crazysim.lab.racing.live_clock import LiveClock
 from crazysim.lab.racing.time_optimal import plan_race
 from crazysim.train import checkpoint
@@ -58,6 +59,20 @@ def test_the_command_prints_laps_and_splits_and_draws(path, tmp_path, capsys):
     assert lap < duration
     assert f"the flight ends after {duration:.3f} s" in text
     assert all(file.stat().st_size > 10_000 for file in files)
+
+
+def test_plots_show_the_sides_of_a_tunnel(monkeypatch, tmp_path):
+    track = replace(TWO_POINTS, gates_rpy=[(0, 0, 0), (0, 0, 0.5)], openings=[SQUARE] * 2, lengths=[0.0, 1.0])
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    plot(replace(fly_ahead(TWO_POINTS, seconds=1.0), track=track), tmp_path / "race.png")
+    monkeypatch.undo()
+    lines = [line.get_xydata() for line in figures[0].axes[0].lines]
+    plt.close(figures[0])
+    ahead, left = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    for side in (-0.2, 0.2):
+        expected = [0.5, 0] + side * left + np.outer([-0.5, 0.5], ahead)
+        assert any(np.shape(line) == (2, 2) and np.allclose(line, expected) for line in lines)
 
 
 @pytest.fixture(scope="module")
