@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6794,
     "envs": 3790,
     "geometry": 948,
-    "lab": 17776,
+    "lab": 17777,
     "media": 1091,
     "plugins": 5083,
     "scene": 3289,
