@@ -34,7 +34,7 @@ BALL_RADIUS = 1e-3
 
 
 class Maps(Plugin):
-    """Scenes that do not move, of which each world draws one at every reset.
+    """Scenes that do not move, of which each world draws one at every reset; until the first, all have map 0.
 
     Geoms of the other maps cost a world nothing: rays and contacts search only the map of their world. In
     ``object_names`` and images the present map is one object, with the name of the plugin. A scene has one list of

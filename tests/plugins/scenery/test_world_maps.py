@@ -152,6 +152,7 @@ def test_law_10_draws_depend_on_world_and_episode():
     def draws(n_worlds, n_drones=1):
         sim, maps = Sim(n_worlds, n_drones, rng_key=5), Maps([f"<mujoco model='{k}'/>" for k in range(5)])
         sim.add(maps)
+        assert not maps.index(sim.data).any()
         sim.reset()
         return sim, maps
 
