@@ -47,7 +47,14 @@ from crazysim.commands.training import parse_seeds
 from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.config import ALGORITHMS, RECIPES, WORLDS, Recipe
 from crazysim.train.show import read_curve
-from crazysim.train.training import CHECKPOINT_FILE, TEACHER_FOLDER, kept_point, least_kept_success, stored_configs
+from crazysim.train.training import (
+    CHECKPOINT_FILE,
+    STUDENTS_FILE,
+    TEACHER_FOLDER,
+    kept_point,
+    least_kept_success,
+    stored_configs,
+)
 from crazysim.train.training import TABLE_FILE as SEEDS_TABLE_FILE
 
 PACKAGE = Path(crazysim.__file__).parent
@@ -224,7 +231,8 @@ def train(group: list[tuple[Any, ...]], out: Path, run_info: dict[str, Any]) -> 
         folder.mkdir(parents=True)
         sources_file.write_text(run_info["sources"])
     command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
-    command += ["--resume"] if (folder / CHECKPOINT_FILE).exists() else []  # the training was interrupted
+    if any((folder / name).exists() for name in (CHECKPOINT_FILE, STUDENTS_FILE)):  # the training was interrupted
+        command.append("--resume")
     # By default each process would take three quarters of the memory of a GPU.
     environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if run_info["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.

@@ -391,7 +391,7 @@ class Scene:
         color_gradients = check_flag("color_gradients", color_gradients)
         require(
             color or not (color_gradients or random_colors),
-            "expected color=True with color_gradients or random_colors, got False.",
+            "expected color=True with color_gradients or random_colors, got False. Use color=True.",
         )
         if isinstance(camera, depth.DroneCamera):
             # The frame of MuJoCo's cameras: x right, y up, z back.

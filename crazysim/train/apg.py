@@ -176,8 +176,8 @@ def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
     constant = [name for name, x in formats.items() if not x.get("has_gradient", True)]
     require(
         not (constant and config.image_gradients),
-        f"expected images whose gradients are not zero, got {', '.join(constant)}. Use color_gradients=True or "
-        f"outputs=('depth',) of the camera, or image_gradients=False.",
+        f"expected images whose gradients are not zero, got {', '.join(constant)}. Use outputs=('depth',) of the "
+        f"camera, color_gradients=True for colours, or image_gradients=False.",
     )
     if config.critic_epochs:
         check_minibatches(config.minibatches, env.sim.n_worlds // len(configs))

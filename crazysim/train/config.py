@@ -288,10 +288,13 @@ class TrainConfig:
                 recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         for name, value in (("options", options), ("config", config)):
             expect(isinstance(value, (Mapping, type(None))), f"{name} as a dict of values by name", value)
-        options, config = stored_options | dict(options or {}), recipe.config | dict(config or {})
+        given = config or {}
+        options, config = stored_options | dict(options or {}), recipe.config | dict(given)
         if recipe.algorithm == "ppo" and (config.get("start") or hasattr(entry.task, "demonstrate")):
             n = min(FIRST_ITERATIONS, int(config.get("iterations", ppo.Config.iterations)) // 2)
             config.setdefault("value_iterations" if config.get("start") else "demonstrations", n)
+            if config.get("start") and resumed is None:  # not by the task's recipe, which is for a new policy
+                config["demonstrations"] = given.get("demonstrations", 0)
         if is_airframe_file(options.get("drone")):  # the run can then be flown from any folder
             options["drone"] = str(Path(options["drone"]).resolve())
         if devices is not None:

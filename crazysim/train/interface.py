@@ -115,7 +115,10 @@ def describe_env(env: Env, sizes: Mapping[str, int] | None = None) -> dict[str, 
         "task_code": task_digest(type(env.task)),
         "freq": env.base.freq,
         "observations": env.observation_sizes if sizes is None else dict(sizes),
-        "images": env.image_formats(),
+        "images": {
+            name: {k: x for k, x in entries.items() if k != "has_gradient"}
+            for name, entries in env.image_formats().items()
+        },
         "actions": {
             "level": env.actions.control.value,
             "centre": env.actions.centre.tolist(),

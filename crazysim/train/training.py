@@ -577,6 +577,11 @@ def store_configs(configs: Mapping[str, TrainConfig], folder: Path) -> None:
     checkpoint.save(folder / STUDENTS_FILE, {}, {"runs": {name: _run_metadata(x) for name, x in configs.items()}})
 
 
+def require_stored_settings(path: Path, stored: TrainConfig, requested: TrainConfig) -> None:
+    """Raise ``ConfigError`` if a resumed training has other settings than those that a file or folder holds."""
+    _require_same_settings(path, *(_run_metadata(x)["settings"] for x in (stored, requested)))
+
+
 def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
     """Return the configurations of the trainings in a folder, by name: of its checkpoint, or by ``store_configs``.
 

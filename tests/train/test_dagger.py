@@ -14,7 +14,8 @@ from crazysim.errors import DivergedError
 from crazysim.train import config as configs
 from crazysim.train import dagger, imitate, run, run_many
 from crazysim.train.config import Recipe, TrainConfig
-from crazysim.train.training import load_policy, train
+from crazysim.train.runs import _train_teacher
+from crazysim.train.training import load_policy, store_configs, stored_configs, train
 
 pytestmark = pytest.mark.usefixtures("shared_environments")
 STUDENT_OBSERVATIONS = ("rot", "difference_to_goal", "vel")
@@ -167,6 +168,8 @@ def test_an_interrupted_teacher_continues_and_then_teaches(recipe_with_teacher, 
     del settings["options"]
     with pytest.raises(ConfigError, match=r"expected the seeds and the sweep of .*run, none, got seed-0"):
         run_many("hover", tmp_path / "run", resume=True, **settings)
+    with pytest.raises(ConfigError, match=r"expected n_worlds = 6 as in .*, got 8; resume with the same value"):
+        run("hover", tmp_path / "run", film=False, resume=True, n_worlds=8, **settings)
     run("hover", tmp_path / "run", film=False, resume=True, **settings)
     headers = [line for line in lines if " by " in line and "engine: " in line]
     assert "continues after iteration 1" in headers[1]
@@ -186,6 +189,15 @@ def test_settings_of_a_student_are_checked_before_its_teacher_is_trained(recipe_
         with pytest.raises(ConfigError, match=message):
             run("hover", tmp_path / "run", **settings | wrong)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_new_run_forgets_the_settings_that_waited_for_a_teacher(tmp_path):
+    config = TrainConfig.create("hover")
+    store_configs({"": config}, tmp_path)
+    assert stored_configs(tmp_path) == {"": config}
+    assert not _train_teacher({"": config}, {}, tmp_path, False, {})
+    with pytest.raises(ConfigError, match=r"an existing file with a checkpoint"):
+        stored_configs(tmp_path)
 
 
 def test_teachers_that_do_not_fit_are_errors(teacher, tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from crazysim.envs import AutoReset, DroneEnv, RewardTerms, make
+from crazysim.envs.registry import entry_of
 from crazysim.envs.state import terms_of
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import ConfigError
@@ -145,9 +146,12 @@ def test_a_class_with_a_demonstration_begins_with_it():
     assert TrainConfig.create("hover").config["demonstrations"] == 0
 
 
-def test_a_policy_of_another_run_begins_with_its_value_function():
+def test_a_policy_of_another_run_begins_with_its_value_function(monkeypatch):
     config = TrainConfig.create(TASK, config={"start": "run", "iterations": 50}).config
     assert (config["value_iterations"], config["demonstrations"]) == (25, 0)
+    monkeypatch.setattr(entry_of(TASK).task, "recipe", {"demonstrations": 40})
+    for given, demonstrations in (({}, 40), ({"start": "run"}, 0), ({"start": "run", "demonstrations": 5}, 5)):
+        assert TrainConfig.create(TASK, config=given).config["demonstrations"] == demonstrations
 
 
 @pytest.mark.parametrize(
