@@ -138,7 +138,8 @@ def load_policy_and_env(
         task: Reference of the task, if it has moved since training; None for the reference in the run.
         drone: Airframe that a policy for any flies; None for airframes that are drawn.
         policies: Folders of runs whose policies fly the drones of a world, in their order; empty for one policy.
-        settings: Options of ``crazysim.envs.make`` that differ from those of the training.
+        settings: Options of ``crazysim.envs.make`` that differ from those of the training, or, with ``policies``, that
+            are not those that all runs share.
     """
     from crazysim.train.config import TrainConfig
     from crazysim.train.export import find_weights, raptor_policy
@@ -147,8 +148,11 @@ def load_policy_and_env(
     from crazysim.train.training import load_policy
 
     if policies:
-        config = TrainConfig.create(str(folder), options=dict(settings)).with_device(device)
-        return MultiPolicy.of([load_policy(x)[0] for x in policies]), config, config.make_env(n_worlds)
+        runs = [load_policy(x)[:2] for x in policies]
+        shared = runs[0][1].options.items()
+        shared = {k: x for k, x in shared if k != "device" and all(c.options.get(k) == x for _, c in runs)}
+        config = TrainConfig.create(str(folder), options=shared | dict(settings)).with_device(device)
+        return MultiPolicy.of([policy for policy, _ in runs]), config, config.make_env(n_worlds)
     if (weights := find_weights(folder)) is not None:
         config = TrainConfig.create("any", options={} if drone is None else {"drone": drone, "drawn": False})
         env = config.with_options(**settings).with_device(device).make_env(n_worlds)

@@ -42,7 +42,8 @@ def load_track(source: str | Path) -> Track:
         return Track()
     path = TRACK_FOLDER / f"{source}.yaml" if str(source) in track_names() else as_path(source)
     require(
-        is_file(path), f"expected a track as one of {', '.join(track_names())}, or a YAML file, got {str(source)!r}."
+        is_file(path),
+        f"expected a track as one of {', '.join(track_names())}, or a YAML file, got {str(source)!r}: no file.",
     )
     with optional_import("race tracks need", "yaml", "racing"):
         import yaml

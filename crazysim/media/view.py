@@ -236,8 +236,9 @@ class View:
                 target.shape[-1:] == (3,), f"expected hold to return points of shape (n, 3), got shape {target.shape}."
             )
             points = np.concatenate([pos, target.reshape(-1, 3)])
-            aim = self._smooth_aim(k, time, _frame_points(points, float(sim.mj_model.vis.global_.fovy)))
-            config |= {"lookat": aim[:3], "distance": aim[3]}
+            points, fovy = points[np.isfinite(points).all(-1)], float(sim.mj_model.vis.global_.fovy)
+            *middle, distance = self._smooth_aim(k, time, _frame_points(points, fovy))
+            config |= {"lookat": middle, "distance": max(distance, _fitting_distance(points, middle, fovy))}
         return config
 
     def _draw_rings_and_marks(self, sim: Sim, k: int, pos: NDArray, config: Mapping[str, Any]) -> None:
@@ -296,12 +297,15 @@ def _draw_top_view(tile: NDArray, picture: NDArray | None) -> None:
 
 
 def _frame_points(points: NDArray, fovy: float) -> NDArray:
-    points = points[np.isfinite(points).all(-1)]
     if not len(points):
         return np.full(4, np.nan)
     middle = (points.min(0) + points.max(0)) / 2
-    radius = max(float(np.linalg.norm(points - middle, axis=-1).max()), MIN_VIEW_RADIUS)
-    return np.append(middle, DISTANCE_MARGIN * radius / np.sin(np.radians(fovy) / 2))
+    return np.append(middle, DISTANCE_MARGIN * _fitting_distance(points, middle, fovy))
+
+
+def _fitting_distance(points: NDArray, middle: ArrayLike, fovy: float) -> float:
+    radius = np.linalg.norm(points - np.asarray(middle), axis=-1).max(initial=MIN_VIEW_RADIUS)
+    return float(radius / np.sin(np.radians(fovy) / 2))
 
 
 def _format_text(text: str | None, world: int, time: float) -> str:

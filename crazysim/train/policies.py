@@ -43,7 +43,8 @@ def load_start(folder: str, env: Env, obs: Obs) -> tuple[Policy, np.ndarray] | N
     if not folder:
         return None
     require(
-        Path(folder).is_dir(), f"expected the run of start={folder}, also to resume, got no such folder. Move it back."
+        Path(folder).is_dir(),
+        f"expected the run of start={folder}, got no such folder. Use the folder of a run, also to resume.",
     )
     (policy, *_), sizes = load_policy(folder), sizes_of(obs)
     known, interface = policy.interface.sizes, Interface.read(describe_env(env, sizes))

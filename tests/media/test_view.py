@@ -174,6 +174,22 @@ def test_a_camera_holds_drones_and_points_of_each_world_in_view(sim):
     np.testing.assert_array_equal(held.render(sim), image)
 
 
+def test_a_camera_that_lags_goes_back_so_far_that_its_points_stay_in_view(sim):
+    place(sim, POSITIONS, 0.0)
+    goal = np.array([0.5, 0.0, 0.5])
+    held = make_view(
+        camera=-1,
+        cam_config={"azimuth": 90, "elevation": -90},
+        hold=lambda _, world: goal,
+        draw=lambda sim, world: draw_points(sim, goal[None], (1, 0, 0, 1), 0.2),
+        lag=10.0,
+    )
+    assert has_colour(held.render(sim), RED).any()
+    goal += [3.0, 0.0, 0.0]
+    place(sim, POSITIONS, 0.1)
+    assert has_colour(held.render(sim), RED).any()
+
+
 def test_a_camera_that_follows_lags_behind(sim):
     """After a jump of 0.2 m the camera has moved by the fraction 1 - exp(-t / lag); after a reset by the whole way."""
     config = {"distance": 1.5, "azimuth": 90, "elevation": -90}

@@ -1,11 +1,14 @@
 """Several policies in one environment, and trainings against earlier versions of the policy."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim import ConfigError
+from crazysim.commands.options import load_policy_and_env
 from crazysim.envs import AutoReset, make, rollout
 from crazysim.train import MultiPolicy, evaluate, evaluate_each, ppo
 from crazysim.train.config import TrainConfig
@@ -164,5 +167,9 @@ def test_policies_of_other_runs_are_opponents_of_their_share_of_the_worlds(tmp_p
     known = {name: x[2:, 1:] for name, x in state.obs.items() if name in solo_policy.interface.sizes}
     np.testing.assert_allclose(action[2:, 1:], solo_policy(known), atol=1e-6)
     jax.tree.map(np.testing.assert_array_equal, agent.rivals[0].layers, solo_policy.layers)
+    # Settings that the runs share are those of the race that they fly together.
+    folders, settings = [tmp_path / "solo"] * 2, {"n_drones": 2, "seconds": 0.2}
+    _, config, _ = load_policy_and_env(Path("head_to_head"), None, 1, policies=folders, settings=settings)
+    assert config.options == options | settings
     with pytest.raises(ConfigError, match="1 versions and 2 rivals divide, got 4"):
         train_iterations(env, 0, opponents=1, versions=1, rivals=rivals * 2)

@@ -142,6 +142,7 @@ def _fly_plan(options: argparse.Namespace) -> RaceFlight:
 
 
 def _fly_policy(options: argparse.Namespace) -> RaceFlight:
+    from crazysim.envs.registry import entry_of
     from crazysim.envs.tasks.race import Race
     from crazysim.lab.racing.flight import flight_of_policy
     from crazysim.plugins.effects.battery import Battery
@@ -160,7 +161,7 @@ def _fly_policy(options: argparse.Namespace) -> RaceFlight:
     course = {"track": options.track, "laps": options.laps, "level": 0, "device": "cpu"}
     course |= {} if options.penalty is None else {"penalty": options.penalty}
     effects = [] if options.battery is None else [Battery(charge=options.battery)]
+    expect(issubclass(entry_of(config.task).task, Race), "a policy of the task race or time_trial", config.task)
     env = config.with_options(**course | settings).make_env(1, effects=effects)
-    expect(isinstance(env.task, Race), "a policy of the task race", config.task)
     check_policy(policy, env)
     return flight_of_policy(env, policy)
