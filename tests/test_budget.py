@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 908,
+    "commands": 911,
     "control": 1394,
     "core": 1584,
     "crazysim": 845,
@@ -19,8 +19,8 @@ BUDGET = {
     "engine": 6794,
     "envs": 3790,
     "geometry": 948,
-    "lab": 17777,
-    "media": 1091,
+    "lab": 17778,
+    "media": 1093,
     "plugins": 5083,
     "scene": 3289,
     "sim": 914,
