@@ -265,7 +265,10 @@ def evaluate(options: argparse.Namespace) -> None:
         check_writable(options.plot, PICTURE_SUFFIXES)
     policy, config, env = _load(options)
     key = None if options.seed is None else jax.random.key(options.seed)
-    title = ", ".join([config.title, *options.set, f"{options.worlds:,} starts ({env.task.criterion})"])
+    # Several policies fly the settings that their runs share.
+    shared = [f"{k}={x}" for k, x in config.options.items() if k != "device"]
+    settings = shared if options.policies else options.set
+    title = ", ".join([config.title, *settings, f"{options.worlds:,} starts ({env.task.criterion})"])
     if options.policies:
         for folder, metrics in zip(options.policies, evaluate_each(env, policy, key), strict=True):
             reward = metrics.pop("reward")
