@@ -266,8 +266,7 @@ def evaluate(options: argparse.Namespace) -> None:
     policy, config, env = _load(options)
     key = None if options.seed is None else jax.random.key(options.seed)
     # Several policies fly the settings that their runs share.
-    shared = [f"{k}={x}" for k, x in config.options.items() if k != "device"]
-    settings = shared if options.policies else options.set
+    settings = [f"{k}={x}" for k, x in config.options.items() if k != "device"] if options.policies else options.set
     title = ", ".join([config.title, *settings, f"{options.worlds:,} starts ({env.task.criterion})"])
     if options.policies:
         for folder, metrics in zip(options.policies, evaluate_each(env, policy, key), strict=True):

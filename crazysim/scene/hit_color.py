@@ -134,33 +134,16 @@ ReachLight = Callable[[int, Array, Components, Sequence[Array], Components, Arra
 it, m, that returns the strength that reaches the point."""
 
 
-def color_at_hit(
-    lights: Sequence[Light],
-    has_sky: bool,
-    has_haze: bool,
-    is_per_world: bool,
-    surfaces: Sequence[Surface],
-    n_pixels: int,
-    n_cameras: int,
-    index: Array,
-    *tables: Array,
-) -> list[Array]:
+def color_at_hit(lights: Sequence[Light], has_sky: bool, has_haze: bool, *rays: Any) -> list[Array]:
     """Return red, green and blue of a ray, from 0 to 1. () each
 
     Args:
         lights: Lights in the order of ``Paint.lights``.
         has_sky: Whether rays that meet nothing have the colour of the sky; they are black otherwise.
         has_haze: Whether a plane disappears in haze at the horizon.
-        is_per_world: Whether looks, textures and lights have rows for each world, one world after the other.
-        surfaces: ``Targets.surfaces``.
-        n_pixels: Number of rays of a camera.
-        n_cameras: Number of cameras of a world.
-        index: Index of the ray, as in ``first_hit``. ()
-        *tables: Fields of ``Paint`` and ``Tables``, then the two results of ``first_hit``. (n_rays, 1) each
+        *rays: Other arguments of ``_look_along``.
     """
-    paint, sight, describe, reach_light = _look_along(
-        lights, is_per_world, surfaces, n_pixels, n_cameras, index, *tables
-    )
+    paint, sight, describe, reach_light = _look_along(lights, *rays)
     color = shade(lights, has_sky, has_haze, paint, sight, describe, reach_light)
     return [jnp.clip(c, 0.0, 1.0) for c in color]
 
@@ -177,26 +160,15 @@ def unpack_color(packed: Array) -> Array:
     return lax.bitcast_convert_type(packed, np.uint8)[..., :3]
 
 
-def trace_at_hit(
-    lights: Sequence[Light],
-    has_sky: bool,
-    has_haze: bool,
-    is_per_world: bool,
-    surfaces: Sequence[Surface],
-    n_pixels: int,
-    n_cameras: int,
-    index: Array,
-    *tables: Array,
-) -> list[Array]:
+def trace_at_hit(lights: Sequence[Light], *rays: Any) -> list[Array]:
     """Return what ``shade`` needs beside the normal of a surface: position along both axes of the texture, each
     with its gradient in the world frame, 1/m, and for each light whether it reaches the surface, 0 or 1. () each
 
-    For the arguments see ``color_at_hit``.
+    Args:
+        lights: Lights in the order of ``Paint.lights``.
+        *rays: Other arguments of ``_look_along``.
     """
-    del has_sky, has_haze
-    paint, sight, describe, reach_light = _look_along(
-        lights, is_per_world, surfaces, n_pixels, n_cameras, index, *tables
-    )
+    paint, sight, describe, reach_light = _look_along(lights, *rays)
     normal, texture = (numbers := describe())[:3], numbers[3:]
     point = _end(sight)
     shares = []
@@ -216,6 +188,17 @@ def _look_along(
     index: Array,
     *tables: Array,
 ) -> tuple[Paint, Sight, Callable[[], Sequence[Array]], ReachLight]:
+    """Return the colours of the scene, a ray, and the two functions of it that ``shade`` takes.
+
+    Args:
+        lights: Lights in the order of ``Paint.lights``.
+        is_per_world: Whether looks, textures and lights have rows for each world, one world after the other.
+        surfaces: ``Targets.surfaces``.
+        n_pixels: Number of rays of a camera.
+        n_cameras: Number of cameras of a world.
+        index: Index of the ray, as in ``first_hit``. ()
+        *tables: Fields of ``Paint`` and ``Tables``, then the two results of ``first_hit``. (n_rays, 1) each
+    """
     n_paint = len(Paint._fields)
     paint, t, (distances, geoms) = Paint(*tables[:n_paint]), Tables(*tables[n_paint:-2]), tables[-2:]
     world, ray = camera_ray(t, n_pixels, n_cameras, index)

@@ -380,7 +380,8 @@ def cast_rays_in_worlds(
     distance = _replace_derivative(distance, _gap(distance, normal, rows, origin, direction))
     normal = _replace_derivative(normal, normal_at(distance))
     if appearance is not None and appearance.has_derivatives:
-        trace_fn = functools.partial(trace_at_hit, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
+        lights, _, _, is_per_world = appearance.flags
+        trace_fn = functools.partial(trace_at_hit, lights, is_per_world, targets.surfaces, n_pixels, n_cameras)
         trace = map_indices(trace_fn, n, [*paint, *tables, *hit_table], platform, compile_now=False)
         all_axes = jnp.broadcast_to(axes, (n_worlds, n_cameras, n_pixels, 3, 3)).reshape(n_worlds, -1, 9)
         args = distance, geom_index, normal, rows, origin, direction, all_axes

@@ -30,8 +30,6 @@ from crazysim.train.training import (
     TEACHER_FOLDER,
     TrainResult,
     require_no_run,
-    require_same_trainings,
-    require_stored_settings,
     store_configs,
     stored_configs,
     train,
@@ -255,21 +253,13 @@ def _train_variants(
     for name, (seed, changes) in variants.items():
         own_settings = {**settings, "seed": seed, "config": {**(settings.get("config") or {}), **changes}}
         configs[name] = TrainConfig.create(task, **own_settings, resumed=stored_by_name.get(name))
-    if resume:
-        require_same_trainings(folder, stored_by_name, configs)
-    if _train_teacher(configs, stored_by_name, folder, resume, options):
+    if _train_teacher(configs, folder, resume, options):
         resume, teacher = False, str(folder / TEACHER_FOLDER)
         configs = {name: dataclasses.replace(x, config=x.config | {"teacher": teacher}) for name, x in configs.items()}
     return folder, configs, train_many(configs, folder, resume, on_iteration=on_iteration, **options)
 
 
-def _train_teacher(
-    students: Mapping[str, TrainConfig],
-    stored: Mapping[str, TrainConfig],
-    folder: Path,
-    resume: bool,
-    options: Mapping[str, Any],
-) -> bool:
+def _train_teacher(students: Mapping[str, TrainConfig], folder: Path, resume: bool, options: Mapping[str, Any]) -> bool:
     student = next(iter(students.values()))
     teacher = student.teacher_config()
     if teacher is None or (resume and (folder / CHECKPOINT_FILE).exists()):
@@ -277,15 +267,11 @@ def _train_teacher(
             (folder / STUDENTS_FILE).unlink(missing_ok=True)  # of a run whose teacher was interrupted
         return False
     teacher_folder = folder / TEACHER_FOLDER
-    if resume:
-        for name, x in students.items():
-            require_stored_settings(folder / STUDENTS_FILE, stored[name], x)
-    else:
+    if not resume:
         require_no_run(folder)
         require_no_run(teacher_folder)
         _check_student(student)
-    if is_first_host():
-        store_configs(students, folder)
+    store_configs(students, folder, resume)
     options["log"](f"first the teacher of {student.title}, then the student by {student.algorithm}")
     train(teacher, teacher_folder, resume and (teacher_folder / CHECKPOINT_FILE).exists(), **options)
     return True

@@ -571,15 +571,18 @@ def _run_metadata(config: TrainConfig) -> dict[str, Any]:
         ) from error
 
 
-def store_configs(configs: Mapping[str, TrainConfig], folder: Path) -> None:
-    """Write the configurations of trainings that begin after that of their teacher, for ``stored_configs``."""
-    make_folder(folder)
-    checkpoint.save(folder / STUDENTS_FILE, {}, {"runs": {name: _run_metadata(x) for name, x in configs.items()}})
+def store_configs(configs: Mapping[str, TrainConfig], folder: Path, resume: bool) -> None:
+    """Write the configurations of trainings that begin after that of their teacher, for ``stored_configs``.
 
-
-def require_stored_settings(path: Path, stored: TrainConfig, requested: TrainConfig) -> None:
-    """Raise ``ConfigError`` if a resumed training has other settings than those that a file or folder holds."""
-    _require_same_settings(path, *(_run_metadata(x)["settings"] for x in (stored, requested)))
+    Raises:
+        ConfigError: If the trainings are resumed, and the folder holds others or other settings.
+    """
+    runs = {name: _run_metadata(x) for name, x in configs.items()}
+    if resume:
+        _require_same_runs(folder, checkpoint.read(folder / STUDENTS_FILE)[1]["runs"], runs)
+    if is_first_host():
+        make_folder(folder)
+        checkpoint.save(folder / STUDENTS_FILE, {}, {"runs": runs})
 
 
 def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
@@ -606,20 +609,19 @@ def _read_run(
             f"run in another folder with --out",
         )
         runs = meta["runs"]
-        require_same_trainings(path, runs, metadata)
-        for name, run in metadata.items():
-            _require_same_settings(path, runs[name]["settings"], run["settings"])
+        _require_same_runs(path, runs, metadata)
         return arrays, runs, meta["code"], float(meta["seconds"])
 
 
-def require_same_trainings(path: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
-    """Raise ``ConfigError`` if other trainings are requested than those that a file or folder holds, by name."""
+def _require_same_runs(path: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
     require(
         list(stored) == list(requested),
         f"expected the seeds and the sweep of {path}, {', '.join(stored) or 'none'}, got "
         f"{', '.join(requested) or 'none'}; resume with the same ones, or start a new run in another folder with "
         f"--out",
     )
+    for name, run in requested.items():
+        _require_same_settings(path, stored[name]["settings"], run["settings"])
 
 
 def _require_same_settings(path: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:

@@ -193,9 +193,9 @@ def test_settings_of_a_student_are_checked_before_its_teacher_is_trained(recipe_
 
 def test_a_new_run_forgets_the_settings_that_waited_for_a_teacher(tmp_path):
     config = TrainConfig.create("hover")
-    store_configs({"": config}, tmp_path)
+    store_configs({"": config}, tmp_path, resume=False)
     assert stored_configs(tmp_path) == {"": config}
-    assert not _train_teacher({"": config}, {}, tmp_path, False, {})
+    assert not _train_teacher({"": config}, tmp_path, False, {})
     with pytest.raises(ConfigError, match=r"an existing file with a checkpoint"):
         stored_configs(tmp_path)
 
