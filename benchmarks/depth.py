@@ -7,7 +7,8 @@ PYTHONPATH.
 With ``--range-finder``, drones at random positions measure six distances up to 4 m in each step.
 ``fraction_that_meets`` is the fraction of the four horizontal rays that meet something.
 
-With ``--colors``, images of a ``Camera`` per second: depth, and colours with and without shadows.
+With ``--colors``, images of a ``Camera`` per second: depth, and colours with and without shadows; and gradients of
+depths and colours by the positions of the cameras.
 
 With ``--maps``, depth images, and contact reports of rooms, among rooms of 16 to 64 boxes: of one room for all worlds,
 the mean of eight rooms, and of numbers of rooms from which each world has drawn one.
@@ -80,7 +81,16 @@ def report_colors(sim: Any, n_poles: int, movable: bool, args: argparse.Namespac
         "colours without shadows": Camera(*args.size, outputs=("rgb",), shadows=False),
         "colours": Camera(*args.size, outputs=("rgb",)),
     }
+    differentiable = {"depth": cameras["depth"], "colours": Camera(*args.size, outputs=("rgb",), color_gradients=True)}
+
+    def mean_square(pos: Array, take: Callable[[Any], dict[str, Array]]) -> Any:
+        images = take(sim.data.replace(states=sim.data.states.replace(pos=pos)))
+        return sum((x * x).mean() for x in images.values())
+
     calls = {name: partial(jax.jit(camera.image_fn(sim)), sim.data) for name, camera in cameras.items()}
+    for name, camera in differentiable.items():
+        gradient = jax.jit(jax.grad(partial(mean_square, take=camera.image_fn(sim))))
+        calls[f"gradient of {name}"] = partial(gradient, sim.data.states.pos)
     jax.block_until_ready([call() for call in calls.values()])
     rates = medians({name: partial(seconds, call) for name, call in calls.items()}, args.repeats)
     for name, call in calls.items():

@@ -46,6 +46,8 @@ MAX_RATE = 3.0
 """Largest rate at which the phase follows the drone, as a multiple of the plan's."""
 MAX_BODY_RATES = (15.0, 15.0, 3.0)
 """Largest roll, pitch and yaw rates of the plan, rad/s, beyond which a flight costs."""
+RATE_RESERVE = 1.2
+"""Largest commanded body rates as a multiple of the plan's largest ones, 1: corrections add to the plan's rates."""
 FINISH_RADIUS = 0.3
 """Radius of the waypoint at the finish, m."""
 PRACTICE_DEVIATION = {"pos": 0.2, "rpy": 0.2, "vel": 1.0, "ang_vel": 1.0}
@@ -118,7 +120,13 @@ class TimeTrial(Race):
         super().add_states(sim, placements, reference=reference, **initial)
 
     def actions(self, sim: Sim) -> Actions:
-        return rotor_speeds(sim.default_data.params) if sim.control == "rotor_vel" else super().actions(sim)
+        if sim.control == "rotor_vel":
+            return rotor_speeds(sim.default_data.params)
+        actions = super().actions(sim)
+        if sim.control == "body_rate":
+            rates = np.multiply(RATE_RESERVE, MAX_BODY_RATES)
+            return Actions(actions.centre, np.array([*rates, actions.scale[3]]), actions.control)
+        return actions
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         data = Race.spawn(dataclasses.replace(self, practice=False), data, key)
