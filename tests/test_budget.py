@@ -19,7 +19,7 @@ BUDGET = {
     "engine": 6794,
     "envs": 3790,
     "geometry": 948,
-    "lab": 17778,
+    "lab": 17785,
     "media": 1093,
     "plugins": 5083,
     "scene": 3289,
