@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -78,6 +79,43 @@ def map_indices(
         return jax.lax.map(run, broadcast_tables), [True] * len(kernels.result_shapes(n))
 
     return jaxcompat.add_vmap_rule(run, batching_rule)(list(tables))
+
+
+def map_tangents(
+    fns: tuple[Function, Function], tables: Sequence[Array], tangents: Array, platform: str | None
+) -> Array:
+    """Return the results of a function that is linear in its last table, for the index of each row. (n, m)
+
+    Args:
+        fns: The function, whose last table has the tangents, and its transpose, whose last table has the cotangents of
+            the results, and which returns those of the tangents.
+        tables: The other tables, as in ``map_indices``.
+        tangents: The tangents. (n, k)
+        platform: As in ``map_indices``.
+    """
+    return linear_map_p.bind(*tables, tangents, fns=fns, platform=platform, n_nonlinear=len(tables))[0]
+
+
+def _map_rows(fn: Function, platform: str | None, *tables: Array) -> list[Array]:
+    return [jnp.stack(map_indices(fn, len(tables[-1]), tables, platform, compile_now=False), axis=-1)]
+
+
+def _map_linear(*args: Any, fns: Any, platform: str | None, **_: Any) -> list[Array]:
+    return _map_rows(fns[0], platform, *args)
+
+
+def _map_transposed(tables: Any, cotangents: Any, fns: Any, platform: str | None, **_: Any) -> list[Array]:
+    return _map_rows(fns[1], platform, *tables, *cotangents)
+
+
+linear_map_p = jaxcompat.primitive_by_platform(
+    "crazysim_linear_map",
+    lambda *args, **params: jax.eval_shape(partial(_map_linear, **params), *args),
+    {"": _map_linear},
+    transpose_rule=_map_transposed,
+    batching_rule=jaxcompat.make_vmap_rule(_map_linear),
+)
+"""Primitive of ``map_tangents``."""
 
 
 def lower_map(fn: Function, tables: Sequence[Any]) -> Block:

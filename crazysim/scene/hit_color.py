@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from crazysim.core.branches import compute_where, table_rows
+from crazysim.core.branches import compute_where, select_where, table_rows
 from crazysim.geometry import Shape
 from crazysim.geometry.points import Components
 from crazysim.geometry.shapes import UNBOUNDED_LENGTH
@@ -160,23 +161,65 @@ def unpack_color(packed: Array) -> Array:
     return lax.bitcast_convert_type(packed, np.uint8)[..., :3]
 
 
-def trace_at_hit(lights: Sequence[Light], *rays: Any) -> list[Array]:
-    """Return what ``shade`` needs beside the normal of a surface: position along both axes of the texture, each
-    with its gradient in the world frame, 1/m, and for each light whether it reaches the surface, 0 or 1. () each
+def color_tangent_at_hit(*args: Any) -> list[Array]:
+    """Return the tangents of red, green and blue for those of 16 numbers, in the last table. () each
+
+    The numbers are the distance, then the components of the origin, the direction, the third axis of the camera, the
+    motion of the point in the frame of the geom, and the rotation of the geom, rad, all in the world frame. Edges, of
+    shadows too, do not move.
 
     Args:
-        lights: Lights in the order of ``Paint.lights``.
-        *rays: Other arguments of ``_look_along``.
+        *args: Those of ``color_at_hit``, and the table. (n_rays, 16)
     """
-    paint, sight, describe, reach_light = _look_along(lights, *rays)
-    normal, texture = (numbers := describe())[:3], numbers[3:]
-    point = _end(sight)
-    shares = []
+    color, numbers, tangents = _color_near_hit(*args)
+    return jax.jvp(color, numbers, [x.astype(numbers[0].dtype) for x in tangents])[1]
+
+
+def color_cotangent_at_hit(*args: Any) -> Sequence[Array]:
+    """Return the cotangents of the numbers of ``color_tangent_at_hit`` for those of the colours. () each
+
+    Args:
+        *args: Those of ``color_at_hit``, and the table. (n_rays, 3)
+    """
+    color, numbers, cotangents = _color_near_hit(*args)
+    return jax.vjp(color, *numbers)[1]([x.astype(numbers[0].dtype) for x in cotangents])
+
+
+def _color_near_hit(
+    lights: Sequence[Light], has_sky: bool, has_haze: bool, *rays: Any
+) -> tuple[Callable[..., list[Array]], list[Array], list[Array]]:
+    # Function from numbers of a ray to its colour, the numbers, and the ray's row in the last table.
+    *along, changes = rays
+    paint, sight, describe, reach_light = _look_along(lights, *along)
+    sight = sight._replace(distance=jnp.where(jnp.isfinite(sight.distance), sight.distance, 1.0))
+    numbers = describe(_rates_of_surface, 20)
+    normal, (u, *u_rates), (v, *v_rates), rates = numbers[:3], numbers[3:7], numbers[7:11], numbers[11:]
+    point, back = _end(sight), _column(sight.axes, 2)
+    shares: dict[int, Array] = {}
     for k, light in enumerate(lights):
-        row = LightRow.read(paint.lights, sight.first_light + k)
-        strength, to_light, limit = _incidence(light, row, point, _column(sight.axes, 2))
-        shares.append(jnp.where(reach_light(k, strength, point, normal, to_light, limit) > 0, 1.0, 0.0))
-    return [*texture, *shares]
+        if light.casts_shadow:
+            row = LightRow.read(paint.lights, sight.first_light + k)
+            strength, to_light, limit = _incidence(light, row, point, back)
+            shares[k] = jnp.where(reach_light(k, strength, point, normal, to_light, limit) > 0, 1.0, 0.0)
+
+    def reach(k: int, strength: Array, *_: Any) -> Array:
+        return strength * shares[k].astype(strength.dtype) if k in shares else strength
+
+    def color(distance: Array, *components: Array) -> list[Array]:
+        origin, direction, (x, y, z), shift, turn = (components[k : k + 3] for k in range(0, 15, 3))
+        axes = (*sight.axes[:2], x, *sight.axes[3:5], y, *sight.axes[6:8], z)
+        ray = sight.ray._replace(origin=origin, direction=direction)
+        # Without terms of second order, whose derivative is zero at a shift and a turn of zero.
+        turned = Vector(*normal) + Vector(*turn).cross(Vector(*normal))
+        turned += Vector(*(_dot(rates[k::3], shift) for k in range(3)))
+        surface = turned.x, turned.y, turned.z, u + _dot(u_rates, shift), *u_rates, v + _dot(v_rates, shift), *v_rates
+        moved = sight._replace(axes=axes, ray=ray, distance=distance)
+        rgb = shade(lights, has_sky, has_haze, paint, moved, lambda: surface, reach, select_where)
+        return [jnp.clip(c, 0.0, 1.0) for c in rgb]
+
+    at_rest = (jnp.zeros_like(point[0]),) * 3
+    numbers = [sight.distance, *sight.ray.origin, *sight.ray.direction, *back, *at_rest, *at_rest]
+    return color, numbers, table_rows(changes, along[4])
 
 
 def _look_along(
@@ -187,7 +230,7 @@ def _look_along(
     n_cameras: int,
     index: Array,
     *tables: Array,
-) -> tuple[Paint, Sight, Callable[[], Sequence[Array]], ReachLight]:
+) -> tuple[Paint, Sight, Callable[..., Sequence[Array]], ReachLight]:
     """Return the colours of the scene, a ray, and the two functions of it that ``shade`` takes.
 
     Args:
@@ -209,8 +252,8 @@ def _look_along(
     row = jnp.where(geom < 0, jnp.int32(0), geom)  # other lanes of a branch read a row, too, which must exist
     look = row + scene * (counts[1] + counts[2])
 
-    def describe() -> Sequence[Array]:
-        return surface_at_hit(_normal_and_texture, 11, surfaces, n_pixels, n_cameras, index, *tables[n_paint:])
+    def describe(fn: Callable[..., Any] = _normal_and_texture, n_results: int = 11) -> Sequence[Array]:
+        return surface_at_hit(fn, n_results, surfaces, n_pixels, n_cameras, index, *tables[n_paint:])
 
     def reach_light(
         k: int, strength: Array, point: Components, normal: Sequence[Array], to_light: Components, limit: Array
@@ -246,7 +289,8 @@ def shade(
         has_haze: Whether there is haze.
         paint: Colours of the scene.
         sight: The ray and the geom that it meets.
-        describe: Function that returns the normal of the surface, then its texture, as from ``trace_at_hit``.
+        describe: Function that returns the normal of the surface, then the position along both axes of its texture,
+            each with its gradient in the world frame, 1/m.
         reach_light: Function for the shadows of lights.
         branch: ``compute_where``, or ``select_where`` for derivatives.
     """
@@ -345,6 +389,15 @@ def _normal_and_texture(
             start = jnp.where(is_finite, 0.5, 0.0)
             texture += [start + rate * _dot(axis, point), *world_vector(row, tuple(rate * a for a in axis))]  # type: ignore[arg-type]
     return *world_vector(row, normal), *texture
+
+
+def _rates_of_surface(surface: Surface, row: Sequence[Array], origin: Components, *ray: Any) -> tuple[Array, ...]:
+    # The results of ``_normal_and_texture``, and the derivatives of the normal by motions along the world's axes.
+    rates = [jnp.zeros_like(origin[0])] * 9
+    if isinstance(surface, str):  # meshes and terrain have flat sides
+        normal_at = lambda *point: world_vector(row, normal_in_frame(surface, row, point, *ray))  # noqa: E731
+        rates = [x for k in (4, 7, 10) for x in jax.jvp(normal_at, origin, tuple(row[k : k + 3]))[1]]
+    return *_normal_and_texture(surface, row, origin, *ray), *rates
 
 
 def _incidence(light: Light, row: LightRow, point: Components, back: Components) -> tuple[Array, Components, Array]:

@@ -14,11 +14,11 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim import rotation
-from crazysim.core.branches import select_where, table_rows
+from crazysim.core.branches import table_rows
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
-from crazysim.engine.index_map import map_indices
+from crazysim.engine.index_map import map_indices, map_tangents
 from crazysim.engine.pytree import PyTree, static
 from crazysim.engine.sharding import map_devices
 from crazysim.errors import ConfigError, UnsupportedError
@@ -41,7 +41,7 @@ from crazysim.scene.first_hit import (
     ray_in_frame,
 )
 from crazysim.scene.hierarchy import N_ORDERS
-from crazysim.scene.hit_color import Paint, Sight, color_at_hit, packed_color_at_hit, shade, trace_at_hit
+from crazysim.scene.hit_color import color_at_hit, color_cotangent_at_hit, color_tangent_at_hit, packed_color_at_hit
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import map_index_of
 
@@ -380,57 +380,39 @@ def cast_rays_in_worlds(
     distance = _replace_derivative(distance, _gap(distance, normal, rows, origin, direction))
     normal = _replace_derivative(normal, normal_at(distance))
     if appearance is not None and appearance.has_derivatives:
-        lights, _, _, is_per_world = appearance.flags
-        trace_fn = functools.partial(trace_at_hit, lights, is_per_world, targets.surfaces, n_pixels, n_cameras)
-        trace = map_indices(trace_fn, n, [*paint, *tables, *hit_table], platform, compile_now=False)
-        all_axes = jnp.broadcast_to(axes, (n_worlds, n_cameras, n_pixels, 3, 3)).reshape(n_worlds, -1, 9)
-        args = distance, geom_index, normal, rows, origin, direction, all_axes
-        shaded = _shade(appearance, paint, len(targets.all_geoms), jnp.stack(trace, axis=-1), *args)
-        color = _replace_derivative(color, shaded)
+        fns = tuple(
+            functools.partial(fn, *appearance.flags, targets.surfaces, n_pixels, n_cameras)
+            for fn in (color_tangent_at_hit, color_cotangent_at_hit)
+        )
+        back = jnp.broadcast_to(axes[..., 2], (n_worlds, n_cameras, n_pixels, 3)).reshape(n_worlds, -1, 3)
+        numbers = _numbers_of_color(distance, rows, origin, direction, back)
+        color = _with_tangents((fns, platform), color, numbers, (*paint, *tables, *hit_table))
     body_indices = jnp.asarray([*(target.body_index for target in targets.all_geoms), -1], jnp.int32)
     return Hits(distance, normal, _hit_points(origin, direction, distance), body_indices[geom_index], names, color)
 
 
-def _shade(
-    appearance: Appearance,
-    paint: Paint,
-    n_geoms: int,
-    trace: Array,
-    distance: Array,
-    geom_index: Array,
-    normal: Array,
-    rows: Array,
-    origin: Array,
-    direction: Array,
-    axes: Array,
-) -> Array:
-    # Colours with derivatives, (n_worlds, n_rays, 3), from the results of ``trace_at_hit``.
-    lights, has_sky, has_haze, is_per_world = appearance.flags
-    distance = jnp.where(jnp.isfinite(distance), distance, 1.0)
-    trace = trace.reshape(*distance.shape, -1).astype(distance.dtype)
-    geom_axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
-    local_point = jnp.sum(geom_axes * (origin + distance[..., None] * direction - rows[..., :3])[..., None], axis=-2)
-    local_shift = local_point - jax.lax.stop_gradient(local_point)
-    shift = jnp.sum(geom_axes * local_shift[..., None, :], axis=-1)
-    u, v = (trace[..., k] + jnp.sum(trace[..., k + 1 : k + 4] * shift, axis=-1) for k in (0, 4))
-    scene = jnp.broadcast_to(jnp.arange(len(distance), dtype=np.int32)[:, None] * is_per_world, distance.shape)
-    look, first_light = jnp.maximum(geom_index, 0) + scene * n_geoms, scene * len(lights)
+def _numbers_of_color(distance: Array, rows: Array, origin: Array, direction: Array, back: Array) -> Array:
+    # Of which ``color_tangent_at_hit`` takes the tangents. (n_worlds, n_rays, 16)
+    length = jnp.where(jnp.isfinite(distance), distance, 0.0)
+    axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
+    local_end = jnp.sum(axes * (origin + length[..., None] * direction - rows[..., :3])[..., None], axis=-2)
+    shift = jnp.sum(_hold(axes) * local_end[..., None, :], axis=-1)
+    turn = jnp.sum(jnp.cross(_hold(axes), axes, axisa=-2, axisb=-2, axisc=-2), axis=-1) / 2
+    return jnp.concatenate([length[..., None], origin, direction, back, shift, turn], axis=-1)
 
-    @jax.checkpoint
-    def shade_ray(*ray: Array) -> Array:
-        distance, geom, look, first_light, u, v, *vectors = ray
-        normal, origin, direction, axes, trace = (tuple(x) for x in vectors)
-        sight = Sight(axes, Ray(origin, direction, jnp.int32(IGNORES_NONE)), distance, geom, look, first_light)
-        numbers = *normal, u, *trace[1:4], v, *trace[5:8]
 
-        def reach_light(k: int, strength: Array, *_: Any) -> Array:
-            return strength * trace[8 + k]
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _with_tangents(fns: Any, color: Array, numbers: Array, tables: Sequence[Array]) -> Array:
+    # The colours, (n_worlds, n_rays, 3), whose derivatives are those by the numbers.
+    del fns, numbers, tables
+    return color
 
-        color = shade(lights, has_sky, has_haze, paint, sight, lambda: numbers, reach_light, select_where)
-        return jnp.clip(jnp.stack(color), 0.0, 1.0)
 
-    ray = distance, geom_index, look, first_light, u, v, normal, origin, direction, axes, trace
-    return jax.vmap(jax.vmap(shade_ray))(*ray)
+@_with_tangents.defjvp
+def _(fns: Any, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    (color, numbers, tables), (fns, platform) = primals, fns
+    result = map_tangents(fns, tables, tangents[1].reshape(-1, numbers.shape[-1]), platform)
+    return color, result.reshape(color.shape).astype(color.dtype)
 
 
 def _gap(distance: Array, normal: Array, rows: Array, origin: Array, direction: Array) -> Array:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim import Camera, Sim
+from crazysim import Camera, ConfigError, Sim
 from crazysim.plugins.sensors import RandomColors
 from crazysim.scene import depth
 from crazysim.scene.ray_casting import RayKernels
@@ -229,6 +229,25 @@ def test_gradients_of_colors_are_central_differences(x64, tmp_path):
         shift = rng.normal(size=gradient.shape)
         sums = [value_and_gradients([*args[:k], args[k] + s * h * shift, *args[k + 1 :]])[0][0] for s in (1, -1)]
         np.testing.assert_allclose(np.sum(gradient * shift), (sums[0] - sums[1]) / (2 * h), rtol=1e-5, err_msg=k)
+
+
+@pytest.mark.parametrize("engine", ["auto", "plain"])
+@pytest.mark.long("compiles derivatives of four kinds")
+def test_colors_have_first_derivatives_of_both_modes(engine):
+    sim = Sim(2, control="attitude", engine=engine)
+    take = Camera(8, 6, outputs=("rgb",), color_gradients=True).image_fn(sim)
+
+    def loss(pos):
+        return jnp.sum(take(sim.data.replace(states=sim.data.states.replace(pos=pos)))["rgb"] ** 2)
+
+    points = sim.data.states.pos + np.linspace([0, 0, 1], [0, 0, 2], 2, dtype=np.float32)[:, None, None]
+    gradients = jax.jit(jax.vmap(jax.grad(loss)))(points)
+    for point, gradient in zip(points, gradients, strict=True):
+        assert jnp.abs(gradient).max() > 1e-3
+        tangent = jax.jvp(loss, (point,), (jnp.ones_like(point),))[1]
+        np.testing.assert_allclose(tangent, gradient.sum(), rtol=1e-5)  # rounding of 288 numbers
+    with pytest.raises(ConfigError, match="the first derivative"):
+        jax.hessian(loss)(points[0])
 
 
 def test_law_07_gradients_of_colors_are_finite_without_haze_and_attenuation(x64, tmp_path):
