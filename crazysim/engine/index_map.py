@@ -73,10 +73,15 @@ def map_indices(
         return list(launch_p.bind(jnp.zeros(1, np.int32), *tables, kernels=kernels, n=n))
 
     def batching_rule(size: int, in_batched: Any, tables: list[Array]) -> Any:
-        broadcast_tables = [
-            x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(tables, *in_batched, strict=True)
-        ]
-        return jax.lax.map(run, broadcast_tables), [True] * len(kernels.result_shapes(n))
+        del size
+        (is_batched,) = in_batched
+
+        def run_next(batched: list[Array]) -> list[Array]:
+            rest = iter(batched)
+            return run([next(rest) if b else x for x, b in zip(tables, is_batched, strict=True)])
+
+        batched = [x for x, b in zip(tables, is_batched, strict=True) if b]
+        return jax.lax.map(run_next, batched), [True] * len(kernels.result_shapes(n))
 
     return jaxcompat.add_vmap_rule(run, batching_rule)(list(tables))
 

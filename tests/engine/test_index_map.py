@@ -58,7 +58,9 @@ def test_lanes_stop_and_skip_on_their_own(tables, platform):
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
     numbers = jnp.stack([tables[0], 2 * tables[0]])
-    result = jax.jit(jax.vmap(lambda x: map_indices(sum_positive_rows, N, [x, tables[1]], platform)))(numbers)
+    call = jax.vmap(lambda x: map_indices(sum_positive_rows, N, [x, tables[1]], platform))
+    result = jax.jit(call)(numbers)
+    assert f"[2,{','.join(map(str, tables[1].shape))}]" not in str(jax.make_jaxpr(call)(numbers)), "it was repeated"
     for k in range(2):
         expected = compute_by_hand(np.asarray(numbers[k]), np.asarray(tables[1]))
         np.testing.assert_allclose(result[0][k], expected[0], rtol=1e-5, atol=1e-6)

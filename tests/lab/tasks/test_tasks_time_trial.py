@@ -10,7 +10,7 @@ import pytest
 from crazysim import ConfigError, rotation
 from crazysim.drones.body import body_shape
 from crazysim.envs import Track, make
-from crazysim.lab.tasks.time_trial import AHEAD, MISSED, START_PHASE, STEP, Reference
+from crazysim.lab.tasks.time_trial import AHEAD, MAX_BODY_RATES, MISSED, START_PHASE, STEP, Reference
 
 TRACK = Track(
     gates_pos=[(4.0, 1.0, 2.0), (8.0, -1.0, 1.5)], gates_rpy=[(0, 0, 0)] * 2, openings=[0.3, 0.3], start=(0, 0, 1),
@@ -149,3 +149,10 @@ def test_a_track_may_end_where_it_starts():
 def test_law_09_a_margin_that_leaves_no_opening_is_an_error():
     with pytest.raises(ConfigError, match=r"a margin below 0\.3 m"):
         make("time_trial", 1, track=TRACK, margin=0.31, engine="interpret")
+
+
+@pytest.mark.parametrize("drones", [["uzh_cpc"], ["uzh_cpc", "uzh_5inch"]])
+def test_commands_of_body_rates_reach_beyond_those_of_the_plan(drones):
+    env = make("time_trial", 1, len(drones), drone=drones, track=TRACK, control="body_rate", engine="interpret")
+    command = env.actions.command(jnp.ones((1, len(drones), 4)))
+    np.testing.assert_array_less(np.broadcast_to(MAX_BODY_RATES, (1, len(drones), 3)), command[..., :3])
