@@ -16,7 +16,7 @@ BUDGET = {
     "crazysim": 845,
     "drones": 516,
     "dynamics": 367,
-    "engine": 6804,
+    "engine": 6809,
     "envs": 3790,
     "geometry": 948,
     "lab": 17785,
