@@ -89,7 +89,7 @@ def _read_track(tables: Any, owner: str) -> Track:
 
 
 def _table(name: Any, tables: Mapping[Any, Any], owner: str) -> Mapping[str, Any]:
-    expect(isinstance(tables.get(name), dict), f"{name!r} in {owner} as a table", tables.get(name))
+    expect(isinstance(tables.get(name), dict), f"{name!r} in {owner} as a table", tables.get(name, list(tables)))
     return tables[name]
 
 

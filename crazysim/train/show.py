@@ -155,6 +155,7 @@ def plot_episode(
     flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
     terms, is_over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
     t = env.task.seconds * (1 + np.arange(len(is_over))) / len(is_over)
+    end = t[min((~is_over).any(axis=-1).sum(), len(t) - 1)]
     rewards = {**terms, "sum": sum(terms.values())}
     figure, axes = _make_figure(1 + len(rewards))
     error = flight["error"].reshape(len(is_over), -1)
@@ -165,7 +166,7 @@ def plot_episode(
     for axis, x in zip(axes[1:], rewards.values(), strict=True):
         axis.plot(t, np.cumsum(x))
     for axis, y in zip(axes, (f"error, {env.task.unit}", *(f"reward until then, {k}" for k in rewards)), strict=True):
-        axis.set(xlabel="time in the episode, s", ylabel=y)
+        axis.set(xlabel="time in the episode, s", ylabel=y, xlim=(0, end))
     has_succeeded = flight["succeeded"].all(axis=-1) if "succeeded" in flight else np.zeros_like(is_over[-1])
     figure.suptitle(
         f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.1%} fly until the end, "
