@@ -64,7 +64,7 @@ def test_half_planes_bound_a_triangle_in_either_order_of_its_corners():
         ("['B', 'A', 'B']", "B", "gates in 'orders'"),
         ("['B', 'A', 'B']", "[]", "gates in 'orders'"),
         ("['B', 'A', 'B']", "[[A]]", "gates in 'orders'"),
-        ("'A', ", "'C', ", "'C' in mine.yaml as a table, got None"),
+        ("'A', ", "'C', ", "'C' in mine.yaml as a table, got .*'A'"),
         ("initState", "start", "'initState' in mine.yaml as a table"),
         ("pos: [9, 0, 1]", "pos: [9, 0]", r"pos of endState of shape \(3,\), got \(2,\)"),
         ("RectanglePrisma", "Ring", "'B' in mine.yaml of type SingleBall, RectanglePrisma"),
