@@ -106,8 +106,8 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
 
     Returns:
         ``success``: fraction of drones that succeed;
-        ``crashed``: fraction of drones that had not succeeded when their episode was terminated; the others were late,
-        or had too large an error at the end;
+        ``crashed``: fraction of ``crashed_drones``; the others that did not succeed were late, or had too large an
+        error at the end;
         ``nonfinite``: fraction of worlds that became non-finite;
         ``length``: mean length of an episode, s;
         ``error``: mean error of the worlds that did not crash, in ``task.unit``, over the last ``task.hold`` seconds,
@@ -166,11 +166,21 @@ def _succeeded(env: Env, flight: dict[str, Any]) -> np.ndarray:
     return np.all(error < env.task.tolerance, axis=0) & ~flight["over"][-1][:, None]
 
 
+def crashed_drones(env: Env, flight: dict[str, Any]) -> np.ndarray:
+    """Return which drones had not arrived when their episode was terminated, from ``fly_episodes``.
+
+    A drone has arrived that succeeded, or reached the first of the task's ``outcomes``, which may be too late to
+    succeed. (n_worlds, n_drones)
+    """
+    arrived = flight["outcomes"].get(getattr(env.task, "outcomes", ("",))[0], False)
+    return flight["over"][-1][:, None] & ~_succeeded(env, flight) & ~np.asarray(arrived)
+
+
 def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
     over_by_step, succeeded = flight["over"][:, worlds], _succeeded(env, flight)[worlds]
     n_steps = 1 + (~over_by_step[:-1]).sum(axis=0)
-    error, is_over = flight["error"][-_n_final_steps(env, flight) :, worlds], over_by_step[-1]
-    crashed = is_over[:, None] & ~succeeded
+    error = flight["error"][-_n_final_steps(env, flight) :, worlds]
+    crashed = crashed_drones(env, flight)[worlds]
     error = error[:, ~np.any(crashed, axis=-1)]
     error = error[~np.isnan(error)]
     return {

@@ -24,7 +24,7 @@ from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_text
 from crazysim.storage import MAX_TEXT_BYTES, as_path, open_file, wrap_read_errors, write_figure
-from crazysim.train.evaluation import fly_episodes, held_out_key
+from crazysim.train.evaluation import crashed_drones, fly_episodes, held_out_key
 from crazysim.train.interface import check_policy
 from crazysim.train.networks import Policy
 from crazysim.train.policies import act, as_tree, initial_memory
@@ -171,7 +171,7 @@ def plot_episode(
     figure.suptitle(
         f"{is_over.shape[1]:,} worlds: {(~is_over[-1]).mean():.1%} fly until the end, "
         + f"{has_succeeded.mean():.0%} succeed, " * ("succeeded" in flight)
-        + f"{(is_over[-1] & ~has_succeeded).mean():.1%} crash",
+        + f"{crashed_drones(env, flight).any(axis=-1).mean():.1%} crash",
         fontsize=9,
     )
     _save_figure(figure, path)

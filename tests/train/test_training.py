@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
 from crazysim.train.critic import estimate_advantages, rescale_value, return_std
-from crazysim.train.evaluation import describe_outcome, evaluate
+from crazysim.train.evaluation import crashed_drones, describe_outcome, evaluate
 from crazysim.train.networks import MEMORYLESS_NETWORK, Policies, init_weights
 from crazysim.train.optimizer import build_optimizer
 from crazysim.train.runs import run
@@ -535,6 +536,13 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     lost = evaluate(easy, ConstantPolicy(jnp.full(4, jnp.nan)))
     assert lost["nonfinite"] == 1
     assert "of all worlds 100.0% became non-finite" in describe_outcome(lost, "m")
+
+
+def test_who_arrives_too_late_has_not_crashed():
+    env = types.SimpleNamespace(task=types.SimpleNamespace(outcomes=("finished", "disabled")))
+    finished, succeeded = (np.array(x)[:, None] for x in ([True, True, False], [True, False, False]))
+    flight = {"over": np.ones((2, 3), bool), "succeeded": succeeded, "outcomes": {"finished": finished}}
+    assert crashed_drones(env, flight).ravel().tolist() == [False, False, True]
 
 
 def test_a_value_at_the_horizon_is_learnt_from_rewards_until_episodes_end(rng):
