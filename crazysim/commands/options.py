@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import ast
+import contextlib
 import json
 import math
 import os
@@ -108,15 +110,15 @@ def require_screen(remedy: str) -> None:
 
 
 def parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
-    """Return the values of ``NAME=VALUE`` by name, as JSON, as Python's True, False and None, or as text."""
-    pairs = {}
+    """Return the values of ``NAME=VALUE`` by name: JSON, a literal of Python such as True or (16, 12), or else text."""
+    pairs: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         require(equals, f"expected NAME=VALUE, got {text!r}; write for example seconds=5", ValueError)
-        try:
-            pairs[name] = json.loads(value)
-        except ValueError:
-            pairs[name] = {"True": True, "False": False, "None": None}.get(value, value)
+        pairs[name] = value
+        for read in (ast.literal_eval, json.loads):  # what both can read is equal
+            with contextlib.suppress(ValueError, SyntaxError):
+                pairs[name] = read(value)
     return pairs
 
 
