@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 913,
+    "commands": 915,
     "control": 1394,
     "core": 1584,
     "crazysim": 845,
