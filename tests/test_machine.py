@@ -34,12 +34,12 @@ def test_a_process_knows_the_memory_that_it_takes():
     if sys.platform != "linux":
         assert machine.process_memory() == 0
         return
-    code = """import machine; import numpy as np
+    code = """import jax, machine, numpy as np
 before = machine.process_memory(); block = np.ones(25_000_000); print(before, machine.process_memory() - before)"""
     folder = Path(machine.__file__).parent
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
     before, taken = map(int, done.stdout.split())
-    assert 1e7 < before < machine.memory()
+    assert 5e7 < before < machine.memory()
     assert taken == pytest.approx(200e6, rel=0.1)
 
 

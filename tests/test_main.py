@@ -214,5 +214,16 @@ def test_the_extras_of_the_table_bring_their_packages():
 
 
 def test_values_of_settings_are_json_or_python_or_text():
-    values = parse_pairs(["a=True", "b=false", "c=None", "d=[1, 2.5]", "e=crazyflie", "f=x=y", "g=(16, 12)"])
-    assert values == {"a": True, "b": False, "c": None, "d": [1, 2.5], "e": "crazyflie", "f": "x=y", "g": (16, 12)}
+    values = parse_pairs(
+        ["a=True", "b=false", "c=None", "d=[1, 2.5]", "e=crazyflie", "f=x=y", "g=(16, 12)", "h=2026_12_01"]
+    )
+    assert values == {
+        "a": True,
+        "b": False,
+        "c": None,
+        "d": [1, 2.5],
+        "e": "crazyflie",
+        "f": "x=y",
+        "g": (16, 12),
+        "h": "2026_12_01",
+    }

@@ -110,16 +110,24 @@ def require_screen(remedy: str) -> None:
 
 
 def parse_pairs(texts: Sequence[str]) -> dict[str, Any]:
-    """Return the values of ``NAME=VALUE`` by name: JSON, a literal of Python such as True or (16, 12), or else text."""
-    pairs: dict[str, Any] = {}
+    """Return the values of ``NAME=VALUE`` by name: JSON, Python's True, False, None and tuples, or else text."""
+    pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
         require(equals, f"expected NAME=VALUE, got {text!r}; write for example seconds=5", ValueError)
-        pairs[name] = value
-        for read in (ast.literal_eval, json.loads):  # what both can read is equal
-            with contextlib.suppress(ValueError, SyntaxError):
-                pairs[name] = read(value)
+        try:
+            pairs[name] = json.loads(value)
+        except ValueError:
+            pairs[name] = _parse_python(value)
     return pairs
+
+
+def _parse_python(text: str) -> Any:
+    # Other literals are text: 2026_12_01 is the name of a folder, not a number.
+    with contextlib.suppress(ValueError, SyntaxError, TypeError):
+        value = ast.literal_eval(text)
+        return value if value is None or isinstance(value, (bool, tuple)) else text
+    return text
 
 
 def load_policy_and_env(
