@@ -10,7 +10,7 @@ PACKAGE = Path(crazysim.__file__).parent
 SLACK = 40
 """Statements that a folder may fall below its number before the number has to follow."""
 BUDGET = {
-    "commands": 915,
+    "commands": 919,
     "control": 1394,
     "core": 1584,
     "crazysim": 845,
@@ -22,7 +22,7 @@ BUDGET = {
     "lab": 17785,
     "media": 1093,
     "plugins": 5083,
-    "scene": 3309,
+    "scene": 3313,
     "sim": 914,
     "train": 2780,
     "trajectories": 497,

@@ -394,8 +394,8 @@ def cast_rays_in_worlds(
 def _numbers_of_color(distance: Array, rows: Array, origin: Array, direction: Array, back: Array) -> Array:
     # Of which ``color_tangent_at_hit`` takes the tangents. (n_worlds, n_rays, 16)
     length = jnp.where(jnp.isfinite(distance), distance, 0.0)
-    axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
-    local_end = jnp.sum(axes * (origin + length[..., None] * direction - rows[..., :3])[..., None], axis=-2)
+    axes = _axes_of_geoms(rows)
+    local_end = _in_frame(axes, origin + length[..., None] * direction - rows[..., :3])
     shift = jnp.sum(_hold(axes) * local_end[..., None, :], axis=-1)
     turn = jnp.sum(jnp.cross(_hold(axes), axes, axisa=-2, axisb=-2, axisc=-2), axis=-1) / 2
     return jnp.concatenate([length[..., None], origin, direction, back, shift, turn], axis=-1)
@@ -421,10 +421,20 @@ def _gap(distance: Array, normal: Array, rows: Array, origin: Array, direction: 
     cosine = jnp.sum(normal * direction, axis=-1)
     cosine = jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), MIN_COSINE)
     weight, end = normal / cosine[..., None], origin + length[..., None] * direction
-    axes = rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
-    local_weight = _hold(jnp.sum(axes * weight[..., None], axis=-2))
-    local_end = jnp.sum(axes * (_hold(end) - rows[..., :3])[..., None], axis=-2)
+    axes = _axes_of_geoms(rows)
+    local_weight = _hold(_in_frame(axes, weight))
+    local_end = _in_frame(axes, _hold(end) - rows[..., :3])
     return -jnp.sum(_hold(weight) * end, axis=-1) - jnp.sum(local_weight * local_end, axis=-1)
+
+
+def _axes_of_geoms(rows: Array) -> Array:
+    # Matrices with the axes of geoms as columns. (..., 3, 3)
+    return rows[..., 4:13].reshape(*rows.shape[:-1], 3, 3)
+
+
+def _in_frame(axes: Array, vectors: Array) -> Array:
+    # Vectors of the world in the frames with these axes. (..., 3)
+    return jnp.sum(axes * vectors[..., None], axis=-2)
 
 
 @jax.custom_jvp
